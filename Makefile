@@ -1,0 +1,55 @@
+# `make test` and `make demo` need Python >= 3.11 with venv, nothing else; the second run reuses .venv.
+#
+#   make test PYTHON=python3.12          another interpreter
+#   make test PYTEST_ARGS="-m 'not slow'"
+#
+# torch without GPU libraries: on Linux the default registry's torch may bring several GB of CUDA packages.
+# Everything runs on the CPU, so a CPU wheel is enough. Point pip at one, by any of
+#   make install PIP_EXTRA_INDEX_URL=<PyTorch's index of CPU wheels>
+#   make install PIP_FIND_LINKS=<folder that holds a torch CPU wheel>
+#   make install PIP_INSTALL_ARGS="<any options of pip install>"
+# constraints.txt says torch==2.13.0, which 2.13.0+cpu satisfies and wins over the plain wheel.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PACKAGES := pace_actuators pace_envs pace_optim
+PIP_INSTALL_ARGS ?=
+PYTEST_ARGS ?=
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint format clean
+
+help:  ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
+
+install: $(STAMP)  ## create .venv and install everything, pinned and editable
+
+$(STAMP): pyproject.toml setup.py constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python >= 3.11 is needed, $(PYTHON) is $$($(PYTHON) -V 2>&1): make $(MAKECMDGOALS) PYTHON=python3.11"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(PIP_INSTALL_ARGS) --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: install  ## identify a robot from its sample recording and open up the result
+	$(BIN)/python scripts/demo.py
+
+lint: install  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy $(PACKAGES)
+
+test: lint  ## lint, types and tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+format: install  ## put imports and layout right
+	$(BIN)/ruff check --fix-only --select I .
+	$(BIN)/ruff format .
+
+clean:  ## remove .venv, builds and caches (logs/ stays)
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

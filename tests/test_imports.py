@@ -1,0 +1,84 @@
+"""Imports run one way: pace_actuators <- pace_envs <- pace_optim <- scripts."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+DOWNSTREAM = {
+    "assets": {"pace_actuators", "pace_envs", "pace_optim", "scripts", "tests"},
+    "pace_actuators": {"pace_assets", "pace_envs", "pace_optim", "scripts", "tests"},
+    "pace_envs": {"pace_optim", "scripts", "tests"},
+    "pace_optim": {"scripts", "tests"},
+    "scripts": {"tests"},
+}
+"""Folder -> what none of its files may import."""
+
+ACTUATORS_MAY_IMPORT = {*sys.stdlib_module_names, "torch", "pace_actuators"}
+ADAPTERS = {"pace_actuators/mjlab.py": "mjlab", "pace_actuators/isaaclab.py": "isaaclab"}
+"""The two files that may import one framework more."""
+
+
+def imported_roots(source: str) -> set[str]:
+    """Top-level names that a file imports from outside its own package, at whatever depth of its code."""
+    roots = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            roots |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            roots.add((node.module or "").split(".")[0])
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if called in ("import_module", "__import__") and not str(node.args[0].value).startswith("."):
+                roots.add(str(node.args[0].value).split(".")[0])
+    return roots
+
+
+def files_of(*folders: str) -> list[str]:
+    return sorted(p.relative_to(ROOT).as_posix() for f in folders for p in (ROOT / f).rglob("*.py"))
+
+
+@pytest.mark.parametrize(
+    ("source", "roots"),
+    [
+        ("import torch.nn as nn, pace_optim", {"torch", "pace_optim"}),
+        ("from pace_envs.mdp import joint_pos_rel", {"pace_envs"}),
+        ("def f():\n    from pace_optim import fit", {"pace_optim"}),
+        ("import importlib\nimportlib.import_module('pace_optim.fit')", {"importlib", "pace_optim"}),
+        ("from . import effects\nfrom .effects import base", set()),
+    ],
+)
+def test_every_form_of_import_is_seen(source, roots):
+    assert imported_roots(source) == roots
+
+
+@pytest.mark.parametrize("path", files_of(*DOWNSTREAM))
+def test_no_file_imports_what_lies_downstream(path):
+    against = imported_roots((ROOT / path).read_text(encoding="utf-8")) & DOWNSTREAM[path.split("/")[0]]
+    assert not against, (
+        f"{path} imports {sorted(against)}, against pace_actuators <- pace_envs <- pace_optim <- scripts"
+    )
+
+
+@pytest.mark.parametrize("path", files_of("pace_actuators"))
+def test_actuators_need_torch_alone(path):
+    allowed = ACTUATORS_MAY_IMPORT | {ADAPTERS.get(path, "torch")}
+    foreign = imported_roots((ROOT / path).read_text(encoding="utf-8")) - allowed
+    assert not foreign, (
+        f"{path} imports {sorted(foreign)}; whoever trains a policy installs torch and nothing else"
+    )
+
+
+def test_importing_the_actuators_loads_no_simulator():
+    code = (
+        "import sys, pace_actuators\n"
+        "unwanted = {'mujoco', 'gymnasium', 'scipy', 'pace_envs', 'pace_optim', 'mjlab', 'isaaclab'}\n"
+        "heavy = unwanted & set(sys.modules)\n"
+        "sys.exit(f'import pace_actuators loads {sorted(heavy)}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
