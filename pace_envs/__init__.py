@@ -5,7 +5,13 @@ from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.gym_vector import PaceVectorEnv
 from pace_envs.manager_based_env import ManagerBasedEnv, ManagerBasedEnvCfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
-from pace_envs.registration import load_env_cfg, register_envs, register_task, registered_tasks, set_physics_dt
+from pace_envs.registration import (
+    load_env_cfg,
+    register_envs,
+    register_task,
+    registered_tasks,
+    set_physics_dt,
+)
 from pace_envs.scene import InteractiveScene, InteractiveSceneCfg, TerrainCfg
 from pace_envs.simulation import Simulation, SimulationCfg
 

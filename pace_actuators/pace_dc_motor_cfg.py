@@ -1,0 +1,71 @@
+"""Configuration of the identified drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from pace_actuators.joint_values import JointValue
+
+if TYPE_CHECKING:
+    from pace_actuators.pace_dc_motor import PaceDCMotor
+
+DelayMode = Literal["command", "effort"]
+
+
+@dataclass(kw_only=True)
+class PaceDCMotorCfg:
+    """One type of drive and the joints that it moves.
+
+    Values are numbers (for every joint of the group), dicts of regular expression to value, or one value
+    per joint. A pattern that matches no joint, and a joint matched twice, are errors.
+    """
+
+    class_type: type[PaceDCMotor] | None = None
+    """The actuator class to build; ``None`` means :class:`PaceDCMotor`. Set it to your own subclass."""
+
+    joint_names_expr: str | Sequence[str]
+    """Regular expressions of the joints in this group."""
+
+    stiffness: JointValue | None = None
+    """Position gain kp [N m/rad]; ``None`` takes what the constructor is given."""
+
+    damping: JointValue | None = None
+    """Velocity gain kd [N m s/rad]; ``None`` takes what the constructor is given."""
+
+    saturation_effort: JointValue | None = None
+    """Stall torque of the torque-speed curve [N m]; ``None`` means torque does not depend on speed."""
+
+    effort_limit: JointValue | None = None
+    """Continuous torque limit [N m]; ``None`` takes what the constructor is given (default: no limit)."""
+
+    velocity_limit: JointValue | None = None
+    """No-load speed of the torque-speed curve [rad/s]; ``None`` takes what the constructor is given."""
+
+    armature: JointValue | None = None
+    """Rotor inertia seen at the joint [kg m^2]. Applied by the simulator, not by the actuator."""
+
+    friction: JointValue | None = None
+    """Coulomb friction [N m]. Applied by the simulator, not by the actuator."""
+
+    viscous_friction: JointValue | None = None
+    """Viscous friction [N m s/rad]. Applied by the simulator, not by the actuator."""
+
+    encoder_bias: JointValue = 0.0
+    """Encoder bias [rad]: the encoder shows q_enc = q - bias."""
+
+    delay: float = 0.0
+    """Delay of every environment at the start [control steps], from 0 to ``max_delay``."""
+
+    max_delay: float = 10.0
+    """Largest delay that can be set later [control steps]."""
+
+    delay_mode: DelayMode = "command"
+    """What is delayed: ``"command"`` (targets and feed-forward) or ``"effort"`` (the controller's torque)."""
+
+    delay_interpolation: Literal["linear", "hold"] = "linear"
+    """Between samples: ``"linear"``, or ``"hold"`` for whole steps only."""
+
+    control_decimation: int = 1
+    """Calls of ``compute`` (physics steps) per control step; the commanded torque is held in between."""

@@ -1,0 +1,382 @@
+"""A robot in the simulation: finding joints, reading state, writing parameters, running the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import torch
+
+from pace_actuators import ActuatorActions, PaceDCMotor, match_names, resolve_joint_values
+from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.articulation_data import ArticulationData
+from pace_envs.simulation import EnvIds, Simulation
+
+JointIds = Sequence[int] | torch.Tensor | slice | None
+
+
+def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
+    """Read a robot's MJCF; its base is fixed or floating as the configuration says.
+
+    Raises:
+        ValueError: If the file is missing or no MJCF, or a floating base is asked of a model without one.
+    """
+    path = Path(cfg.mjcf_path)
+    if not path.is_file():
+        raise ValueError(
+            f"The model file {path} does not exist. Correct mjcf_path in the robot's configuration."
+        )
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {path}: {error}") from None
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    if cfg.fix_base:
+        for joint in free:
+            base = joint.parent
+            base.pos, base.quat = cfg.init_state.pos, cfg.init_state.rot
+            spec.delete(joint)
+    return spec
+
+
+class Articulation:
+    """A robot, batched over environments; every joint index is an index into ``joint_names``."""
+
+    def __init__(self, cfg: ArticulationCfg, sim: Simulation):
+        """Find the robot's joints in the simulation and build its drives.
+
+        Args:
+            cfg: The configuration.
+            sim: The simulation that holds the robot.
+
+        Raises:
+            ValueError: If names in the configuration do not fit the model.
+        """
+        self.cfg = cfg
+        self._sim = sim
+        self._find_joints_in_model(sim.model)
+        n, device = self.num_joints, sim.device
+        state = {"dtype": torch.float64, "device": device}
+
+        init = cfg.init_state
+        limits = torch.tensor(
+            [
+                sim.model.joint(name).range if sim.model.joint(name).limited[0] else (-torch.inf, torch.inf)
+                for name in self.joint_names
+            ],
+            **state,
+        ).view(n, 2)
+        middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
+        zeros = torch.zeros(sim.num_envs, n, **state)
+        default_pos = resolve_joint_values(
+            init.joint_pos, self.joint_names, field="init_state.joint_pos", default=0.0
+        )
+        default_vel = resolve_joint_values(
+            init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0
+        )
+        self.data = ArticulationData(
+            joint_pos=self._view(sim.qpos, self._qpos_columns),
+            joint_vel=self._view(sim.qvel, self._dof_columns),
+            default_joint_pos=default_pos.repeat(sim.num_envs, 1),
+            default_joint_vel=default_vel.repeat(sim.num_envs, 1),
+            joint_pos_limits=limits,
+            soft_joint_pos_limits=middle + cfg.soft_joint_pos_limit_factor * (limits - middle),
+            joint_pos_target=default_pos.repeat(sim.num_envs, 1),
+            computed_torque=zeros.clone(),
+            applied_torque=zeros.clone(),
+        )
+        if self._root is not None:
+            q, v = self._root
+            self.data.root_pos_w, self.data.root_quat_w = sim.qpos[:, q : q + 3], sim.qpos[:, q + 3 : q + 7]
+            self.data.root_lin_vel_w, self.data.root_ang_vel_b = (
+                sim.qvel[:, v : v + 3],
+                sim.qvel[:, v + 3 : v + 6],
+            )
+        self._effort = self._view(sim.qfrc_applied, self._dof_columns)
+        self._build_actuators()
+        self.reset()
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self._sim.num_envs
+
+    @property
+    def is_fixed_base(self) -> bool:
+        """Whether the base is held in place."""
+        return self._root is None
+
+    def find_joints(
+        self, name_keys: str | Sequence[str], *, preserve_order: bool = False
+    ) -> tuple[list[int], list[str]]:
+        """Joints whose names match regular expressions.
+
+        Args:
+            name_keys: One expression or several.
+            preserve_order: Order by the expressions instead of by ``joint_names``.
+
+        Returns:
+            Indices and names.
+
+        Raises:
+            ValueError: If an expression matches no joint.
+        """
+        return _find(name_keys, self.joint_names, preserve_order, "joint")
+
+    def find_bodies(
+        self, name_keys: str | Sequence[str], *, preserve_order: bool = False
+    ) -> tuple[list[int], list[str]]:
+        """Bodies whose names match regular expressions: model body indices and names."""
+        found, names = _find(name_keys, self.body_names, preserve_order, "body")
+        return [self._body_ids[i] for i in found], names
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Put all or some environments' robots back to their initial state and clear their drives."""
+        rows = slice(None) if env_ids is None else torch.as_tensor(self._sim.resolve_env_ids(env_ids)).long()
+        init = self.cfg.init_state
+        if self._root is not None:
+            self.write_root_state_to_sim(
+                torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64),
+                env_ids,
+            )
+        self.write_joint_state_to_sim(
+            self.data.default_joint_pos[rows], self.data.default_joint_vel[rows], env_ids=env_ids
+        )
+        self.data.joint_pos_target[rows] = self.data.default_joint_pos[rows]
+        for target in (self.data.joint_vel_target, self.data.joint_effort_target):
+            if target is not None:
+                target[rows] = 0.0
+        for actuator in self.actuators.values():
+            actuator.reset(env_ids if env_ids is None else rows)
+
+    def write_joint_state_to_sim(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        joint_ids: JointIds = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write joint positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable."""
+        self._write(self._sim.qpos, self._qpos_columns, position, joint_ids, env_ids)
+        self._write(self._sim.qvel, self._dof_columns, velocity, joint_ids, env_ids)
+        self._refresh()
+
+    def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write a floating base's state: position, quaternion, linear (world) and angular (body) velocity, (…, 13)."""
+        if self._root is None:
+            raise ValueError("This robot's base is fixed: it has no root state to write.")
+        rows, (q, v) = self._rows(env_ids), self._root
+        self._sim.qpos[rows, q : q + 7] = root_state[..., :7]
+        self._sim.qvel[rows, v : v + 6] = root_state[..., 7:]
+
+    def write_joint_armature_to_sim(
+        self, armature: torch.Tensor | float, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write armature [kg m^2], (len(env_ids), len(joint_ids)) or broadcastable."""
+        self._write_parameter("armature", "dof_armature", armature, joint_ids, env_ids)
+
+    def write_joint_viscous_friction_coefficient_to_sim(
+        self,
+        joint_viscous_friction_coeff: torch.Tensor | float,
+        joint_ids: JointIds = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write viscous friction [N m s/rad], (len(env_ids), len(joint_ids)) or broadcastable."""
+        self._write_parameter(
+            "viscous_friction", "dof_damping", joint_viscous_friction_coeff, joint_ids, env_ids
+        )
+
+    def write_joint_friction_coefficient_to_sim(
+        self, joint_friction_coeff: torch.Tensor | float, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Write Coulomb friction [N m], (len(env_ids), len(joint_ids)) or broadcastable."""
+        self._write_parameter("friction", "dof_frictionloss", joint_friction_coeff, joint_ids, env_ids)
+
+    def set_joint_position_target(
+        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set position targets [rad]; they reach the drives with :meth:`write_data_to_sim`."""
+        if joint_ids is None and env_ids is None:
+            self.data.joint_pos_target.copy_(target)
+        else:
+            _assign(self.data.joint_pos_target, self._rows(env_ids), _columns(joint_ids), target)
+
+    def set_joint_velocity_target(
+        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set velocity targets [rad/s]."""
+        if self.data.joint_vel_target is None:
+            self.data.joint_vel_target = torch.zeros_like(self.data.joint_pos_target)
+        _assign(self.data.joint_vel_target, self._rows(env_ids), _columns(joint_ids), target)
+
+    def set_joint_effort_target(
+        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set feed-forward efforts [N m]."""
+        if self.data.joint_effort_target is None:
+            self.data.joint_effort_target = torch.zeros_like(self.data.joint_pos_target)
+        _assign(self.data.joint_effort_target, self._rows(env_ids), _columns(joint_ids), target)
+
+    def write_data_to_sim(self) -> None:
+        """Run the drives on the present targets and state, and apply their torques."""
+        data = self.data
+        for actuator in self.actuators.values():
+            ids = actuator.joint_indices
+            action = ActuatorActions(
+                data.joint_pos_target[:, ids],
+                None if data.joint_vel_target is None else data.joint_vel_target[:, ids],
+                None if data.joint_effort_target is None else data.joint_effort_target[:, ids],
+            )
+            efforts = actuator.compute(action, data.joint_pos[:, ids], data.joint_vel[:, ids]).joint_efforts
+            if len(self.actuators) == 1 and ids == slice(None):
+                data.computed_torque, data.applied_torque = actuator.computed_effort, efforts
+            else:
+                data.computed_torque[:, ids] = actuator.computed_effort
+                data.applied_torque[:, ids] = efforts
+        if self._effort is not None:
+            self._effort.copy_(data.applied_torque)
+        else:
+            self._sim.qfrc_applied[:, self._dof_columns] = data.applied_torque
+
+    def update(self) -> None:
+        """Read the state after a physics step."""
+        self._refresh()
+
+    def _find_joints_in_model(self, model: mujoco.MjModel) -> None:
+        self._root = None
+        single = {}
+        for j in range(model.njnt):
+            name, kind = model.joint(j).name, mujoco.mjtJoint(int(model.jnt_type[j]))
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                self._root = (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
+            elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+                single[name] = j
+            else:
+                raise ValueError(
+                    f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives."
+                )
+        if not single:
+            raise ValueError(f"The model {self.cfg.mjcf_path} has no joints to drive.")
+        order = self.cfg.joint_order or tuple(single)
+        unknown = [name for name in order if name not in single]
+        if unknown or len(set(order)) != len(order):
+            wrong = f"names unknown joints: {', '.join(unknown)}" if unknown else "names a joint twice"
+            raise ValueError(f"joint_order {wrong}. Joints of the model: {', '.join(single)}.")
+        self.joint_names = list(order)
+        ids = [single[name] for name in order]
+        self._qpos_columns = torch.tensor([int(model.jnt_qposadr[j]) for j in ids])
+        self._dof_columns = torch.tensor([int(model.jnt_dofadr[j]) for j in ids])
+        self._body_ids = list(range(1, model.nbody))
+        self.body_names = [model.body(i).name for i in self._body_ids]
+        self.dof_columns = self._dof_columns.clone()
+
+    def _build_actuators(self) -> None:
+        n = self.num_joints
+        columns = {
+            "armature": "dof_armature",
+            "viscous_friction": "dof_damping",
+            "friction": "dof_frictionloss",
+        }
+        model_values = {
+            key: torch.as_tensor(getattr(self._sim.model, field))[self._dof_columns]
+            for key, field in columns.items()
+        }
+        self.actuators: dict[str, PaceDCMotor] = {}
+        owner: dict[str, str] = {}
+        for group, cfg in self.cfg.actuators.items():
+            ids, names = self.find_joints(cfg.joint_names_expr)
+            for name in names:
+                if name in owner:
+                    raise ValueError(
+                        f"The joint {name!r} belongs to the actuator groups {owner[name]!r} and {group!r}. "
+                        "Make their joint_names_expr exclusive."
+                    )
+                owner[name] = group
+            joint_ids = slice(None) if ids == list(range(n)) else torch.tensor(ids)
+            self.actuators[group] = (cfg.class_type or PaceDCMotor)(
+                cfg,
+                names,
+                joint_ids,
+                self.num_envs,
+                self._sim.device,
+                dtype=torch.float64,
+                **{key: values[ids] for key, values in model_values.items()},
+            )
+        for actuator in self.actuators.values():
+            ids = actuator.joint_indices
+            self.write_joint_armature_to_sim(actuator.armature, ids)
+            self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, ids)
+            self.write_joint_friction_coefficient_to_sim(actuator.friction, ids)
+
+    def _write_parameter(
+        self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
+    ) -> None:
+        tensor = torch.as_tensor(value, dtype=torch.float64)
+        if not bool((tensor >= 0).all()):
+            raise ValueError(f"{name} must be >= 0, got {tensor.min().item():g}.")
+        self._write(self._sim.expand(field), self._dof_columns, tensor, joint_ids, env_ids)
+        self._sim.constants_changed()
+
+    def _write(
+        self,
+        field: torch.Tensor,
+        columns: torch.Tensor,
+        value: torch.Tensor | float,
+        joint_ids: JointIds,
+        env_ids: EnvIds,
+    ) -> None:
+        _assign(field, self._rows(env_ids), columns[_columns(joint_ids)], value)
+
+    def _rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
+        """Rows in the caller's order: values belong to env_ids one by one."""
+        if env_ids is None or isinstance(env_ids, slice):
+            return slice(None) if env_ids is None else env_ids
+        rows = torch.as_tensor(env_ids)
+        return rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows.long()
+
+    def _view(self, field: torch.Tensor, columns: torch.Tensor) -> torch.Tensor | None:
+        """A live view where the joints lie side by side in the model, else ``None``/a buffer to refresh."""
+        first, n = int(columns[0]), len(columns)
+        if columns.tolist() == list(range(first, first + n)):
+            return field[:, first : first + n]
+        return None if field is self._sim.qfrc_applied else field[:, columns]
+
+    def _refresh(self) -> None:
+        data, sim = self.data, self._sim
+        if data.joint_pos.untyped_storage().data_ptr() != sim.qpos.untyped_storage().data_ptr():
+            torch.index_select(sim.qpos, 1, self._qpos_columns, out=data.joint_pos)
+            torch.index_select(sim.qvel, 1, self._dof_columns, out=data.joint_vel)
+
+
+def _columns(joint_ids: JointIds) -> torch.Tensor | slice:
+    if joint_ids is None or isinstance(joint_ids, slice):
+        return slice(None) if joint_ids is None else joint_ids
+    return torch.as_tensor(joint_ids).long()
+
+
+def _assign(
+    field: torch.Tensor,
+    rows: torch.Tensor | slice,
+    columns: torch.Tensor | slice,
+    value: torch.Tensor | float,
+) -> None:
+    """``field[rows][:, columns] = value`` for any mix of slices and indices."""
+    if isinstance(rows, slice) or isinstance(columns, slice):
+        field[rows, columns] = torch.as_tensor(value, dtype=field.dtype)
+    else:
+        field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype)
+
+
+def _find(
+    keys: str | Sequence[str], names: Sequence[str], preserve_order: bool, what: str
+) -> tuple[list[int], list[str]]:
+    groups = match_names(keys, names, what=what)
+    found = [i for group in groups for i in group]
+    found = list(dict.fromkeys(found)) if preserve_order else sorted(set(found))
+    return found, [names[i] for i in found]

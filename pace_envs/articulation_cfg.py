@@ -1,0 +1,53 @@
+"""Configuration of a robot: model file, initial state, drives."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pace_actuators import JointValue, PaceDCMotorCfg
+
+
+@dataclass(kw_only=True)
+class InitialStateCfg:
+    """State after a reset."""
+
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position of the base in the world [m]."""
+
+    rot: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation of the base (w, x, y, z)."""
+
+    lin_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Linear velocity of a floating base in the world [m/s]."""
+
+    ang_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Angular velocity of a floating base in its own frame [rad/s]."""
+
+    joint_pos: JointValue = 0.0
+    """Joint positions [rad]; joints without a value start at 0."""
+
+    joint_vel: JointValue = 0.0
+    """Joint velocities [rad/s]; joints without a value start at 0."""
+
+
+@dataclass(kw_only=True)
+class ArticulationCfg:
+    """A robot."""
+
+    mjcf_path: str | Path
+    """MJCF file. Its actuators are not used: the drives below take their place."""
+
+    init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
+    """State after a reset."""
+
+    actuators: Mapping[str, PaceDCMotorCfg] = field(default_factory=dict)
+    """Groups of joints by name of the group; each joint belongs to one group at most."""
+
+    joint_order: tuple[str, ...] | None = None
+    """Order of the joints in every tensor, and which of them are used; ``None`` means the model's order."""
+
+    fix_base: bool = False
+    """Whether the base is held in place (its free joint is removed)."""
+
+    soft_joint_pos_limit_factor: float = 1.0
+    """Part of the joint range that counts as the soft limit, 0 to 1."""

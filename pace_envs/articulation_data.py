@@ -1,0 +1,44 @@
+"""What is known of a robot's state, batched over environments."""
+
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(kw_only=True)
+class ArticulationData:
+    """State, targets and defaults; joints in the articulation's ``joint_names`` order, all float64.
+
+    Tensors of the state may share memory with the simulation: clone them to keep them.
+    """
+
+    joint_pos: torch.Tensor
+    """True joint positions [rad], (num_envs, num_joints)."""
+    joint_vel: torch.Tensor
+    """Joint velocities [rad/s], (num_envs, num_joints)."""
+    default_joint_pos: torch.Tensor
+    """[rad], (num_envs, num_joints)."""
+    default_joint_vel: torch.Tensor
+    """[rad/s], (num_envs, num_joints)."""
+    joint_pos_limits: torch.Tensor
+    """Lower and upper [rad], (num_joints, 2); infinite where there is none."""
+    soft_joint_pos_limits: torch.Tensor
+    """Lower and upper [rad], (num_joints, 2)."""
+    joint_pos_target: torch.Tensor
+    """[rad], (num_envs, num_joints)."""
+    joint_vel_target: torch.Tensor | None = None
+    """[rad/s], (num_envs, num_joints); ``None`` until one is set, which means zero."""
+    joint_effort_target: torch.Tensor | None = None
+    """Feed-forward [N m], (num_envs, num_joints); ``None`` until one is set, which means zero."""
+    computed_torque: torch.Tensor
+    """Torque that the controllers ask for [N m], (num_envs, num_joints)."""
+    applied_torque: torch.Tensor
+    """Torque at the joints [N m], (num_envs, num_joints)."""
+    root_pos_w: torch.Tensor | None = None
+    """Position of a floating base in the world [m], (num_envs, 3); ``None`` for a fixed base."""
+    root_quat_w: torch.Tensor | None = None
+    """Orientation of a floating base, w x y z, (num_envs, 4)."""
+    root_lin_vel_w: torch.Tensor | None = None
+    """Linear velocity of a floating base in the world [m/s], (num_envs, 3)."""
+    root_ang_vel_b: torch.Tensor | None = None
+    """Angular velocity of a floating base in its frame [rad/s], (num_envs, 3)."""

@@ -1,0 +1,211 @@
+"""The batched environment: scene, actions, events, observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from pace_envs.managers import (
+    ActionManager,
+    ActionTermCfg,
+    EventManager,
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationManager,
+)
+from pace_envs.scene import InteractiveScene, InteractiveSceneCfg
+from pace_envs.simulation import EnvIds, SimulationCfg
+
+
+@dataclass(kw_only=True)
+class ManagerBasedEnvCfg:
+    """Configuration of an environment."""
+
+    scene: InteractiveSceneCfg
+    """What stands in it."""
+
+    sim: SimulationCfg = field(default_factory=SimulationCfg)
+    """How the physics is stepped."""
+
+    decimation: int = 1
+    """Physics steps per environment step."""
+
+    seed: int | None = None
+    """Seed of all random draws; ``None`` draws one."""
+
+    actions: Mapping[str, ActionTermCfg] = field(default_factory=dict)
+    """Action terms by name."""
+
+    observations: Mapping[str, ObservationGroupCfg] = field(default_factory=dict)
+    """Observation groups by name; policies read ``"policy"``."""
+
+    events: Mapping[str, EventTermCfg] = field(default_factory=dict)
+    """Events by name."""
+
+
+class ManagerBasedEnv(gym.Env):
+    """``num_envs`` environments in one object; every tensor has the environments as its first dimension.
+
+    A step: (1) the action manager takes the action; (2) for every physics step, targets are set, the drives
+    turn them into torques and the simulation advances; (3) interval events happen; (4) observations.
+    """
+
+    metadata = {"render_modes": [None, "rgb_array"], "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+
+    def __init__(self, cfg: ManagerBasedEnvCfg, render_mode: str | None = None):
+        """Build the scene and the managers.
+
+        Args:
+            cfg: The configuration.
+            render_mode: ``None`` or ``"rgb_array"``.
+
+        Raises:
+            ValueError: If the configuration is unusable.
+        """
+        if not (isinstance(cfg.decimation, int) and cfg.decimation >= 1):
+            raise ValueError(f"decimation is {cfg.decimation!r}, expected an integer >= 1.")
+        self.cfg = cfg
+        self.render_mode = render_mode
+        self._generator = torch.Generator()
+        self.seed(cfg.seed)
+        self.scene = InteractiveScene(cfg.scene, cfg.sim)
+        self.sim = self.scene.sim
+        for name, actuator in self.scene["robot"].actuators.items():
+            if cfg.decimation % actuator.cfg.control_decimation:
+                raise ValueError(
+                    f"decimation is {cfg.decimation}, expected a multiple of the actuator group {name!r}'s "
+                    f"control_decimation = {actuator.cfg.control_decimation}."
+                )
+        self.extras: dict[str, Any] = {}
+        self.common_step_counter = 0
+        self._renderer: Any = None
+        self.load_managers()
+        self._configure_spaces()
+        self.event_manager.apply("startup")
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self.scene.num_envs
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all tensors."""
+        return self.sim.device
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics time step [s]."""
+        return self.cfg.sim.dt
+
+    @property
+    def step_dt(self) -> float:
+        """Time of an environment step [s]."""
+        return self.cfg.sim.dt * self.cfg.decimation
+
+    def load_managers(self) -> None:
+        """Build the managers."""
+        self.event_manager = EventManager(self.cfg.events, self)
+        self.action_manager = ActionManager(self.cfg.actions, self)
+        self.observation_manager = ObservationManager(self.cfg.observations, self)
+
+    def seed(self, seed: int | None) -> int:  # type: ignore[override]
+        """Seed all random draws of the environment; returns the seed."""
+        seed = int(torch.seed() % 2**31) if seed is None else int(seed)
+        self._generator.manual_seed(seed)
+        return seed
+
+    def uniform(self, shape: tuple[int, ...], low: Any = 0.0, high: Any = 1.0) -> torch.Tensor:
+        """Uniform draws from the environment's own generator, float64."""
+        draws = torch.rand(shape, generator=self._generator, dtype=torch.float64)
+        return low + (high - low) * draws.to(self.device)
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+        env_ids: EnvIds = None,
+    ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Reset all or some environments.
+
+        Args:
+            seed: Seed of all random draws from here on.
+            options: Not used; part of Gymnasium's signature.
+            env_ids: The environments, or ``None`` for all.
+
+        Returns:
+            Observations of all environments by group, and extras.
+        """
+        if seed is not None:
+            self.seed(seed)
+        ids = torch.as_tensor(self.sim.resolve_env_ids(env_ids)).long()
+        self.extras = {}
+        self._reset_idx(ids)
+        self.sim.forward(ids)
+        self.scene.update()
+        return self.observation_manager.compute(), self.extras
+
+    def step(self, action: torch.Tensor) -> Any:
+        """Advance all environments by ``step_dt``.
+
+        Args:
+            action: (num_envs, action_dim).
+
+        Returns:
+            Observations by group, and extras.
+        """
+        self.simulate(action)
+        self.event_manager.apply("interval", dt=self.step_dt)
+        return self.observation_manager.compute(), self.extras
+
+    def simulate(self, action: torch.Tensor) -> None:
+        """Only the physics of a step: take the action and advance all environments by ``step_dt``."""
+        self.action_manager.process_action(action)
+        for _ in range(self.cfg.decimation):
+            self.action_manager.apply_action()
+            self.scene.write_data_to_sim()
+            self.sim.step()
+            self.scene.update()
+        self.common_step_counter += 1
+
+    def render(self) -> np.ndarray | None:
+        """A picture of environment 0, (height, width, 3) uint8; ``None`` without a render mode."""
+        if self.render_mode != "rgb_array":
+            return None
+        if self._renderer is None:
+            from pace_envs.rendering import OffscreenRenderer
+
+            self._renderer = OffscreenRenderer(self.sim)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Release the simulations and the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self.sim.close()
+
+    def _reset_idx(self, env_ids: torch.Tensor) -> None:
+        self.scene.reset(None if len(env_ids) == self.num_envs else env_ids)
+        self.event_manager.apply("reset", env_ids)
+        self.action_manager.reset(env_ids)
+        self.event_manager.reset(env_ids)
+        self.observation_manager.reset(env_ids)
+
+    def _configure_spaces(self) -> None:
+        unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
+        self.single_observation_space = gym.spaces.Dict(
+            {
+                name: gym.spaces.Box(shape=shape, **unbounded)
+                for name, shape in self.observation_manager.group_obs_dim.items()
+            }
+        )
+        self.single_action_space = gym.spaces.Box(shape=(self.action_manager.total_action_dim,), **unbounded)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)

@@ -1,0 +1,107 @@
+"""The batched environment with rewards, terminations and commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+from pace_envs.manager_based_env import ManagerBasedEnv, ManagerBasedEnvCfg
+from pace_envs.managers import (
+    CommandManager,
+    CommandTermCfg,
+    RewardManager,
+    RewardTermCfg,
+    TerminationManager,
+    TerminationTermCfg,
+)
+
+
+@dataclass(kw_only=True)
+class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
+    """Configuration of an environment for learning."""
+
+    episode_length_s: float = 20.0
+    """Longest episode [s]."""
+
+    commands: Mapping[str, CommandTermCfg] = field(default_factory=dict)
+    """Commands by name."""
+
+    rewards: Mapping[str, RewardTermCfg] = field(default_factory=dict)
+    """Rewards by name."""
+
+    terminations: Mapping[str, TerminationTermCfg] = field(default_factory=dict)
+    """Terminations by name."""
+
+
+class ManagerBasedRLEnv(ManagerBasedEnv):
+    """A :class:`ManagerBasedEnv` with an episode.
+
+    A step: (1) action and physics; (2) terminations; (3) rewards; (4) environments that are done are reset;
+    (5) commands; (6) interval events; (7) observations. The observation of an environment that was reset is
+    the first of its new episode (Gymnasium's "same step" autoreset); ``extras["final_obs"]`` holds the last one
+    of the old episode where ``extras["_final_obs"]`` is true.
+    """
+
+    cfg: ManagerBasedRLEnvCfg
+
+    def __init__(self, cfg: ManagerBasedRLEnvCfg, render_mode: str | None = None):
+        """Build the scene and the managers."""
+        super().__init__(cfg, render_mode)
+        self.final_observations = False
+        """Whether steps compute ``extras["final_obs"]``."""
+
+    @property
+    def max_episode_length_s(self) -> float:
+        """Longest episode [s]."""
+        return self.cfg.episode_length_s
+
+    @property
+    def max_episode_length(self) -> int:
+        """Longest episode [steps]."""
+        return math.ceil(self.max_episode_length_s / self.step_dt)
+
+    def load_managers(self) -> None:
+        """Build the managers."""
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self.command_manager = CommandManager(self.cfg.commands, self)
+        super().load_managers()
+        self.termination_manager = TerminationManager(self.cfg.terminations, self)
+        self.reward_manager = RewardManager(self.cfg.rewards, self)
+
+    def step(
+        self, action: torch.Tensor
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+        """Advance all environments by ``step_dt``.
+
+        Args:
+            action: (num_envs, action_dim).
+
+        Returns:
+            Observations by group; reward (num_envs,); terminated and truncated (num_envs,) bool; extras.
+        """
+        self.extras = {}
+        self.simulate(action)
+        self.episode_length_buf += 1
+        done = self.termination_manager.compute()
+        reward = self.reward_manager.compute(self.step_dt)
+        terminated, truncated = self.termination_manager.terminated, self.termination_manager.time_outs
+        env_ids = done.nonzero()[:, 0]
+        if len(env_ids):
+            if self.final_observations:
+                self.extras |= {"final_obs": self.observation_manager.compute(), "_final_obs": done.clone()}
+            self._reset_idx(env_ids)
+            self.sim.forward(env_ids)
+            self.scene.update()
+        self.command_manager.compute(self.step_dt)
+        self.event_manager.apply("interval", dt=self.step_dt)
+        return self.observation_manager.compute(), reward, terminated, truncated, self.extras
+
+    def _reset_idx(self, env_ids: torch.Tensor) -> None:
+        log = self.reward_manager.reset(env_ids) | self.termination_manager.reset(env_ids)
+        super()._reset_idx(env_ids)
+        self.command_manager.reset(env_ids)
+        self.episode_length_buf[env_ids] = 0
+        self.extras["log"] = log

@@ -1,0 +1,105 @@
+"""Actions: the policy's numbers become targets of joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pace_envs.managers.manager_base import term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class ActionTermCfg:
+    """Configuration of an action term."""
+
+    class_type: type[ActionTerm]
+    """The term's class."""
+
+    asset_name: str = "robot"
+    """Name of the entity that it moves."""
+
+
+class ActionTerm:
+    """Turns a slice of the action into commands."""
+
+    def __init__(self, cfg: ActionTermCfg, env: ManagerBasedEnv):
+        """Keep the configuration and find the entity."""
+        self.cfg = cfg
+        self._env = env
+        self._asset = env.scene[cfg.asset_name]
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action entries that it takes."""
+        raise NotImplementedError
+
+    def process_actions(self, actions: torch.Tensor) -> None:
+        """Take the policy's numbers, once per environment step; (num_envs, action_dim)."""
+        raise NotImplementedError
+
+    def apply_actions(self) -> None:
+        """Set the targets, before every physics step."""
+        raise NotImplementedError
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Forget the state of some environments."""
+
+
+class ActionManager:
+    """Splits the action among its terms."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Build the terms of a dict of name to configuration."""
+        self._terms = {name: term.class_type(term, env) for name, term in term_items(cfg).items()}
+        self._sizes = [term.action_dim for term in self._terms.values()]
+        self.action = torch.zeros(env.num_envs, sum(self._sizes), dtype=torch.float64, device=env.device)
+        self.prev_action = self.action.clone()
+
+    @property
+    def total_action_dim(self) -> int:
+        """Number of entries of an action."""
+        return self.action.shape[1]
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._terms)
+
+    def get_term(self, name: str) -> ActionTerm:
+        """The term of that name."""
+        return self._terms[name]
+
+    def process_action(self, action: torch.Tensor) -> None:
+        """Take an action, (num_envs, total_action_dim).
+
+        Raises:
+            ValueError: If its shape is wrong.
+        """
+        if action.shape != self.action.shape:
+            raise ValueError(
+                f"The action has shape {tuple(action.shape)}, expected {tuple(self.action.shape)} "
+                "(num_envs, total_action_dim)."
+            )
+        self.prev_action.copy_(self.action)
+        self.action.copy_(action)
+        start = 0
+        for term, size in zip(self._terms.values(), self._sizes, strict=True):
+            term.process_actions(self.action[:, start : start + size])
+            start += size
+
+    def apply_action(self) -> None:
+        """Set the targets of all terms."""
+        for term in self._terms.values():
+            term.apply_actions()
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Zero the actions of some environments."""
+        self.action[env_ids] = 0.0
+        self.prev_action[env_ids] = 0.0
+        for term in self._terms.values():
+            term.reset(env_ids)

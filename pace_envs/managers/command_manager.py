@@ -1,0 +1,94 @@
+"""Commands: what the policy is asked to do, drawn again from time to time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pace_envs.managers.manager_base import term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class CommandTermCfg:
+    """Configuration of a command term."""
+
+    class_type: type[CommandTerm]
+    """The term's class."""
+
+    resampling_time_range: tuple[float, float] = (10.0, 10.0)
+    """Time between two draws [s]."""
+
+
+class CommandTerm:
+    """A command per environment; subclasses draw it in :meth:`_resample_command`."""
+
+    cfg: CommandTermCfg
+
+    def __init__(self, cfg: CommandTermCfg, env: ManagerBasedEnv):
+        """Start with the time of the next draw at zero."""
+        self.cfg = cfg
+        self._env = env
+        self.time_left = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
+
+    @property
+    def command(self) -> torch.Tensor:
+        """The present command, (num_envs, dim)."""
+        raise NotImplementedError
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Draw new commands for some environments."""
+        if len(env_ids):
+            self.time_left[env_ids] = self._env.uniform((len(env_ids),), *self.cfg.resampling_time_range)
+            self._resample_command(env_ids)
+
+    def compute(self, dt: float) -> None:
+        """Let time pass and draw where it has run out."""
+        self.time_left -= dt
+        self.reset((self.time_left <= 0.0).nonzero()[:, 0])
+        self._update_command()
+
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        raise NotImplementedError
+
+    def _update_command(self) -> None:
+        """Change the command with the state (none by default)."""
+
+
+class CommandManager:
+    """Holds the command terms."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Build the terms of a dict of name to configuration."""
+        self._terms: dict[str, CommandTerm] = {
+            name: term.class_type(term, env) for name, term in term_items(cfg).items()
+        }
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._terms)
+
+    def get_command(self, name: str) -> torch.Tensor:
+        """The present command of a term, (num_envs, dim)."""
+        return self.get_term(name).command
+
+    def get_term(self, name: str) -> CommandTerm:
+        """The term of that name."""
+        if name not in self._terms:
+            raise KeyError(f"There is no command {name!r}. Available: {', '.join(self._terms) or 'none'}.")
+        return self._terms[name]
+
+    def compute(self, dt: float) -> None:
+        """Let time pass."""
+        for term in self._terms.values():
+            term.compute(dt)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Draw new commands for some environments."""
+        for term in self._terms.values():
+            term.reset(env_ids)

@@ -1,0 +1,80 @@
+"""Events: changes at startup, at resets and at intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class EventTermCfg(ManagerTermBaseCfg):
+    """An event ``func(env, env_ids, **params)``."""
+
+    mode: Literal["startup", "reset", "interval"]
+    """When it happens."""
+
+    interval_range_s: tuple[float, float] | None = None
+    """Time between two events of an environment [s]; for mode ``"interval"``."""
+
+
+class EventManager:
+    """Runs events, mode by mode, in the order in which they were given."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Resolve the terms.
+
+        Raises:
+            ValueError: If a mode is unknown or an interval is missing.
+        """
+        self._env = env
+        self._terms: dict[str, list[Term]] = {"startup": [], "reset": [], "interval": []}
+        self._time_left: list[torch.Tensor] = []
+        for name, term_cfg in term_items(cfg).items():
+            if term_cfg.mode not in self._terms:
+                raise ValueError(
+                    f"The event {name!r} has mode {term_cfg.mode!r}. Available: {', '.join(self._terms)}."
+                )
+            if term_cfg.mode == "interval":
+                if term_cfg.interval_range_s is None:
+                    raise ValueError(
+                        f"The interval event {name!r} needs interval_range_s = (min, max) in seconds."
+                    )
+                self._time_left.append(env.uniform((env.num_envs,), *term_cfg.interval_range_s))
+            self._terms[term_cfg.mode].append(Term(name, term_cfg, env))
+
+    @property
+    def available_modes(self) -> list[str]:
+        """Modes that have events."""
+        return [mode for mode, terms in self._terms.items() if terms]
+
+    @property
+    def active_terms(self) -> dict[str, list[str]]:
+        """Names of the events by mode."""
+        return {mode: [term.name for term in terms] for mode, terms in self._terms.items() if terms}
+
+    def apply(self, mode: str, env_ids: torch.Tensor | None = None, dt: float | None = None) -> None:
+        """Run the events of a mode on all or some environments; ``dt`` [s] for intervals."""
+        if mode == "interval":
+            for term, time_left in zip(self._terms[mode], self._time_left, strict=True):
+                time_left -= dt or 0.0
+                due = (time_left <= 0.0).nonzero()[:, 0]
+                if len(due):
+                    time_left[due] = self._env.uniform((len(due),), *term.cfg.interval_range_s)  # type: ignore[attr-defined]
+                    term(due)
+            return
+        ids = torch.arange(self._env.num_envs, device=self._env.device) if env_ids is None else env_ids
+        for term in self._terms[mode]:
+            term(ids)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Reset class terms."""
+        for terms in self._terms.values():
+            for term in terms:
+                term.reset(env_ids)

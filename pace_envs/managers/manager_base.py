@@ -1,0 +1,117 @@
+"""What all managers share: terms by name, resolved once."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclasses.dataclass(kw_only=True)
+class SceneEntityCfg:
+    """Joints and bodies of an entity, named by regular expressions and found once, when the managers load."""
+
+    name: str = "robot"
+    """Name of the entity in the scene."""
+
+    joint_names: str | tuple[str, ...] | None = None
+    """Expressions of joints; ``None`` means all."""
+
+    body_names: str | tuple[str, ...] | None = None
+    """Expressions of bodies; ``None`` means all."""
+
+    preserve_order: bool = False
+    """Order by the expressions instead of by the entity's own order."""
+
+    joint_ids: slice | list[int] = dataclasses.field(default_factory=lambda: slice(None))
+    """Filled in by :meth:`resolve`."""
+
+    body_ids: slice | list[int] = dataclasses.field(default_factory=lambda: slice(None))
+    """Filled in by :meth:`resolve`."""
+
+    def resolve(self, env: ManagerBasedEnv) -> SceneEntityCfg:
+        """A copy with ``joint_ids`` and ``body_ids`` filled in."""
+        entity, found = env.scene[self.name], {}
+        if self.joint_names is not None:
+            found["joint_ids"] = entity.find_joints(self.joint_names, preserve_order=self.preserve_order)[0]
+        if self.body_names is not None:
+            found["body_ids"] = entity.find_bodies(self.body_names, preserve_order=self.preserve_order)[0]
+        return dataclasses.replace(self, **found)
+
+
+@dataclasses.dataclass(kw_only=True)
+class ManagerTermBaseCfg:
+    """A term: a function ``(env, **params)``, or a class built as ``(cfg, env)`` and then called so."""
+
+    func: Callable[..., Any]
+    """The function or class."""
+
+    params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Arguments after ``env``."""
+
+
+class ManagerTermBase:
+    """Base of terms that keep state."""
+
+    def __init__(self, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv):
+        """Keep the configuration and the environment."""
+        self.cfg = cfg
+        self._env = env
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Forget the state of some environments."""
+
+
+class Term:
+    """A term with its function and parameters resolved."""
+
+    def __init__(self, name: str, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv):
+        """Resolve scene entities, build class terms and check the arguments.
+
+        Raises:
+            ValueError: If an argument is missing or unknown.
+        """
+        self.name = name
+        self.cfg = cfg
+        self._env = env
+        self.params = {
+            key: value.resolve(env) if isinstance(value, SceneEntityCfg) else value
+            for key, value in cfg.params.items()
+        }
+        self.func = cfg.func(cfg, env) if inspect.isclass(cfg.func) else cfg.func
+        self._check_arguments()
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the term's function: ``func(env, *args, **params)``."""
+        return self.func(self._env, *args, **self.params)
+
+    def reset(self, env_ids: torch.Tensor) -> None:
+        """Reset the state of a class term."""
+        if isinstance(self.func, ManagerTermBase):
+            self.func.reset(env_ids)
+
+    def _check_arguments(self) -> None:
+        function = self.func.__call__ if isinstance(self.func, ManagerTermBase) else self.func
+        accepted = inspect.signature(function).parameters
+        if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in accepted.values()):
+            return
+        unknown = set(self.params) - set(accepted)
+        if unknown:
+            raise ValueError(
+                f"The term {self.name!r} got unknown params {', '.join(sorted(unknown))}. "
+                f"Its function takes: {', '.join(accepted)}."
+            )
+
+
+def term_items(cfg: Any) -> dict[str, Any]:
+    """Terms by name of a dict or of an object whose attributes are terms; ``None`` values are switched off."""
+    if cfg is None:
+        return {}
+    items = cfg if isinstance(cfg, Mapping) else vars(cfg)
+    return {name: term for name, term in items.items() if term is not None}

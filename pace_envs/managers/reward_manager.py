@@ -1,0 +1,62 @@
+"""Rewards: a weighted sum of terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class RewardTermCfg(ManagerTermBaseCfg):
+    """A reward ``func(env, **params) -> (num_envs,)`` per second."""
+
+    weight: float
+    """Factor of the term; 0 switches it off."""
+
+
+class RewardManager:
+    """Sums weight * term * dt and keeps each term's sum over the episode."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Resolve the terms."""
+        self._terms = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        self._reward = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
+        self._sums = {term.name: torch.zeros_like(self._reward) for term in self._terms}
+        self._max_episode_length_s = getattr(env, "max_episode_length_s", 1.0)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._sums)
+
+    def get_term_cfg(self, name: str) -> RewardTermCfg:
+        """The configuration of a term; its weight can be changed."""
+        return next(term.cfg for term in self._terms if term.name == name)  # type: ignore[return-value]
+
+    def compute(self, dt: float) -> torch.Tensor:
+        """The reward of this step, (num_envs,)."""
+        self._reward.zero_()
+        for term in self._terms:
+            weight = term.cfg.weight  # type: ignore[attr-defined]
+            if weight != 0.0:
+                value = term() * (weight * dt)
+                self._reward += value
+                self._sums[term.name] += value
+        return self._reward.clone()
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Clear the sums of some environments; returns each term's mean per second of a full episode."""
+        log = {}
+        for name, total in self._sums.items():
+            log[f"Episode_Reward/{name}"] = float(total[env_ids].mean()) / self._max_episode_length_s
+            total[env_ids] = 0.0
+        for term in self._terms:
+            term.reset(env_ids)
+        return log

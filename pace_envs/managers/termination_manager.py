@@ -1,0 +1,66 @@
+"""Terminations: why an episode ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class TerminationTermCfg(ManagerTermBaseCfg):
+    """A termination ``func(env, **params) -> (num_envs,) bool``."""
+
+    time_out: bool = False
+    """Whether the end is a truncation (time ran out) and not a failure."""
+
+
+class TerminationManager:
+    """Computes which environments are done, and why."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Resolve the terms."""
+        self._terms = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        self.terminated = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        self.time_outs = torch.zeros_like(self.terminated)
+        self._last = {term.name: torch.zeros_like(self.terminated) for term in self._terms}
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._last)
+
+    @property
+    def dones(self) -> torch.Tensor:
+        """Environments whose episode ended, (num_envs,) bool."""
+        return self.terminated | self.time_outs
+
+    def get_term(self, name: str) -> torch.Tensor:
+        """Which environments a term ended at the last step, (num_envs,) bool."""
+        return self._last[name]
+
+    def compute(self) -> torch.Tensor:
+        """Evaluate all terms; returns :attr:`dones`."""
+        self.terminated = torch.zeros_like(self.terminated)
+        self.time_outs = torch.zeros_like(self.time_outs)
+        for term in self._terms:
+            value = term()
+            self._last[term.name] = value
+            if term.cfg.time_out:  # type: ignore[attr-defined]
+                self.time_outs |= value
+            else:
+                self.terminated |= value
+        return self.dones
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Reset class terms; returns how many of these environments each term ended."""
+        log = {f"Episode_Termination/{name}": float(last[env_ids].sum()) for name, last in self._last.items()}
+        for term in self._terms:
+            term.reset(env_ids)
+        return log

@@ -1,0 +1,69 @@
+"""Action terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_actuators import JointValue, resolve_joint_values
+from pace_envs.managers import ActionTerm, ActionTermCfg
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+class JointPositionAction(ActionTerm):
+    """Joint position targets: q* = scale * action + offset."""
+
+    cfg: JointPositionActionCfg
+
+    def __init__(self, cfg: JointPositionActionCfg, env: ManagerBasedEnv):
+        """Find the joints, their scales and offsets."""
+        super().__init__(cfg, env)
+        ids, names = self._asset.find_joints(cfg.joint_names, preserve_order=cfg.preserve_order)
+        self.joint_names = names
+        self._joint_ids = None if ids == list(range(self._asset.num_joints)) else torch.tensor(ids)
+        self._scale = resolve_joint_values(cfg.scale, names, field="scale", default=1.0)
+        self._offset = resolve_joint_values(cfg.offset, names, field="offset", default=0.0)
+        if cfg.use_default_offset:
+            self._offset = self._asset.data.default_joint_pos[0, ids].clone()
+        self._plain = bool((self._scale == 1.0).all()) and not bool(self._offset.any())
+        self.processed_actions = torch.zeros(env.num_envs, len(ids), dtype=torch.float64, device=env.device)
+
+    @property
+    def action_dim(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    def process_actions(self, actions: torch.Tensor) -> None:
+        """Scale and offset."""
+        self.processed_actions = actions if self._plain else actions * self._scale + self._offset
+
+    def apply_actions(self) -> None:
+        """Set the joints' position targets."""
+        self._asset.set_joint_position_target(self.processed_actions, self._joint_ids)
+
+
+@dataclass(kw_only=True)
+class JointPositionActionCfg(ActionTermCfg):
+    """Configuration of :class:`JointPositionAction`."""
+
+    class_type: type[ActionTerm] = JointPositionAction
+    """The term's class."""
+
+    joint_names: str | tuple[str, ...] = ".*"
+    """Expressions of the joints."""
+
+    scale: JointValue = 1.0
+    """Factor [rad]."""
+
+    offset: JointValue = 0.0
+    """Offset [rad]."""
+
+    use_default_offset: bool = True
+    """Whether the default joint positions are the offset."""
+
+    preserve_order: bool = False
+    """Order of the action: by the expressions instead of by ``joint_names`` of the articulation."""

@@ -1,0 +1,56 @@
+"""Command terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_envs.managers import CommandTerm, CommandTermCfg
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+class UniformVelocityCommand(CommandTerm):
+    """Velocity of the base in its own frame: forward [m/s], left [m/s], yaw rate [rad/s]."""
+
+    cfg: UniformVelocityCommandCfg
+
+    def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedEnv):
+        """Start with zero commands."""
+        super().__init__(cfg, env)
+        self._command = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)
+        ranges = torch.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z], dtype=torch.float64)
+        self._low, self._high = ranges[:, 0], ranges[:, 1]
+
+    @property
+    def command(self) -> torch.Tensor:
+        """The present command, (num_envs, 3)."""
+        return self._command
+
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        drawn = self._env.uniform((len(env_ids), 3), self._low, self._high)
+        standing = self._env.uniform((len(env_ids), 1)) < self.cfg.rel_standing_envs
+        self._command[env_ids] = drawn.masked_fill(standing, 0.0)
+
+
+@dataclass(kw_only=True)
+class UniformVelocityCommandCfg(CommandTermCfg):
+    """Configuration of :class:`UniformVelocityCommand`."""
+
+    class_type: type[CommandTerm] = UniformVelocityCommand
+    """The term's class."""
+
+    lin_vel_x: tuple[float, float] = (-1.0, 1.0)
+    """Forward velocity [m/s]."""
+
+    lin_vel_y: tuple[float, float] = (-1.0, 1.0)
+    """Velocity to the left [m/s]."""
+
+    ang_vel_z: tuple[float, float] = (-1.0, 1.0)
+    """Yaw rate [rad/s]."""
+
+    rel_standing_envs: float = 0.02
+    """Part of the environments that are told to stand still, 0 to 1."""

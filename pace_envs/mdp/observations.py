@@ -1,0 +1,41 @@
+"""Observation terms: functions returning (num_envs, dim)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_envs.managers import SceneEntityCfg
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+    from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
+
+_ROBOT = SceneEntityCfg()
+
+
+def joint_pos(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Joint positions [rad]."""
+    return env.scene[asset_cfg.name].data.joint_pos[:, asset_cfg.joint_ids]
+
+
+def joint_pos_rel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Joint positions relative to the defaults [rad]."""
+    data = env.scene[asset_cfg.name].data
+    return (data.joint_pos - data.default_joint_pos)[:, asset_cfg.joint_ids]
+
+
+def joint_vel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Joint velocities [rad/s]."""
+    return env.scene[asset_cfg.name].data.joint_vel[:, asset_cfg.joint_ids]
+
+
+def last_action(env: ManagerBasedEnv) -> torch.Tensor:
+    """The last action."""
+    return env.action_manager.action
+
+
+def generated_commands(env: ManagerBasedRLEnv, command_name: str) -> torch.Tensor:
+    """The present command of a command term."""
+    return env.command_manager.get_command(command_name)

@@ -1,0 +1,134 @@
+"""Registering environments with Gymnasium and building them."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import gymnasium as gym
+
+from pace_envs.gym_vector import PaceVectorEnv
+from pace_envs.manager_based_env import ManagerBasedEnvCfg
+from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
+
+_TASKS = {
+    "Pace-AnymalD-v0": "pace_envs.tasks.pace.anymal_d:anymal_d_pace_env_cfg",
+    "Pace-Go2-v0": "pace_envs.tasks.pace.go2:go2_pace_env_cfg",
+    "Pace-TestBench-v0": "pace_envs.tasks.pace.test_bench:test_bench_pace_env_cfg",
+}
+
+
+def register_envs() -> None:
+    """Register the project's environments; Gymnasium calls this by itself where the project is installed."""
+    for task, entry_point in _TASKS.items():
+        if task not in gym.registry:
+            register_task(task, entry_point)
+
+
+def register_task(task: str, env_cfg_entry_point: str | Callable[[], ManagerBasedRLEnvCfg]) -> None:
+    """Register an environment: ``gym.make(task, num_envs=…)`` and ``gym.make_vec(task, num_envs=…)`` build it.
+
+    Args:
+        task: Its name, such as ``"Pace-MyRobot-v0"``.
+        env_cfg_entry_point: A function that returns its configuration, or ``"module:function"``.
+
+    Raises:
+        ValueError: If the name is taken.
+    """
+    if task in gym.registry:
+        raise ValueError(f"An environment named {task!r} is already registered. Choose another name.")
+    gym.register(
+        id=task,
+        entry_point="pace_envs.registration:make_env",
+        vector_entry_point="pace_envs.registration:make_vector_env",
+        disable_env_checker=True,
+        order_enforce=False,
+        kwargs={"env_cfg_entry_point": env_cfg_entry_point},
+    )
+
+
+def registered_tasks() -> list[str]:
+    """Names of all environments that were registered this way."""
+    return sorted(name for name, spec in gym.registry.items() if "env_cfg_entry_point" in spec.kwargs)
+
+
+def load_env_cfg(task: str) -> Any:
+    """A fresh configuration of a registered environment.
+
+    Raises:
+        ValueError: If there is no such environment.
+    """
+    if task not in registered_tasks():
+        close = difflib.get_close_matches(task, registered_tasks(), n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise ValueError(
+            f"There is no environment {task!r}.{hint} Available: {', '.join(registered_tasks())}. "
+            "Register your own with pace_envs.register_task."
+        )
+    return _call(gym.registry[task].kwargs["env_cfg_entry_point"])
+
+
+def make_env(
+    env_cfg_entry_point: str | Callable[[], ManagerBasedRLEnvCfg],
+    cfg: ManagerBasedRLEnvCfg | None = None,
+    num_envs: int | None = None,
+    physics_dt: float | None = None,
+    delay_mode: str | None = None,
+    seed: int | None = None,
+    render_mode: str | None = None,
+) -> ManagerBasedRLEnv:
+    """Build an environment; ``gym.make`` calls this.
+
+    Args:
+        env_cfg_entry_point: Where its configuration comes from.
+        cfg: A configuration of your own instead.
+        num_envs: Number of environments.
+        physics_dt: A finer physics time step under the same control rate [s].
+        delay_mode: ``"command"`` or ``"effort"``, for all drives.
+        seed: Seed of all random draws.
+        render_mode: ``None`` or ``"rgb_array"``.
+    """
+    env_cfg = copy.deepcopy(cfg) if cfg is not None else _call(env_cfg_entry_point)
+    if num_envs is not None:
+        env_cfg.scene.num_envs = num_envs
+    if seed is not None:
+        env_cfg.seed = seed
+    if physics_dt is not None:
+        set_physics_dt(env_cfg, physics_dt)
+    if delay_mode is not None:
+        for drive in env_cfg.scene.robot.actuators.values():
+            drive.delay_mode = delay_mode
+    return ManagerBasedRLEnv(env_cfg, render_mode)
+
+
+def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
+    """Build Gymnasium's vector form of an environment; ``gym.make_vec`` calls this."""
+    return PaceVectorEnv(make_env(num_envs=num_envs, **kwargs))
+
+
+def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
+    """Make the physics step finer; the controllers, and the environment, keep their rates.
+
+    Raises:
+        ValueError: If the present time step is no multiple of the finer one.
+    """
+    ratio = round(cfg.sim.dt / physics_dt) if physics_dt > 0 else 0
+    if ratio < 1 or abs(ratio * physics_dt - cfg.sim.dt) > 1e-9:
+        raise ValueError(
+            f"physics_dt is {physics_dt:g} s, expected a whole fraction of the control step {cfg.sim.dt:g} s, "
+            f"such as {cfg.sim.dt / 5:g}."
+        )
+    cfg.sim.dt = cfg.sim.dt / ratio
+    cfg.decimation *= ratio
+    for drive in cfg.scene.robot.actuators.values():
+        drive.control_decimation *= ratio
+
+
+def _call(entry_point: str | Callable[[], Any]) -> Any:
+    if isinstance(entry_point, str):
+        module, _, name = entry_point.partition(":")
+        entry_point = getattr(import_module(module), name)
+    return entry_point()

@@ -1,0 +1,30 @@
+"""Pictures of one environment, without a screen."""
+
+import mujoco
+import numpy as np
+
+from pace_envs.simulation import Simulation
+
+
+class OffscreenRenderer:
+    """Draws environment 0 with MuJoCo's renderer (set MUJOCO_GL to egl or osmesa where there is no screen)."""
+
+    def __init__(self, sim: Simulation, width: int = 1280, height: int = 720):
+        """Create the renderer; uses the model's camera ``track`` where there is one."""
+        self._sim = sim
+        cameras = [sim.model.camera(i).name for i in range(sim.model.ncam)]
+        self._camera: str | int = "track" if "track" in cameras else -1
+        self._model = sim.batch.get_model(0)
+        self._data = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, height, width)
+
+    def render(self) -> np.ndarray:
+        """The picture, (height, width, 3) uint8."""
+        self._sim.batch.get_data(0, self._data)
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, camera=self._camera)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Release the renderer."""
+        self._renderer.close()

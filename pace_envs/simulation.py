@@ -1,0 +1,164 @@
+"""Many simulations of one model on a thread pool, their arrays shared with torch."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+import torch
+from mujoco import batch
+
+EnvIds = Sequence[int] | torch.Tensor | np.ndarray | slice | None
+
+_INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+}
+
+
+@dataclass(kw_only=True)
+class SimulationCfg:
+    """How the physics is stepped."""
+
+    dt: float = 0.0025
+    """Physics time step [s]."""
+
+    integrator: Literal["implicitfast", "implicit", "euler"] = "implicitfast"
+    """MuJoCo's integrator."""
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """Gravity [m/s^2]."""
+
+    friction_timeconst: float | None = None
+    """Time constant of the joints' Coulomb friction [s]; ``None`` means two time steps, the stiffest that is stable.
+
+    MuJoCo's default of 20 ms is soft: a stuck joint creeps.
+    """
+
+    friction_impedance: float = 0.999
+    """Impedance of the joints' Coulomb friction, 0 to 1; the closer to 1, the less a stuck joint creeps."""
+
+    contacts: bool = False
+    """Whether geoms collide."""
+
+    num_threads: int = 0
+    """Threads of the physics; 0 means one per processor. Results do not depend on it."""
+
+    iterations: int = 100
+    """Largest number of solver iterations a step."""
+
+
+class Simulation:
+    """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (float64, no copies)."""
+
+    def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
+        """Compile the model and start the thread pool.
+
+        Args:
+            cfg: The configuration.
+            spec: The model; it is changed (options, joint friction solver parameters, no actuators).
+            num_envs: Number of simulations.
+
+        Raises:
+            ValueError: If a value of the configuration or the model is unusable.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}, expected at least 1.")
+        if not (np.isfinite(cfg.dt) and 0 < cfg.dt <= 0.1):
+            raise ValueError(f"sim.dt is {cfg.dt} s, expected a time step in (0, 0.1] s.")
+        if cfg.integrator not in _INTEGRATORS:
+            raise ValueError(f"Unknown integrator {cfg.integrator!r}. Available: {', '.join(_INTEGRATORS)}.")
+        self.cfg = cfg
+        self.num_envs = num_envs
+        self.device = torch.device("cpu")
+        self.model = self._compile(spec)
+        if mujoco.get_mju_user_warning() is None:
+            mujoco.set_mju_user_warning(_ignore_warning)
+        self.batch = batch.Batch(self.model, num_envs, nthread=cfg.num_threads)
+        self.qpos = self.bind("qpos")
+        self.qvel = self.bind("qvel")
+        self.qfrc_applied = self.bind("qfrc_applied")
+        self._constants_changed = False
+
+    def bind(self, field: str) -> torch.Tensor:
+        """A live tensor over an ``MjData`` field, shape (num_envs, ...).
+
+        State fields can be written; fields that MuJoCo computes are for reading only.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # torch knows no read-only tensors
+            return torch.from_numpy(self.batch.bind(field))
+
+    def expand(self, field: str) -> torch.Tensor:
+        """A live tensor over an ``MjModel`` field's values per simulation; call :meth:`constants_changed` after writing."""
+        return torch.from_numpy(self.batch.expand(field))
+
+    def constants_changed(self) -> None:
+        """Note that model fields were written, so that derived constants are computed before the next step."""
+        self._constants_changed = True
+
+    def step(self) -> None:
+        """Advance every simulation by one physics step."""
+        if self._constants_changed:
+            self._update_constants()
+        self.batch.step()
+
+    def forward(self, env_ids: EnvIds = None) -> None:
+        """Compute everything that follows from the state, without advancing time."""
+        if self._constants_changed:
+            self._update_constants()
+        self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Put the state of all or some simulations back to the model's (positions, speeds, forces, time)."""
+        ids = None if env_ids is None else self.resolve_env_ids(env_ids)
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+
+    def resolve_env_ids(self, env_ids: EnvIds) -> np.ndarray:
+        """Environment indices, sorted and unique, as an int32 array."""
+        if env_ids is None:
+            return np.arange(self.num_envs, dtype=np.int32)
+        if isinstance(env_ids, slice):
+            return np.arange(self.num_envs, dtype=np.int32)[env_ids]
+        ids = np.unique(np.asarray(env_ids))
+        if ids.size and (ids[0] < 0 or ids[-1] >= self.num_envs):
+            raise ValueError(f"env_ids holds {ids[0]} to {ids[-1]}, expected 0 to {self.num_envs - 1}.")
+        return ids.astype(np.int32)
+
+    def close(self) -> None:
+        """Release the simulations."""
+        self.batch = None
+
+    def _update_constants(self) -> None:
+        self.batch.set_const()
+        self._constants_changed = False
+
+    def _compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)  # the drive is pace_actuators' business
+        spec.option.timestep = self.cfg.dt
+        spec.option.integrator = _INTEGRATORS[self.cfg.integrator]
+        spec.option.gravity = self.cfg.gravity
+        spec.option.iterations = self.cfg.iterations
+        # a simulation that diverges must show it instead of starting again at rest
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        if not self.cfg.contacts:
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        timeconst = 2 * self.cfg.dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
+        impedance = self.cfg.friction_impedance
+        for joint in spec.joints:
+            joint.solref_friction = [timeconst, 1.0]
+            joint.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise ValueError(f"MuJoCo cannot compile the model: {error}") from None
+
+
+def _ignore_warning(message: str) -> None:
+    """Keep MuJoCo from printing, and logging to a file, each diverged simulation: their states say it."""

@@ -1,0 +1,1 @@
+"""Tasks: environments by what they are for."""

@@ -1,0 +1,108 @@
+"""What identification needs to know of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PARAMETER_GROUPS = ("armature", "viscous_friction", "friction", "encoder_bias")
+"""The parameters of each joint, in the order of the parameter vector; the delay follows them."""
+
+
+@dataclass(kw_only=True)
+class CMAESOptimizerCfg:
+    """Settings of the search."""
+
+    max_iteration: int = 200
+    """Largest number of generations."""
+
+    epsilon: float | None = 1e-2
+    """Stop when (max - min) / min of a generation's scores falls below this; ``None`` switches it off."""
+
+    sigma: float = 0.5
+    """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
+
+    save_interval: int = 10
+    """Generations between two saved means and checkpoints."""
+
+    save_optimization_process: bool = False
+    """Whether every generation's parameters and scores are kept in ``progress.pt``."""
+
+
+@dataclass(kw_only=True)
+class ExcitationCfg:
+    """How the robot is moved for a recording: target = (signal + bias) * direction * scale, per joint."""
+
+    bias: tuple[float, ...]
+    """Centre of the motion before scaling, one per joint."""
+
+    direction: tuple[float, ...]
+    """+1 or -1, one per joint."""
+
+    scale: tuple[float, ...]
+    """Amplitude [rad] of a signal that runs from -1 to 1, one per joint."""
+
+
+@dataclass(kw_only=True)
+class PaceCfg:
+    """Names, bounds and search settings of a robot's identification."""
+
+    robot_name: str
+    """Name of the robot; runs are kept under it."""
+
+    data_dir: str | Path
+    """The recording that is used when no other is named."""
+
+    joint_order: tuple[str, ...]
+    """The joints, in the order of every vector."""
+
+    bounds_params: torch.Tensor
+    """Lower and upper bound of each parameter, (4n+1, 2): armature [kg m^2], viscous friction [N m s/rad],
+    Coulomb friction [N m] and encoder bias [rad] of every joint, then the delay [control steps]."""
+
+    cmaes: CMAESOptimizerCfg = field(default_factory=CMAESOptimizerCfg)
+    """Settings of the search."""
+
+    excitation: ExcitationCfg | None = None
+    """How the robot is moved for a recording; ``None`` if it is only fitted to given ones."""
+
+    sample_params: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
+    """The true parameters of simulated recordings, by name: a number, or a number per joint."""
+
+    apply_load: Callable[[Any, Any, Mapping[str, float]], None] | None = None
+    """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to some environments,
+    as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
+
+    def __post_init__(self) -> None:
+        """Check the shape and order of the bounds."""
+        expected = (4 * len(self.joint_order) + 1, 2)
+        self.bounds_params = torch.as_tensor(self.bounds_params, dtype=torch.float64)
+        if tuple(self.bounds_params.shape) != expected:
+            raise ValueError(
+                f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters for "
+                f"each of the {len(self.joint_order)} joints in joint_order, then the delay."
+            )
+        wrong = (~(self.bounds_params[:, 0] <= self.bounds_params[:, 1])).nonzero()[:, 0]
+        if len(wrong):
+            row = int(wrong[0])
+            low, high = self.bounds_params[row].tolist()
+            raise ValueError(f"bounds_params row {row} is ({low:g}, {high:g}), expected lower <= upper.")
+
+
+def make_bounds(
+    joint_order: tuple[str, ...],
+    *,
+    armature: tuple[float, float],
+    viscous_friction: tuple[float, float],
+    friction: tuple[float, float],
+    encoder_bias: tuple[float, float],
+    delay: tuple[float, float],
+) -> torch.Tensor:
+    """``bounds_params`` with the same bounds for every joint, (4n+1, 2)."""
+    n = len(joint_order)
+    groups = [armature, viscous_friction, friction, encoder_bias]
+    return torch.tensor([pair for pair in groups for _ in range(n)] + [delay], dtype=torch.float64)

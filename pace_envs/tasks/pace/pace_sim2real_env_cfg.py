@@ -1,0 +1,62 @@
+"""The identification environment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pace_envs import mdp
+from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
+from pace_envs.managers import ActionTermCfg, ObservationGroupCfg, ObservationTermCfg, TerminationTermCfg
+from pace_envs.scene import InteractiveSceneCfg
+from pace_envs.tasks.pace.pace_cfg import PaceCfg
+
+
+@dataclass(kw_only=True)
+class PaceSim2realSceneCfg(InteractiveSceneCfg):
+    """A robot held in the air."""
+
+    def __post_init__(self) -> None:
+        """Fix the base."""
+        self.robot.fix_base = True
+
+
+def _actions() -> dict[str, ActionTermCfg]:
+    return {"joint_pos": mdp.JointPositionActionCfg(use_default_offset=False)}
+
+
+def _observations() -> dict[str, ObservationGroupCfg]:
+    terms = {
+        "joint_pos": ObservationTermCfg(func=mdp.joint_pos),
+        "joint_vel": ObservationTermCfg(func=mdp.joint_vel),
+    }
+    return {"policy": ObservationGroupCfg(terms=terms)}
+
+
+def _terminations() -> dict[str, TerminationTermCfg]:
+    return {"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True)}
+
+
+@dataclass(kw_only=True)
+class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
+    """400 Hz physics and control, actions are joint position targets [rad], episodes end only after days."""
+
+    scene: PaceSim2realSceneCfg
+    """The robot, its base fixed."""
+
+    sim2real: PaceCfg
+    """What identification needs to know of the robot."""
+
+    episode_length_s: float = 1e6
+    """Longest episode [s]."""
+
+    actions: Mapping[str, ActionTermCfg] = field(default_factory=_actions)
+    """Joint position targets, scale 1, no offset."""
+
+    observations: Mapping[str, ObservationGroupCfg] = field(default_factory=_observations)
+    """Joint positions [rad] and velocities [rad/s]."""
+
+    terminations: Mapping[str, TerminationTermCfg] = field(default_factory=_terminations)
+    """Only the time."""
+
+    def __post_init__(self) -> None:
+        """Use the identification's joint order everywhere."""
+        self.scene.robot.joint_order = tuple(self.sim2real.joint_order)
