@@ -10,7 +10,7 @@ Interpolation = Literal["linear", "hold"]
 
 
 class DelayBuffer:
-    """Delays a batched signal by a time lag of its own for every environment.
+    """Delays a batched signal (num_envs, num_joints) by a time lag of its own for every environment.
 
     With the lag d = i + f (i whole steps, f the fraction), the output at step k is
 
@@ -47,8 +47,8 @@ class DelayBuffer:
         self._num_envs = num_envs
         self._device = torch.device(device)
         self._length = math.ceil(max_delay) + 2
-        self._lag = torch.zeros(num_envs, dtype=torch.float64, device=self._device)
-        self._storage: torch.Tensor | None = None  # (length * num_envs, ...)
+        self._lag = torch.zeros(num_envs, 1, dtype=torch.float64, device=self._device)
+        self._storage: torch.Tensor | None = None  # (length * num_envs, num_joints)
         self._head = 0
         self._stale = torch.ones(num_envs, dtype=torch.bool, device=self._device)
         self._any_stale = True
@@ -57,8 +57,8 @@ class DelayBuffer:
 
     @property
     def time_lags(self) -> torch.Tensor:
-        """Lag of each environment [steps], shape (num_envs,)."""
-        return self._lag.clone()
+        """Lags [steps]: one per environment, (num_envs,), or one per joint, (num_envs, num_joints)."""
+        return self._lag[:, 0].clone() if self._lag.shape[1] == 1 else self._lag.clone()
 
     def set_time_lag(
         self, time_lag: float | torch.Tensor, env_ids: Sequence[int] | torch.Tensor | slice | None = None
@@ -66,21 +66,24 @@ class DelayBuffer:
         """Set the lag of all or some environments; the history is kept.
 
         Args:
-            time_lag: Lag [steps], a number or shape (len(env_ids),) or (len(env_ids), 1).
+            time_lag: Lag [steps]: a number, one per environment (len(env_ids),), or one per environment and
+                joint (len(env_ids), num_joints).
             env_ids: The environments, or ``None`` for all.
 
         Raises:
             ValueError: If a lag is not a number between 0 and ``max_delay``.
         """
         lag = torch.as_tensor(time_lag, dtype=torch.float64, device=self._device)
-        if lag.ndim == 2 and lag.shape[1] == 1:
-            lag = lag[:, 0]
+        if lag.ndim == 1:
+            lag = lag[:, None]
         bad = ~((lag >= 0) & (lag <= self.max_delay))
         if bool(bad.any()):
             raise ValueError(
                 f"A delay of {lag[bad].flatten()[0].item():g} steps was set, expected 0 to max_delay = "
                 f"{self.max_delay:g}. Raise max_delay in the actuator's configuration or bound the delay."
             )
+        if lag.ndim == 2 and lag.shape[1] > self._lag.shape[1]:
+            self._lag = self._lag.repeat(1, lag.shape[1])
         self._lag[slice(None) if env_ids is None else env_ids] = lag
         self._index_lags()
 
@@ -93,7 +96,7 @@ class DelayBuffer:
         """Push a sample and return the delayed one.
 
         Args:
-            data: The sample, shape (num_envs, ...).
+            data: The sample, shape (num_envs, num_joints).
 
         Returns:
             The delayed sample, same shape.
@@ -111,11 +114,17 @@ class DelayBuffer:
         self._storage[start : start + self._num_envs] = data
         if self._all_zero:
             return data
-        newer = self._storage.index_select(0, self._newer[self._head])
+        newer = self._look_up(self._newer[self._head])
         if self._whole:
             return newer
-        older = self._storage.index_select(0, self._older[self._head])
-        return newer.lerp_(older, self._fraction.to(data.dtype).view(-1, *[1] * (data.ndim - 1)))
+        older = self._look_up(self._older[self._head])
+        return newer.lerp_(older, self._fraction.to(data.dtype))
+
+    def _look_up(self, index: torch.Tensor) -> torch.Tensor:
+        storage = self._storage
+        if index.ndim == 1:  # whole rows: one lag per environment
+            return storage.index_select(0, index)  # type: ignore[union-attr]
+        return storage.gather(0, index)  # type: ignore[union-attr]
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
@@ -124,7 +133,10 @@ class DelayBuffer:
         self._whole = not bool(self._fraction.any())
         self._all_zero = not bool(self._lag.any())
         heads = torch.arange(self._length, device=self._device)[:, None]
-        envs = torch.arange(self._num_envs, device=self._device)
-        steps = whole.long()
+        if whole.shape[1] == 1:
+            steps, envs = whole[:, 0].long(), torch.arange(self._num_envs, device=self._device)
+        else:
+            heads, steps = heads[..., None], whole.long()
+            envs = torch.arange(self._num_envs, device=self._device)[:, None]
         self._newer = ((heads - steps) % self._length) * self._num_envs + envs
         self._older = ((heads - steps - 1) % self._length) * self._num_envs + envs

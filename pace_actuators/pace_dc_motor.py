@@ -141,7 +141,7 @@ class PaceDCMotor:
 
     @property
     def time_lags(self) -> torch.Tensor:
-        """Delay of each environment [control steps], shape (num_envs,)."""
+        """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
         return next(iter(self._delay_buffers.values())).time_lags
 
     def compute(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> Any:
@@ -225,7 +225,7 @@ class PaceDCMotor:
         self.encoder_bias[rows] = torch.as_tensor(encoder_bias, dtype=self._dtype, device=self._device)
 
     def update_time_lags(self, delay: torch.Tensor | float, env_ids: EnvIds = None) -> None:
-        """Set the delay [control steps], a real number or shape (len(env_ids),) or (len(env_ids), 1).
+        """Set the delay [control steps]: a number, (len(env_ids),) or, per joint, (len(env_ids), num_joints).
 
         Raises:
             ValueError: If a delay lies outside 0 to ``max_delay``.
