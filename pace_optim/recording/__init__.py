@@ -1,0 +1,21 @@
+"""Recordings of real (or simulated) joints: reading, checking, and bringing them onto the simulation's grid.
+
+>>> recording = load_recording("leg.csv")
+>>> recording = conform_recording(recording, joint_order=("hip", "knee"), control_dt=0.0025)
+>>> recording.dof_pos, recording.command, recording.notes
+"""
+
+from .conform import conform_recording
+from .data import Drive, Load, Recording, validation_start
+from .files import SUFFIXES, load_recording, save_recording
+
+__all__ = [
+    "SUFFIXES",
+    "Drive",
+    "Load",
+    "Recording",
+    "conform_recording",
+    "load_recording",
+    "save_recording",
+    "validation_start",
+]

@@ -1,0 +1,121 @@
+"""Bring a recording onto a robot's joints and a simulation's control grid."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from .data import Drive, Recording
+from .keys import JOINT_SERIES, listed
+from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
+from .robot_checks import check_load, check_motion, column_order
+from .time_base import TimeBase, fit_time_base
+
+
+def conform_recording(
+    recording: Recording,
+    *,
+    joint_order: Sequence[str],
+    control_dt: float,
+    joint_pos_limits: np.ndarray | None = None,
+    limit_margin: float = 0.2,
+    load_bodies: Collection[str] = (),
+    accepts_load: bool = False,
+) -> Recording:
+    """Return the recording with columns in `joint_order` and samples on the grid of the control.
+
+    1. Check joints and load against the robot; put columns (and the drive's values) in `joint_order`.
+    2. Check the motion: limits, units, wraps; note what is odd.
+    3. Compare the time stamps with the grid of spacing `sample_stride * control_dt`: keep the samples bit for
+       bit when they lie on it, else resample them.
+    4. Fill `command` and `command_torque_enable` on the control grid.
+
+    A recording that is already conformed to `control_dt` keeps its samples and commands.
+
+    Args:
+        recording: As `load_recording` gives it.
+        joint_order: The robot's joints, in the order wanted.
+        control_dt: Control step of the simulation [s].
+        joint_pos_limits: Lower and upper limit per joint of `joint_order`, (n, 2) [rad]; infinite where none.
+        limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops).
+        load_bodies: Bodies that `added_mass` may name.
+        accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
+
+    Raises:
+        ValueError: If the recording does not fit the robot or its time base cannot be used.
+    """
+    if not (np.isfinite(control_dt) and control_dt > 0.0):
+        raise ValueError(f"control_dt is {control_dt}; expected a time above zero [s]. Correct the argument.")
+    if len(set(joint_order)) != len(joint_order):
+        raise ValueError(f"joint_order names a joint twice: {listed(joint_order)}. Name each joint once.")
+    check_load(recording, load_bodies, accepts_load)
+    columns, notes = column_order(recording, joint_order)
+    recording = _with_columns(recording, columns, tuple(joint_order))
+    notes += check_motion(recording, joint_pos_limits, limit_margin)
+    if recording.command is not None:
+        _check_conformed(recording, control_dt)
+        return recording
+    base = fit_time_base(recording.time, control_dt, recording.label)
+    on_grid = _kept(recording, base) if base.exact else _resampled(recording, base, control_dt)
+    time = base.sample_stride * control_dt * np.arange(base.num_samples)
+    return replace(
+        recording,
+        **on_grid,
+        time=time,
+        sample_stride=base.sample_stride,
+        notes=(*recording.notes, *base.notes, *notes),
+    )
+
+
+def _with_columns(recording: Recording, columns: list[int], joint_order: tuple[str, ...]) -> Recording:
+    def take(array: np.ndarray | None) -> np.ndarray | None:
+        return None if array is None else array[..., columns]
+
+    series: dict[str, Any] = {key: take(getattr(recording, key)) for key in (*JOINT_SERIES, "command")}
+    drive = Drive(**{f.name: take(getattr(recording.drive, f.name)) for f in fields(Drive)})
+    return replace(recording, joint_names=joint_order, drive=drive, **series)
+
+
+def _check_conformed(recording: Recording, control_dt: float) -> None:
+    own_dt = float(recording.time[1] - recording.time[0]) / recording.sample_stride
+    if abs(own_dt / control_dt - 1.0) > 1e-6:
+        raise ValueError(
+            f"{recording.label}: is already on a control step of {own_dt:g} s; expected a recording as "
+            f"loaded, or one on {control_dt:g} s. Conform the loaded recording."
+        )
+
+
+def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:
+    """The samples as they are; commands repeated over the control steps of a sample."""
+    stride, count = base.sample_stride, (base.num_samples - 1) * base.sample_stride + 1
+    enable = recording.torque_enable
+    return {
+        "command": np.repeat(recording.des_dof_pos, stride, axis=0)[:count],
+        "command_torque_enable": None if enable is None else np.repeat(enable, stride)[:count],
+    }
+
+
+def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
+    """The samples on the grid; what was commanded at a sample is what the control has there."""
+    stride, count = base.sample_stride, (base.num_samples - 1) * base.sample_stride + 1
+    stamps = recording.time - recording.time[0]
+    at = np.minimum(stride * control_dt * np.arange(base.num_samples), stamps[-1])
+    command = hold_on_grid(stamps, recording.des_dof_pos, control_dt, count)
+    result: dict[str, Any] = {"command": command, "des_dof_pos": command[::stride]}
+    for key, interpolate in (
+        ("dof_pos", interpolate_smooth),
+        ("dof_vel", interpolate_smooth),
+        ("dof_effort", interpolate_linear),
+    ):
+        if (values := getattr(recording, key)) is not None:
+            result[key] = interpolate(stamps, values, at)
+    if recording.torque_enable is not None:
+        share_on = hold_on_grid(
+            stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count
+        )
+        result["command_torque_enable"] = share_on[:, 0] >= 0.5
+        result["torque_enable"] = result["command_torque_enable"][::stride]
+    return result

@@ -1,0 +1,117 @@
+"""The data classes of a recording: what was measured, what was commanded, and the facts that go with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drive:
+    """The drive in force while recording; one value per joint, None where the file does not say."""
+
+    stiffness: np.ndarray | None = None
+    """Proportional gain, (n,) [N m/rad]."""
+    damping: np.ndarray | None = None
+    """Derivative gain, (n,) [N m s/rad]."""
+    effort_limit: np.ndarray | None = None
+    """Largest torque, (n,) [N m]."""
+    saturation_effort: np.ndarray | None = None
+    """Stall torque of the torque-speed line, (n,) [N m]."""
+    velocity_limit: np.ndarray | None = None
+    """No-load speed of the torque-speed line, (n,) [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Load:
+    """The load carried while recording; empty or None where the file does not say."""
+
+    added_mass: Mapping[str, float] = field(default_factory=dict)
+    """Mass added to a body, {body: kg}."""
+    load_mass: float | None = None
+    """Point mass at the end of the test bench's arm [kg]."""
+    load_length: float | None = None
+    """Distance of that mass from the axis [m]."""
+    arm_mass: float | None = None
+    """Mass of the test bench's uniform rod [kg]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """One recording of n joints over T samples.
+
+    `dof_pos[k]` is measured at `time[k]`, the instant at which `des_dof_pos[k]` is issued. A target holds
+    until the next sample. `load_recording` gives a recording as its file has it; `conform_recording` puts it
+    on a simulation's grid and fills `command`.
+    """
+
+    name: str
+    """The file's "name", or the stem of its path."""
+    joint_names: tuple[str, ...]
+    """Names in the order of the columns; empty when the file has none (a conformed recording has them)."""
+    time: np.ndarray
+    """Instants, (T,) [s]; starts at 0 once conformed."""
+    dof_pos: np.ndarray
+    """Encoder positions, (T, n) [rad]."""
+    des_dof_pos: np.ndarray
+    """Commanded positions, (T, n) [rad]."""
+    dof_vel: np.ndarray | None = None
+    """Measured speeds, (T, n) [rad/s]."""
+    dof_effort: np.ndarray | None = None
+    """Measured torques, (T, n) [N m]."""
+    torque_enable: np.ndarray | None = None
+    """False where the drive gives no torque, (T,) bool."""
+    drive: Drive = field(default_factory=Drive)
+    """The drive in force."""
+    load: Load = field(default_factory=Load)
+    """The load carried."""
+    sample_stride: int = 1
+    """Control steps per sample (set by `conform_recording`)."""
+    command: np.ndarray | None = None
+    """Commanded positions on the control grid, ((T - 1) * sample_stride + 1, n) [rad]; None until conformed.
+
+    `command[::sample_stride]` is `des_dof_pos`.
+    """
+    command_torque_enable: np.ndarray | None = None
+    """`torque_enable` on the control grid, or None."""
+    notes: tuple[str, ...] = ()
+    """What a user should know about this recording, in plain sentences."""
+    source: str = ""
+    """Path of the file."""
+
+    @property
+    def num_samples(self) -> int:
+        """Number of samples T."""
+        return len(self.time)
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints n."""
+        return self.dof_pos.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def label(self) -> str:
+        """How messages call this recording: its path, or its name when it came from no file."""
+        return self.source or self.name
+
+
+def validation_start(recording: Recording, fraction: float = 0.7) -> int:
+    """Return the index of the first sample to validate on; samples before it are for training.
+
+    Args:
+        recording: The recording to split in time.
+        fraction: Share of the samples used for training, between 0 and 1.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise ValueError(
+            f"{recording.label}: found a training share of {fraction}; expected a number between 0 and 1. "
+            "Use 0.7 to validate on the last 30 %."
+        )
+    return min(max(round(fraction * recording.num_samples), 1), recording.num_samples - 1)

@@ -1,0 +1,134 @@
+"""From the facts in a file to `Drive`, `Load` and joint names, each checked once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from .data import Drive, Load
+from .keys import BENCH_FACTS, DRIVE_FACTS, did_you_mean, listed
+
+_MAY_BE_INFINITE = ("effort_limit", "saturation_effort", "velocity_limit")
+_MAY_BE_ZERO = ("stiffness", "damping", "load_mass", "arm_mass")
+
+
+def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
+    """Return the file's joint names as a tuple, () when it has none.
+
+    Args:
+        value: The file's "joint_names", or None.
+        num_joints: Number of columns that the names must cover.
+        source: Path, for messages.
+    """
+    if value is None:
+        return ()
+    names = value.tolist() if isinstance(value, np.ndarray) else value
+    if (
+        isinstance(names, str)
+        or not isinstance(names, Sequence)
+        or not all(isinstance(n, str) for n in names)
+    ):
+        raise ValueError(
+            f"{source}: joint_names is {value!r}; expected a list of text, one name per column of dof_pos. "
+            "Write joint_names as a list of names."
+        )
+    if len(names) != num_joints:
+        raise ValueError(
+            f"{source}: joint_names has {len(names)} names ({listed(names)}) but dof_pos has {num_joints} "
+            "columns. Give one name per column."
+        )
+    if repeated := sorted({n for n in names if names.count(n) > 1}):
+        raise ValueError(f"{source}: joint_names repeats {listed(repeated)}. Give every joint its own name.")
+    return tuple(names)
+
+
+def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], num_joints: int, source: str) -> Drive:
+    """Read the drive's facts: a number for all joints, one per joint in column order, or {joint: value}."""
+    given = {key: fields[key] for key in DRIVE_FACTS if fields.get(key) is not None}
+    return Drive(**{k: _per_joint(k, v, joint_names, num_joints, source) for k, v in given.items()})
+
+
+def load_of(fields: Mapping[str, Any], source: str) -> Load:
+    """Read the load's facts."""
+    bench = {key: _number(key, fields[key], source) for key in BENCH_FACTS if fields.get(key) is not None}
+    return Load(added_mass=_added_mass(fields.get("added_mass"), source), **bench)
+
+
+def _per_joint(
+    key: str, value: Any, joint_names: tuple[str, ...], num_joints: int, source: str
+) -> np.ndarray:
+    if isinstance(value, Mapping):
+        value = _in_column_order(key, value, joint_names, source)
+    try:
+        array = np.asarray(value)
+    except ValueError:  # a ragged list
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(
+            f"{source}: {key} is {value!r}; expected a number, a list of {num_joints} numbers in the order "
+            f"of the recording's columns, or {{joint: number}}. Correct {key}."
+        )
+    if array.shape not in ((), (1,), (num_joints,)):
+        raise ValueError(
+            f"{source}: {key} has shape {array.shape}; expected one number, or {num_joints} (one per joint). "
+            f"Correct {key} or leave it out."
+        )
+    array = np.broadcast_to(array.astype(np.float64), (num_joints,)).copy()
+    for joint in range(num_joints):
+        label = joint_names[joint] if joint_names else f"column {joint}"
+        _check_range(f"{key} of {label}", key, array[joint], source)
+    return array
+
+
+def _in_column_order(key: str, value: Mapping, joint_names: tuple[str, ...], source: str) -> list:
+    if not joint_names:
+        raise ValueError(
+            f"{source}: {key} is given by joint name, but the recording has no joint_names. "
+            "Add joint_names, or give a list in the order of the columns."
+        )
+    for name in value:
+        if name not in joint_names:
+            raise ValueError(
+                f"{source}: {key} names the unknown joint '{name}'{did_you_mean(str(name), joint_names)} "
+                f"Joints of the recording: {listed(joint_names)}."
+            )
+    if missing := [name for name in joint_names if name not in value]:
+        raise ValueError(f"{source}: {key} has no value for {listed(missing)}. Give one for every joint.")
+    return [value[name] for name in joint_names]
+
+
+def _added_mass(value: Any, source: str) -> dict[str, float]:
+    if value is None:
+        return {}
+    if isinstance(value, str):  # in an .npz
+        with suppress(json.JSONDecodeError):  # the message below shows what is no JSON
+            value = json.loads(value)
+    if not isinstance(value, Mapping) or not all(isinstance(body, str) for body in value):
+        raise ValueError(
+            f"{source}: added_mass is {value!r}; expected {{body: kg}} (in an .npz as JSON text). "
+            'Write it as {"body_name": 0.5}.'
+        )
+    return {
+        body: _number("added_mass", mass, source, f"added_mass of {body}") for body, mass in value.items()
+    }
+
+
+def _number(key: str, value: Any, source: str, label: str = "") -> float:
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf" or array.size != 1:
+        raise ValueError(f"{source}: {label or key} is {value!r}; expected one number. Correct it.")
+    _check_range(label or key, key, number := float(array.reshape(())), source)
+    return number
+
+
+def _check_range(label: str, key: str, value: float, source: str) -> None:
+    fine = value >= 0.0 if key in (*_MAY_BE_ZERO, "added_mass") else value > 0.0
+    if fine and (np.isfinite(value) or key in _MAY_BE_INFINITE):
+        return
+    expected = "zero or more" if key in (*_MAY_BE_ZERO, "added_mass") else "more than zero"
+    finite = "" if key in _MAY_BE_INFINITE else ", and finite"
+    raise ValueError(f"{source}: {label} is {value:g}; expected a number of {expected}{finite}. Correct it.")

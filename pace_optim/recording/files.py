@@ -1,0 +1,192 @@
+"""Read and write recordings: `.pt`, `.npz` and `.csv`, facts in the file or in a JSON of the same stem."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import fields as dataclass_fields
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+
+from .checks import check_recording
+from .csv_format import read_csv, write_csv
+from .data import Recording
+from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean, listed
+
+SUFFIXES = (".pt", ".npz", ".csv")
+
+
+def load_recording(path: str | os.PathLike[str]) -> Recording:
+    """Read a recording and check that it is one; its samples stay as they are in the file.
+
+    Args:
+        path: A `.pt` (dict of tensors, numbers, text), `.npz` or `.csv` file. A JSON file of the same stem
+            beside it may hold the facts (joint_names, stiffness, added_mass, ...).
+
+    Raises:
+        ValueError: If the file is missing, unreadable, or not a sound recording; the message says what to do.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    if not path.is_file():
+        folder = path.parent
+        there = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES) if folder.is_dir() else []
+        raise ValueError(f"{path}: no such file. Recordings in {folder}: {listed(there)}. Correct the path.")
+    found: tuple[str, ...] = ()
+    if suffix == ".csv":
+        fields, found = read_csv(path)
+    else:
+        fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
+    fields = _add_json_facts(fields, path)
+    return check_recording(fields, source=str(path), default_name=path.stem, found=found)
+
+
+def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
+    """Write a recording in the format of the path's suffix; a CSV's facts go to a JSON file of the same stem.
+
+    Series and facts are written without loss. What `conform_recording` derives from them (`command`,
+    `sample_stride`, `notes`) is not written. The file appears whole or not at all.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    series = {key: getattr(recording, key) for key in SERIES if getattr(recording, key) is not None}
+    facts = _facts_of(recording)
+    if suffix == ".csv":
+        text = json.dumps(facts, indent=2).encode()
+        _write_atomically(path.with_suffix(".json"), lambda file: file.write(text))
+        _write_atomically(path, lambda file: write_csv(file, series, recording.joint_names))
+    elif suffix == ".npz":
+        if "added_mass" in facts:
+            facts["added_mass"] = json.dumps(facts["added_mass"])
+        _write_atomically(path, lambda file: np.savez_compressed(file, **series, **facts))
+    else:
+        tensors = {key: torch.from_numpy(np.ascontiguousarray(array)) for key, array in series.items()}
+        _write_atomically(path, lambda file: torch.save({**tensors, **facts}, file))
+    return path
+
+
+def _suffix(path: Path) -> str:
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
+        raise ValueError(
+            f"{path}: found the suffix '{path.suffix}'; expected one of {listed(SUFFIXES)}. "
+            "Convert the recording (save_recording writes all three)."
+        )
+    return suffix
+
+
+def _facts_of(recording: Recording) -> dict[str, Any]:
+    """The facts as plain numbers, text, lists and dicts; what is unknown is left out."""
+    facts: dict[str, Any] = {"name": recording.name}
+    if recording.joint_names:
+        facts["joint_names"] = list(recording.joint_names)
+    for key in DRIVE_FACTS:
+        if (value := getattr(recording.drive, key)) is not None:
+            facts[key] = value.tolist()
+    for field in dataclass_fields(recording.load):
+        value = getattr(recording.load, field.name)
+        if value is not None and value != {}:
+            facts[field.name] = dict(value) if field.name == "added_mass" else value
+    return facts
+
+
+def _read_pt(path: Path) -> dict[str, Any]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged or foreign file
+        if isinstance(error, pickle.UnpicklingError) and "load key" not in str(error):
+            problem = "holds Python objects other than tensors, numbers, text, lists and dicts"
+            cure = "Save tensors: torch.save({'time': t, 'dof_pos': q, 'des_dof_pos': q_des}, path)."
+        else:
+            problem, cure = f"cannot be read ({_first_line(error)})", "Copy or record it again."
+        raise ValueError(f"{path}: {problem}; expected a dict saved by torch.save. {cure}") from error
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"{path}: holds a {type(content).__name__}; expected a dict with time, dof_pos and des_dof_pos. "
+            "Save such a dict with torch.save."
+        )
+    return {str(key): _without_tensor(value) for key, value in content.items()}
+
+
+def _without_tensor(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu()
+        return (value.double() if value.is_floating_point() else value).numpy()
+    if isinstance(value, dict):
+        return {key: _without_tensor(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_tensor(item) for item in value]
+    return value
+
+
+def _read_npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            fields = {key: content[key] for key in content.files}
+    except Exception as error:  # zip, value and end-of-file errors alike
+        if "Object arrays" in str(error):
+            problem, cure = "holds Python objects", "Store text as unicode arrays and dicts as JSON text."
+        else:
+            problem, cure = f"cannot be read ({_first_line(error)})", "Copy or record it again."
+        raise ValueError(f"{path}: {problem}; expected arrays saved by numpy.savez. {cure}") from error
+    return {
+        key: array.item() if array.dtype.kind == "U" and array.ndim == 0 else array
+        for key, array in fields.items()
+    }
+
+
+def _add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the fields with those of the JSON file of the same stem, where there is one."""
+    facts_path = path.with_suffix(".json")
+    if not facts_path.is_file():
+        return fields
+    try:
+        facts = json.loads(facts_path.read_text(encoding="utf-8-sig"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{facts_path}: is not JSON ({error}). Correct it, or move it away from {path.name}."
+        ) from error
+    if not isinstance(facts, dict):
+        raise ValueError(
+            f"{facts_path}: holds a {type(facts).__name__}; expected {{fact: value}}. Correct it."
+        )
+    for key, value in facts.items():
+        if key not in FACTS:
+            raise ValueError(
+                f"{facts_path}: unknown fact '{key}'{did_you_mean(key, FACTS)} "
+                f"Facts: {listed(FACTS)}. Rename it, or put free text under 'comment'."
+            )
+        if key in fields and not _same(fields[key], value):
+            raise ValueError(
+                f"{facts_path}: {key} differs from the one in {path.name}"
+                f"{' (joint names of its columns)' if key == 'joint_names' else ''}. Keep it in one place."
+            )
+    return {**fields, **facts}
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether a fact of the file and one of the JSON say the same."""
+    if isinstance(one, str) and isinstance(other, dict):
+        one = json.loads(one)
+    if isinstance(one, dict) or isinstance(other, dict):
+        return one == other
+    return np.array_equal(np.asarray(one), np.asarray(other))
+
+
+def _write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__} {error}".splitlines()[0].strip().rstrip(".")

@@ -1,0 +1,52 @@
+"""The names that a recording's file may hold, and what to say about any other name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+REQUIRED_SERIES = ("time", "dof_pos", "des_dof_pos")
+JOINT_SERIES = ("dof_pos", "des_dof_pos", "dof_vel", "dof_effort")
+SERIES = ("time", *JOINT_SERIES, "torque_enable")
+DRIVE_FACTS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
+FACTS = ("name", "joint_names", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "comment")
+
+_OTHER_WORDS = {
+    "time": ("t", "timestamp", "timestamps", "stamp"),
+    "dof_pos": ("q", "pos", "position", "positions", "joint_pos", "joint_position", "dof_position"),
+    "des_dof_pos": ("q_des", "target", "targets", "goal_position", "command", "cmd", "joint_pos_target"),
+    "dof_vel": ("qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity", "speed"),
+    "dof_effort": ("tau", "effort", "torque", "torques", "joint_effort", "joint_torque"),
+    "torque_enable": ("enable", "enabled", "torque_enabled", "torque_on"),
+    "joint_names": ("joints", "names", "joint_order", "dof_names"),
+    "stiffness": ("kp", "p_gain", "p_gains", "gains_p"),
+    "damping": ("kd", "d_gain", "d_gains", "gains_d"),
+    "effort_limit": ("torque_limit", "max_torque", "max_effort"),
+    "saturation_effort": ("stall_torque", "saturation_torque"),
+    "velocity_limit": ("speed_limit", "max_velocity", "no_load_speed"),
+}
+_KEY_OF_WORD = {word: key for key, words in _OTHER_WORDS.items() for word in words}
+
+
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that was probably meant, or None."""
+    known = tuple(known)
+    if (meant := _KEY_OF_WORD.get(name.lower())) in known:
+        return meant
+    by_case = {k.lower(): k for k in known}
+    matches = difflib.get_close_matches(name.lower(), by_case, n=1, cutoff=0.75)
+    return by_case[matches[0]] if matches else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return ", did you mean 'x'?" or ".", to put behind a name that ends a sentence."""
+    match = closest(name, known)
+    return f", did you mean '{match}'?" if match else "."
+
+
+def listed(names: Iterable[object], limit: int = 40) -> str:
+    """Return names as a comma-separated list for a message, cut after `limit`."""
+    texts = [str(name) for name in names]
+    more = [f"and {len(texts) - limit} more"] if len(texts) > limit else []
+    return ", ".join(texts[:limit] + more) or "none"

@@ -1,0 +1,131 @@
+"""Checks of a recording against the robot that it claims to show: joints, limits, loads."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from .data import Recording
+from .keys import did_you_mean, listed
+
+_STILL = 2e-3  # [rad]
+_FAR = 0.5  # [rad]
+_DEGREES = "The values look like degrees: multiply them by pi/180."
+
+
+def column_order(recording: Recording, joint_order: Sequence[str]) -> tuple[list[int], list[str]]:
+    """Return the column of each joint of `joint_order`, and notes."""
+    names, source = recording.joint_names, recording.label
+    if not names:
+        if recording.num_joints != len(joint_order):
+            raise ValueError(
+                f"{source}: has {recording.num_joints} joints (columns of dof_pos) but the robot has "
+                f"{len(joint_order)} ({listed(joint_order)}). Record these joints, or choose the robot's "
+                "task."
+            )
+        return list(range(len(joint_order))), [
+            f"The file has no joint_names: its columns were taken to be {listed(joint_order)}."
+        ]
+    unknown = [name for name in names if name not in joint_order]
+    missing = [name for name in joint_order if name not in names]
+    if unknown or missing:
+        found = [f"unknown joint '{name}'{did_you_mean(name, missing)}" for name in unknown[:3]]
+        found += [f"no column for {listed(missing)}."] if missing else []
+        raise ValueError(
+            f"{source}: {' '.join(found)} The recording has {len(names)} joints ({listed(names)}), the robot "
+            f"has {len(joint_order)} ({listed(joint_order)}). Rename the columns, or choose the robot's task."
+        )
+    return [names.index(name) for name in joint_order], []
+
+
+def check_load(recording: Recording, load_bodies: Collection[str], accepts_load: bool) -> None:
+    """Refuse a load that the robot's model cannot carry."""
+    load, source = recording.load, recording.label
+    for body in load.added_mass:
+        if body not in load_bodies:
+            raise ValueError(
+                f"{source}: added_mass names the unknown body '{body}'{did_you_mean(body, load_bodies)} "
+                f"Bodies that take a mass: {listed(load_bodies)}. Correct the name."
+            )
+    bench = [key for key in ("load_mass", "load_length", "arm_mass") if getattr(load, key) is not None]
+    if bench and not accepts_load:
+        raise ValueError(
+            f"{source}: holds {listed(bench)}, which belong to the test bench; this robot has no such load. "
+            "Use added_mass {body: kg}, or the task Pace-TestBench-v0."
+        )
+
+
+def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: float) -> list[str]:
+    """Refuse positions that the robot cannot have; return notes on what is odd but possible."""
+    _check_wraps(recording)
+    notes: list[str] = []
+    if limits is not None:
+        notes += _check_limits(recording, np.asarray(limits, dtype=np.float64), limit_margin)
+    names = recording.joint_names
+    position, target = recording.dof_pos, recording.des_dof_pos
+    if turning := _those(names, np.abs(position).max(axis=0) > 8.0 * np.pi):
+        notes.append(
+            f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}"
+        )
+    if still := _those(names, np.ptp(position, axis=0) < _STILL):
+        notes.append(
+            f"{listed(still)}: moves less than {_STILL * 1e3:g} mrad, so its parameters cannot be found from "
+            "this recording."
+        )
+    if uncommanded := _those(names, (np.ptp(target, axis=0) == 0.0) & (np.ptp(position, axis=0) >= _STILL)):
+        notes.append(f"{listed(uncommanded)}: moves although its command never changes.")
+    if far := _those(names, np.abs(position[0] - target[0]) > _FAR):
+        notes.append(
+            f"{listed(far)}: starts more than {_FAR:g} rad from its target; the first instants are a "
+            "transient."
+        )
+    if recording.torque_enable is not None and not recording.torque_enable.all():
+        notes.append(f"The drive is off in {np.mean(~recording.torque_enable):.0%} of the samples.")
+    return notes
+
+
+def _check_wraps(recording: Recording) -> None:
+    jump = np.abs(np.diff(recording.dof_pos, axis=0))
+    wraps = np.argwhere(np.abs(jump - 2.0 * np.pi) < 0.3)
+    if len(wraps):
+        sample, joint = wraps[0]
+        raise ValueError(
+            f"{recording.label}: dof_pos of {recording.joint_names[joint]} jumps by "
+            f"{jump[sample, joint]:.3f} rad between samples {sample} and {sample + 1}; expected a steady "
+            "position. The encoder wraps there: apply numpy.unwrap."
+        )
+
+
+def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> list[str]:
+    names, source = recording.joint_names, recording.label
+    if limits.shape != (len(names), 2) or np.any(np.isnan(limits)) or np.any(limits[:, 0] > limits[:, 1]):
+        raise ValueError(
+            f"joint_pos_limits has shape {limits.shape}; expected ({len(names)}, 2), lower and upper limit "
+            "[rad] of each joint in joint_order, infinite where there is none. Correct the argument."
+        )
+    excess = {
+        key: np.maximum(limits[:, 0] - values.min(axis=0), values.max(axis=0) - limits[:, 1])
+        for key, values in (("dof_pos", recording.dof_pos), ("des_dof_pos", recording.des_dof_pos))
+    }
+    for key, allowed in (("dof_pos", margin), ("des_dof_pos", 2.0 * np.pi)):
+        if np.any(excess[key] > allowed):
+            joint = int(np.argmax(excess[key]))
+            values = getattr(recording, key)[:, joint]
+            cure = "Check the column order, the signs and the zero, or the model's limits."
+            if np.abs(values).max() > 2.0 * np.pi:
+                cure = _DEGREES
+            raise ValueError(
+                f"{source}: {key} of {names[joint]} goes from {values.min():.3f} to {values.max():.3f} rad; "
+                f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} rad, the joint's limits (and at "
+                f"most {allowed:.3g} beyond). {cure}"
+            )
+    if beyond := _those(names, excess["des_dof_pos"] > 0.0):
+        return [
+            f"{listed(beyond)}: commanded beyond the joint limits, by {excess['des_dof_pos'].max():.3f} rad."
+        ]
+    return []
+
+
+def _those(names: Sequence[str], where: np.ndarray) -> list[str]:
+    return [name for name, flag in zip(names, where, strict=True) if flag]

@@ -1,0 +1,132 @@
+"""The time base of a recording against the simulation's control grid: keep the samples, or resample them.
+
+Samples are kept exactly when their time stamps are those of the grid, up to what a clock or a file format
+adds: jitter below 1 % of a step, rounding of the stamps (decimals, float32), drift below a tenth of a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_JITTER = 0.01  # of a step: moves a joint at 10 rad/s by 0.25 mrad at 400 Hz, below any encoder's noise
+_DRIFT = 0.1  # of a sample, over the whole recording
+_RATE = 1e-3  # relative error of the mean step
+_MAX_STEP = 0.05  # [s]
+_MAX_GAP = 0.5  # [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeBase:
+    """What a recording's time stamps are, and how they go onto the control grid."""
+
+    sample_stride: int
+    """Control steps per sample on the grid."""
+    num_samples: int
+    """Samples on the grid."""
+    exact: bool
+    """Whether the samples already lie on the grid."""
+    notes: tuple[str, ...]
+    """Rate, jitter, gaps, and what follows from them."""
+
+
+def fit_time_base(time: np.ndarray, control_dt: float, source: str) -> TimeBase:
+    """Compare time stamps with the control grid.
+
+    Args:
+        time: Time stamps, (T,) [s], strictly increasing.
+        control_dt: Control step of the simulation [s].
+        source: Name of the recording, for messages.
+
+    Raises:
+        ValueError: If the recording is too slow, or has a gap that interpolation cannot honestly fill.
+    """
+    resolution = _resolution(time)
+    time = time - time[0]
+    step = np.diff(time)
+    median = float(np.median(step))
+    _check_usable(time, step, median, source)
+
+    stride = max(1, round(median / control_dt))
+    spacing = stride * control_dt
+    mean = float(time[-1]) / (len(time) - 1)
+    exact, off_by_one = _on_grid(time, step, mean, spacing, resolution)
+    notes = [_rate_note(step, mean), *_gap_notes(time, step, median)]
+    if off_by_one:
+        notes.append(
+            f"The time stamps span one step too many, as of linspace(0, T*dt, T): {mean * 1e3:.6g} ms a step "
+            f"was read as {spacing * 1e3:g} ms."
+        )
+    if not exact:
+        notes.append(
+            f"Resampled to {spacing * 1e3:g} ms ({1 / spacing:g} Hz): positions and speeds by cubics, "
+            "torques by straight lines, commands held and averaged over each control step of "
+            f"{control_dt * 1e3:g} ms."
+        )
+    if not exact and median < 0.95 * control_dt:
+        notes.append(
+            f"The recording ({1 / median:.4g} Hz) is finer than the control step ({1 / control_dt:.4g} Hz), "
+            "so information is lost; a smaller control step (sim.dt times decimation) keeps it."
+        )
+    num_samples = len(time) if exact else int(np.floor(time[-1] / spacing + 1e-6)) + 1
+    return TimeBase(sample_stride=stride, num_samples=num_samples, exact=exact, notes=tuple(notes))
+
+
+def _check_usable(time: np.ndarray, step: np.ndarray, median: float, source: str) -> None:
+    if median > _MAX_STEP:
+        raise ValueError(
+            f"{source}: found one sample every {median:.3g} s ({1 / median:.3g} Hz); expected at least "
+            f"{1 / _MAX_STEP:g} Hz, below which joint dynamics do not show. Record faster, or check that "
+            "time is in seconds."
+        )
+    if step.max() > _MAX_GAP:
+        gap = int(np.argmax(step))
+        raise ValueError(
+            f"{source}: found a gap of {step[gap]:.3g} s after sample {gap} ({time[gap]:.3f} s from the "
+            f"start); expected no gap above {_MAX_GAP:g} s, since what happened in it is unknown. Cut the "
+            "file there into two recordings."
+        )
+
+
+def _on_grid(
+    time: np.ndarray, step: np.ndarray, mean: float, spacing: float, resolution: float
+) -> tuple[bool, bool]:
+    """Return whether the stamps are those of the grid, and whether only after a fencepost error is mended."""
+    count = len(time)
+    deviation = time - spacing * np.arange(count)
+    from_rounding = resolution <= spacing / 2 and np.ptp(deviation) <= resolution * 1.001
+    jitter = np.abs(step - mean).max()
+    even = jitter <= max(_JITTER * spacing, min(resolution, _DRIFT * spacing))
+    true_rate = abs(mean / spacing - 1.0) <= _RATE and np.abs(deviation).max() <= _DRIFT * spacing
+    off_by_one = bool(even and abs(time[-1] - count * spacing) <= _JITTER * spacing)
+    return bool(from_rounding or (even and true_rate) or off_by_one), off_by_one
+
+
+def _resolution(time: np.ndarray) -> float:
+    """Smallest difference that the stamps can express: decimals written, or float32 [s]."""
+    for digits in range(2, 7):
+        scaled = (time - time[0]) * 10.0**digits
+        if np.abs(scaled - np.round(scaled)).max() < 1e-3:
+            return 10.0**-digits
+    if np.all(time == time.astype(np.float32)):
+        return float(np.spacing(np.float32(np.abs(time).max())))
+    return 0.0
+
+
+def _rate_note(step: np.ndarray, mean: float) -> str:
+    return (
+        f"{len(step) + 1} samples at {1 / mean:.4g} Hz over {mean * len(step):.4g} s; steps of "
+        f"{mean * 1e3:.4g} ms, std {step.std() * 1e3:.2g} ms, longest {step.max() * 1e3:.4g} ms."
+    )
+
+
+def _gap_notes(time: np.ndarray, step: np.ndarray, median: float) -> list[str]:
+    gaps = np.flatnonzero(step > 3.0 * median)
+    if not len(gaps):
+        return []
+    worst = gaps[np.argmax(step[gaps])]
+    return [
+        f"{len(gaps)} gap(s) longer than three steps, the longest of {step[worst] * 1e3:.4g} ms "
+        f"{time[worst]:.3f} s from the start; positions there are interpolated."
+    ]
