@@ -2,5 +2,15 @@
 
 from pace_envs.tasks.pace.pace_cfg import CMAESOptimizerCfg, ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
+from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters
 
-__all__ = ["CMAESOptimizerCfg", "ExcitationCfg", "PaceCfg", "PaceSim2realEnvCfg", "PaceSim2realSceneCfg"]
+__all__ = [
+    "GLOBAL",
+    "CMAESOptimizerCfg",
+    "ExcitationCfg",
+    "PaceCfg",
+    "PaceSim2realEnvCfg",
+    "PaceSim2realSceneCfg",
+    "Parameter",
+    "base_parameters",
+]

@@ -17,6 +17,9 @@ PARAMETER_GROUPS = ("armature", "viscous_friction", "friction", "encoder_bias")
 class CMAESOptimizerCfg:
     """Settings of the search."""
 
+    per_tree: bool = True
+    """Whether parts of the robot that do not influence each other (legs on a fixed base) are searched apart."""
+
     max_iteration: int = 200
     """Largest number of generations."""
 
@@ -72,6 +75,9 @@ class PaceCfg:
 
     sample_params: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
     """The true parameters of simulated recordings, by name: a number, or a number per joint."""
+
+    extra_parameters: tuple[Any, ...] = ()
+    """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 
     apply_load: Callable[[Any, Any, Mapping[str, float]], None] | None = None
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to some environments,

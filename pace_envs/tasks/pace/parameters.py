@@ -1,0 +1,126 @@
+"""What can be identified: parameters, their bounds and how they reach the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+GLOBAL = "all"
+"""The key of a parameter that all joints share."""
+
+UNITS = {
+    "armature": "kg m^2",
+    "viscous_friction": "N m s/rad",
+    "friction": "N m",
+    "encoder_bias": "rad",
+    "delay": "control steps",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One physical quantity, of every joint or of the whole robot."""
+
+    name: str
+    """Its name in results."""
+
+    unit: str
+    """Its unit."""
+
+    lower: tuple[float, ...]
+    """Lower bounds, one per key."""
+
+    upper: tuple[float, ...]
+    """Upper bounds, one per key."""
+
+    apply: Callable[[Any, torch.Tensor], None]
+    """Writes values of shape (num_envs, len(keys)) to an environment: ``apply(env, values)``."""
+
+    keys: tuple[str, ...]
+    """Joint names, or ``("all",)`` for one value of the whole robot."""
+
+    scale: Literal["linear", "log"] = "linear"
+    """How the optimizer's coordinate runs from the lower to the upper bound."""
+
+    per_joint_copies: bool = False
+    """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is one value of the whole robot."""
+        return self.keys == (GLOBAL,)
+
+    def __post_init__(self) -> None:
+        """Check the bounds."""
+        if not len(self.lower) == len(self.upper) == len(self.keys):
+            raise ValueError(
+                f"The parameter {self.name!r} has {len(self.lower)} lower and {len(self.upper)} upper bounds, "
+                f"expected {len(self.keys)} of each: {', '.join(self.keys)}."
+            )
+        if self.scale == "log" and min(self.lower) <= 0:
+            raise ValueError(f"The parameter {self.name!r} has a logarithmic scale: its bounds must be > 0.")
+
+
+def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
+    """Armature, viscous friction, Coulomb friction and encoder bias of every joint, and the delay."""
+    n, joints = len(cfg.joint_order), tuple(cfg.joint_order)
+    apply = {
+        "armature": _apply_armature,
+        "viscous_friction": _apply_viscous_friction,
+        "friction": _apply_friction,
+        "encoder_bias": _apply_encoder_bias,
+        "delay": _apply_delay,
+    }
+    bounds = cfg.bounds_params
+    result = [
+        Parameter(
+            name=name,
+            unit=UNITS[name],
+            lower=tuple(bounds[i * n : (i + 1) * n, 0].tolist()),
+            upper=tuple(bounds[i * n : (i + 1) * n, 1].tolist()),
+            apply=apply[name],
+            keys=joints,
+        )
+        for i, name in enumerate(PARAMETER_GROUPS)
+    ]
+    low, high = bounds[-1].tolist()
+    delay = Parameter(
+        name="delay",
+        unit=UNITS["delay"],
+        lower=(low,),
+        upper=(high,),
+        apply=apply["delay"],
+        keys=(GLOBAL,),
+        per_joint_copies=True,
+    )
+    return (*result, delay)
+
+
+def _apply_armature(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    env.scene["robot"].write_joint_armature_to_sim(values)
+
+
+def _apply_viscous_friction(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    env.scene["robot"].write_joint_viscous_friction_coefficient_to_sim(values)
+
+
+def _apply_friction(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    env.scene["robot"].write_joint_friction_coefficient_to_sim(values)
+
+
+def _apply_encoder_bias(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    for actuator in env.scene["robot"].actuators.values():
+        actuator.update_encoder_bias(values[:, actuator.joint_indices])
+
+
+def _apply_delay(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    for actuator in env.scene["robot"].actuators.values():
+        actuator.update_time_lags(values if values.shape[1] == 1 else values[:, actuator.joint_indices])

@@ -1,0 +1,123 @@
+"""The recordings of one fit, side by side on the control grid, split into training and validation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from pace_optim.recording import Recording, validation_start
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dataset:
+    """R recordings of n joints, padded to the longest; T control steps.
+
+    Padding holds the last command and has no samples.
+    """
+
+    recordings: tuple[Recording, ...]
+    """The recordings, conformed."""
+    command: torch.Tensor
+    """Position targets, (T, R, n) [rad]."""
+    measured: torch.Tensor
+    """Encoder positions, (T, R, n) [rad]; zero where there is no sample."""
+    measured_vel: torch.Tensor
+    """Measured speeds, from the recording or by differences, (T, R, n) [rad/s]; zero where there is no sample."""
+    sampled: torch.Tensor
+    """Where there is a sample, (T, R) bool."""
+    train: torch.Tensor
+    """Where there is a sample to train on, (T, R) bool."""
+    torque_enable: torch.Tensor | None
+    """Whether the drives give torque, (T, R) bool; ``None`` when always."""
+    validation_only: tuple[bool, ...]
+    """For each recording, whether none of it is trained on."""
+
+    @property
+    def num_recordings(self) -> int:
+        """Number of recordings R."""
+        return len(self.recordings)
+
+    @property
+    def validation(self) -> torch.Tensor:
+        """Where there is a sample that is not trained on, (T, R) bool."""
+        return self.sampled & ~self.train
+
+    def last_step(self, where: torch.Tensor) -> int:
+        """Control steps up to and including the last true entry of a (T, R) mask."""
+        steps = where.any(dim=1).nonzero()
+        return int(steps[-1]) + 1 if len(steps) else 0
+
+    def names(self, which: str) -> list[str]:
+        """Names of what is trained on or validated on: whole recordings, or their parts in time."""
+        result = []
+        for r, (recording, validation_only) in enumerate(
+            zip(self.recordings, self.validation_only, strict=True)
+        ):
+            parts = {"train": bool(self.train[:, r].any()), "validation": bool(self.validation[:, r].any())}
+            if not parts[which]:
+                continue
+            whole = validation_only or not parts["validation"]
+            share = float(getattr(self, which)[:, r].sum()) / float(self.sampled[:, r].sum())
+            place = "first" if which == "train" else "last"
+            result.append(recording.name if whole else f"{recording.name} ({place} {100 * share:.0f} %)")
+        return result
+
+
+def make_dataset(
+    recordings: Sequence[Recording], validation: Sequence[Recording] = (), train_fraction: float = 0.7
+) -> Dataset:
+    """Lay recordings side by side.
+
+    Args:
+        recordings: To train on, conformed to the same joints and control step.
+        validation: Never trained on. If there are none, the last part in time of each recording is kept for it.
+        train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing.
+
+    Raises:
+        ValueError: If there is no recording.
+    """
+    every = (*recordings, *validation)
+    if not recordings:
+        raise ValueError("There is no recording to train on. Name at least one with --data.")
+    steps, n = max(len(_command(r)) for r in every), every[0].num_joints
+    shape = (steps, len(every))
+    command = torch.zeros(*shape, n, dtype=torch.float64)
+    measured, measured_vel = torch.zeros_like(command), torch.zeros_like(command)
+    sampled, train = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
+    enable = torch.ones(shape, dtype=torch.bool)
+    for r, recording in enumerate(every):
+        held = torch.as_tensor(_command(recording))
+        command[: len(held), r], command[len(held) :, r] = held, held[-1]
+        at = torch.arange(recording.num_samples) * recording.sample_stride
+        measured[at, r] = torch.as_tensor(recording.dof_pos)
+        speed = recording.dof_vel
+        if speed is None:
+            speed = np.gradient(recording.dof_pos, recording.time, axis=0)
+        measured_vel[at, r] = torch.as_tensor(speed)
+        sampled[at, r] = True
+        if recording.command_torque_enable is not None:
+            flags = torch.as_tensor(recording.command_torque_enable)
+            enable[: len(flags), r], enable[len(flags) :, r] = flags, flags[-1]
+        if r < len(recordings):
+            whole = bool(validation) or train_fraction >= 1
+            end = recording.num_samples if whole else validation_start(recording, train_fraction)
+            train[at[:end], r] = True
+    return Dataset(
+        recordings=every,
+        command=command,
+        measured=measured,
+        measured_vel=measured_vel,
+        sampled=sampled,
+        train=train,
+        torque_enable=None if bool(enable.all()) else enable,
+        validation_only=tuple(r >= len(recordings) for r in range(len(every))),
+    )
+
+
+def _command(recording: Recording) -> np.ndarray:
+    if recording.command is None:
+        raise ValueError(f"{recording.label}: not on the control grid. Call conform_recording first.")
+    return recording.command

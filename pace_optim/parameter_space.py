@@ -1,0 +1,123 @@
+"""The vector that is searched: parameters by name, their bounds and their normalised coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters
+
+if TYPE_CHECKING:
+    from pace_envs import ManagerBasedEnv
+
+
+class ParameterSpace:
+    """Lays parameters out in one vector, in order, one entry per key.
+
+    The optimizer's coordinate x runs from -1 to 1 between the bounds:
+
+        physical = lower + (x + 1)/2 (upper - lower)              linear scale
+        physical = exp(log lower + (x + 1)/2 (log upper - log lower))   logarithmic scale
+    """
+
+    def __init__(self, parameters: Sequence[Parameter]):
+        """Lay out the vector.
+
+        Raises:
+            ValueError: If two parameters have the same name.
+        """
+        names = [parameter.name for parameter in parameters]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"The parameter {repeated[0]!r} is declared twice. Give each a name of its own.")
+        self.parameters = tuple(parameters)
+        self.slices: dict[str, slice] = {}
+        start = 0
+        for parameter in parameters:
+            self.slices[parameter.name] = slice(start, start + len(parameter.keys))
+            start += len(parameter.keys)
+        self.size = start
+        self.lower = torch.tensor([v for p in parameters for v in p.lower], dtype=torch.float64)
+        self.upper = torch.tensor([v for p in parameters for v in p.upper], dtype=torch.float64)
+        self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
+        self._log = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
+        self._low = torch.where(self._log, self.lower.clamp(min=1e-300).log(), self.lower)
+        self._high = torch.where(self._log, self.upper.clamp(min=1e-300).log(), self.upper)
+
+    @classmethod
+    def of(cls, cfg: PaceCfg) -> ParameterSpace:
+        """The space of a robot's configuration: the base parameters and the user's own."""
+        return cls((*base_parameters(cfg), *cfg.extra_parameters))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter, by name."""
+        return {parameter.name: parameter.unit for parameter in self.parameters}
+
+    def __getitem__(self, name: str) -> slice:
+        """Where a parameter's entries are."""
+        if name not in self.slices:
+            raise KeyError(f"There is no parameter {name!r}. Available: {', '.join(self.slices)}.")
+        return self.slices[name]
+
+    def to_physical(self, x: torch.Tensor) -> torch.Tensor:
+        """Physical values of normalised vectors (…, size)."""
+        value = self._low + (x + 1) / 2 * (self._high - self._low)
+        value = torch.where(self._log, value.exp(), value)
+        return value.clamp(self.lower, self.upper)
+
+    def to_normalised(self, physical: torch.Tensor) -> torch.Tensor:
+        """Normalised vectors of physical values (…, size); entries whose bounds are equal become 0."""
+        value = torch.where(self._log, physical.clamp(min=1e-300).log(), physical)
+        width = self._high - self._low
+        return torch.where(width > 0, (value - self._low) / width.clamp(min=1e-300) * 2 - 1, 0.0)
+
+    def slope(self, x: torch.Tensor) -> torch.Tensor:
+        """d physical / d x at normalised vectors (…, size)."""
+        half_width = (self._high - self._low) / 2
+        return torch.where(self._log, self.to_physical(x) * half_width, half_width)
+
+    def to_dict(self, physical: torch.Tensor) -> dict[str, dict[str, float]]:
+        """One vector (size,) as {parameter: {key: value}}."""
+        values = physical.tolist()
+        return {p.name: dict(zip(p.keys, values[self.slices[p.name]], strict=True)) for p in self.parameters}
+
+    def from_dict(self, values: Mapping[str, float | Mapping[str, float]]) -> torch.Tensor:
+        """The vector (size,) of {parameter: value or {key: value}}.
+
+        Raises:
+            ValueError: If a parameter or key is missing or unknown.
+        """
+        unknown = sorted(set(values) - set(self.slices))
+        missing = [name for name in self.slices if name not in values]
+        if unknown or missing:
+            wrong = f"unknown: {', '.join(unknown)}" if unknown else f"missing: {', '.join(missing)}"
+            raise ValueError(f"The parameters do not fit ({wrong}). Expected: {', '.join(self.slices)}.")
+        entries: list[float] = []
+        for parameter in self.parameters:
+            value = values[parameter.name]
+            if isinstance(value, Mapping):
+                if set(value) != set(parameter.keys):
+                    raise ValueError(
+                        f"{parameter.name} has values for {', '.join(value)}, expected {', '.join(parameter.keys)}."
+                    )
+                entries += [float(value[key]) for key in parameter.keys]
+            else:
+                entries += [float(value)] * len(parameter.keys)
+        return torch.tensor(entries, dtype=torch.float64)
+
+    def apply(self, env: ManagerBasedEnv, physical: torch.Tensor) -> None:
+        """Write one vector per environment, (num_envs, size), to the simulation and its drives."""
+        for parameter in self.parameters:
+            parameter.apply(env, physical[:, self.slices[parameter.name]])
+
+    def owners(self, trees: Sequence[Sequence[str]]) -> list[int | None]:
+        """For each entry, which group of joints it influences; ``None`` for entries that all share.
+
+        Args:
+            trees: Groups of joint names.
+        """
+        tree_of = {joint: t for t, joints in enumerate(trees) for joint in joints}
+        return [None if key == GLOBAL else tree_of[key] for p in self.parameters for key in p.keys]

@@ -1,0 +1,145 @@
+"""Simulating candidates on recordings, all in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_optim.dataset import Dataset
+from pace_optim.parameter_space import ParameterSpace
+
+if TYPE_CHECKING:
+    from pace_envs import ManagerBasedEnv
+
+_DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+
+
+class Rollout:
+    """Lets every candidate follow every recording's commands.
+
+    Environment ``c * R + r`` simulates candidate c on recording r, with that recording's gains, limits and load.
+    Iterating simulates; at every sample it yields the simulated and measured positions:
+
+        rollout.start(physical)
+        for sim_dof_pos, real_dof_pos in rollout:   # each (num_envs, n) [rad]
+            …
+
+    ``sim_dof_pos`` is the true joint position: subtract the candidate's encoder bias to compare.
+    During the iteration, ``weight`` (num_envs, 1) says how much each environment's sample counts in the score (its
+    sum over the rollout is 1 per candidate), and ``sim_dof_vel`` and ``real_dof_vel`` are at hand.
+    """
+
+    def __init__(self, env: ManagerBasedEnv, dataset: Dataset, space: ParameterSpace):
+        """Give each environment its recording's facts.
+
+        Args:
+            env: Its number of environments must be a multiple of the number of recordings.
+            dataset: The recordings.
+            space: The parameters.
+
+        Raises:
+            ValueError: If the number of environments does not fit, or a recording's facts cannot be simulated.
+        """
+        count = dataset.num_recordings
+        if env.num_envs % count:
+            raise ValueError(
+                f"num_envs is {env.num_envs}, expected a multiple of the number of recordings ({count}): "
+                f"try {max(1, env.num_envs // count) * count}."
+            )
+        self.env = env
+        self.robot = env.scene["robot"]
+        self.dataset = dataset
+        self.space = space
+        self.num_candidates = env.num_envs // count
+        self.simulated_steps = 0
+        self._where = dataset.train
+        self.weight: torch.Tensor | float = 0.0
+        self.physical = torch.empty(0)
+        for r in range(count):
+            self._set_facts(r)
+
+    @property
+    def sim_dof_vel(self) -> torch.Tensor:
+        """Simulated joint velocities at the present sample, (num_envs, n) [rad/s]."""
+        return self.robot.data.joint_vel
+
+    @property
+    def real_dof_vel(self) -> torch.Tensor:
+        """Measured joint velocities at the present sample, (num_envs, n) [rad/s]."""
+        return self._rows(self.dataset.measured_vel[self._step])
+
+    @property
+    def duration_steps(self) -> int:
+        """Control steps of the present rollout."""
+        return self.dataset.last_step(self._where)
+
+    def start(self, physical: torch.Tensor, where: torch.Tensor | None = None) -> None:
+        """Write candidates and put every environment at its recording's first sample.
+
+        Args:
+            physical: Physical parameters, (num_candidates, size).
+            where: Which samples count, (T, R) bool; ``None`` means those to train on.
+        """
+        self._where = self.dataset.train if where is None else where
+        self.physical = physical.repeat_interleave(self.dataset.num_recordings, dim=0)
+        self.env.scene.reset()
+        self.space.apply(self.env, self.physical)
+        self._set_initial_state()
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
+        data = self.dataset
+        weights = self._where.double() / self._where.sum()
+        counts = self._where.any(dim=1).tolist()
+        enable = data.torque_enable
+        steps = self.duration_steps
+        for self._step in range(steps):
+            k = self._step
+            if counts[k]:
+                self.weight = self._rows(weights[k, :, None])
+                yield self.robot.data.joint_pos, self._rows(data.measured[k])
+            if k + 1 == steps:
+                break
+            if enable is not None and (k == 0 or not torch.equal(enable[k], enable[k - 1])):
+                for actuator in self.robot.actuators.values():
+                    actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
+            self.env.simulate(self._rows(data.command[k]))
+        self.simulated_steps += (steps - 1) * self.env.num_envs
+
+    def _rows(self, per_recording: torch.Tensor) -> torch.Tensor:
+        """(R, m) to (num_envs, m): the same for every candidate."""
+        count = self.dataset.num_recordings
+        if count == 1:
+            return per_recording.expand(self.env.num_envs, -1)
+        return per_recording.repeat(self.num_candidates, 1)
+
+    def _set_initial_state(self) -> None:
+        position = self._rows(self.dataset.measured[0]).clone()
+        for actuator in self.robot.actuators.values():
+            position[:, actuator.joint_indices] += actuator.encoder_bias
+        measured = [recording.dof_vel is not None for recording in self.dataset.recordings]
+        speed = self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None]
+        self.robot.write_joint_state_to_sim(position, self._rows(speed))
+
+    def _set_facts(self, r: int) -> None:
+        recording = self.dataset.recordings[r]
+        rows = slice(r, None, self.dataset.num_recordings)
+        for actuator in self.robot.actuators.values():
+            for name in _DRIVE_FIELDS:
+                value = getattr(recording.drive, name)
+                if value is not None:
+                    getattr(actuator, name)[rows] = torch.as_tensor(value)[actuator.joint_indices]
+        load = {
+            key: value
+            for key in ("load_mass", "load_length", "arm_mass")
+            if (value := getattr(recording.load, key)) is not None
+        }
+        apply_load = self.env.cfg.sim2real.apply_load  # type: ignore[attr-defined]
+        if load and apply_load is not None:
+            apply_load(self.env, rows, load)
+        for body, mass in recording.load.added_mass.items():
+            ids, _ = self.robot.find_bodies(body)
+            self.env.sim.expand("body_mass")[rows, ids] += mass
+            self.env.sim.constants_changed()
