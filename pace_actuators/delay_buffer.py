@@ -83,7 +83,8 @@ class DelayBuffer:
                 f"{self.max_delay:g}. Raise max_delay in the actuator's configuration or bound the delay."
             )
         if lag.ndim == 2 and lag.shape[1] > self._lag.shape[1]:
-            self._lag = self._lag.repeat(1, lag.shape[1])
+            with torch.inference_mode(False):  # can be written outside of the caller's inference mode too
+                self._lag = self._lag.expand(-1, lag.shape[1]).clone()
         self._lag[slice(None) if env_ids is None else env_ids] = lag
         self._index_lags()
 
@@ -102,7 +103,7 @@ class DelayBuffer:
             The delayed sample, same shape.
         """
         if self._storage is None or self._storage.shape[1:] != data.shape[1:]:
-            with torch.inference_mode(False):  # usable outside of the caller's inference mode too
+            with torch.inference_mode(False):  # as above
                 self._storage = data.new_empty((self._length * self._num_envs, *data.shape[1:]))
             self.reset()
         if self._any_stale:
@@ -114,17 +115,11 @@ class DelayBuffer:
         self._storage[start : start + self._num_envs] = data
         if self._all_zero:
             return data
-        newer = self._look_up(self._newer[self._head])
+        newer = _look_up(self._storage, self._newer[self._head])
         if self._whole:
             return newer
-        older = self._look_up(self._older[self._head])
+        older = _look_up(self._storage, self._older[self._head])
         return newer.lerp_(older, self._fraction.to(data.dtype))
-
-    def _look_up(self, index: torch.Tensor) -> torch.Tensor:
-        storage = self._storage
-        if index.ndim == 1:  # whole rows: one lag per environment
-            return storage.index_select(0, index)  # type: ignore[union-attr]
-        return storage.gather(0, index)  # type: ignore[union-attr]
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
@@ -140,3 +135,8 @@ class DelayBuffer:
             envs = torch.arange(self._num_envs, device=self._device)[:, None]
         self._newer = ((heads - steps) % self._length) * self._num_envs + envs
         self._older = ((heads - steps - 1) % self._length) * self._num_envs + envs
+
+
+def _look_up(storage: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Whole rows for one lag per environment, single entries for one per joint."""
+    return storage.index_select(0, index) if index.ndim == 1 else storage.gather(0, index)

@@ -9,9 +9,7 @@ JointValue = float | Mapping[str, float] | Sequence[float] | torch.Tensor
 """A number for every joint, a dict of regular expression to value, or one value per joint."""
 
 
-def match_names(
-    patterns: str | Sequence[str], names: Sequence[str], *, what: str = "joint"
-) -> list[list[int]]:
+def match_names(patterns: str | Sequence[str], names: Sequence[str], *, what: str = "joint") -> list[list[int]]:
     """For each pattern the indices of the names it matches in full.
 
     Args:
@@ -30,9 +28,7 @@ def match_names(
         try:
             expression = re.compile(pattern)
         except re.error as error:
-            raise ValueError(
-                f"{pattern!r} is not a regular expression ({error}). Correct the pattern."
-            ) from None
+            raise ValueError(f"{pattern!r} is not a regular expression ({error}). Correct the pattern.") from None
         found = [i for i, name in enumerate(names) if expression.fullmatch(name)]
         if not found:
             raise ValueError(
@@ -74,8 +70,8 @@ def resolve_joint_values(
             for i in indices:
                 if i in owner:
                     raise ValueError(
-                        f"{field}: the joint {joint_names[i]!r} is matched twice, by {owner[i]!r} and by {pattern!r}. "
-                        "Make the patterns exclusive."
+                        f"{field}: the joint {joint_names[i]!r} is matched twice, by {owner[i]!r} and by "
+                        f"{pattern!r}. Make the patterns exclusive."
                     )
                 owner[i] = pattern
                 result[i] = float(value[pattern])

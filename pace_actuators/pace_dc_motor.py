@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -14,6 +14,23 @@ from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
+
+_NOT_NEGATIVE = (lambda x: (x >= 0) & x.isfinite(), "a finite number >= 0")
+_DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
+    "stiffness": _NOT_NEGATIVE,
+    "damping": _NOT_NEGATIVE,
+    "armature": _NOT_NEGATIVE,
+    "friction": _NOT_NEGATIVE,
+    "viscous_friction": _NOT_NEGATIVE,
+    "saturation_effort": (
+        lambda x: (x >= 0) & x.isfinite(),
+        "a finite number >= 0, or None for no torque-speed curve",
+    ),
+    "effort_limit": (lambda x: x >= 0, "a number >= 0, or inf"),
+    "velocity_limit": (lambda x: x > 0, "a number > 0, or inf"),
+    "encoder_bias": (torch.isfinite, "a finite number"),
+}
+"""Which values a field of the configuration may have, and how to say so."""
 
 
 class PaceDCMotor:
@@ -74,7 +91,8 @@ class PaceDCMotor:
             damping: [N m s/rad].
             armature: [kg m^2].
             friction: Coulomb friction [N m].
-            dynamic_friction: Isaac Lab's friction while sliding [N m]; ``None`` means equal to ``friction``.
+            dynamic_friction: Isaac Lab's friction while sliding [N m]; equal to ``friction`` if ``None``, and
+                where the configuration gives the friction.
             viscous_friction: [N m s/rad].
             effort_limit: [N m].
             velocity_limit: [rad/s].
@@ -97,7 +115,7 @@ class PaceDCMotor:
         self.friction = self._parameter("friction", friction)
         self.dynamic_friction = (
             self.friction.clone()
-            if dynamic_friction is None
+            if dynamic_friction is None or cfg.friction is not None
             else self._tensor(dynamic_friction, "dynamic_friction")
         )
         self.viscous_friction = self._parameter("viscous_friction", viscous_friction)
@@ -106,21 +124,21 @@ class PaceDCMotor:
         self.velocity_limit = self._parameter("velocity_limit", velocity_limit)
         self.velocity_limit_sim = self.velocity_limit.clone()
         if cfg.saturation_effort is None:
-            # no torque-speed curve was asked for: a stall torque at the limit and no fall with speed
-            self.saturation_effort = self.effort_limit.clone()
+            # no torque-speed curve was asked for: a (finite) stall torque at the limit and no fall with speed
+            self.saturation_effort = self.effort_limit.clamp(max=torch.finfo(dtype).max)
             self.velocity_limit = torch.full_like(self.velocity_limit, torch.inf)
         else:
             self.saturation_effort = self._parameter("saturation_effort", torch.inf)
-        self.encoder_bias = self._parameter("encoder_bias", 0.0, signed=True)
+        self.encoder_bias = self._parameter("encoder_bias", 0.0)
         self.torque_enable: torch.Tensor | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
         self.applied_effort = torch.zeros_like(self.stiffness)
         delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
         self._delay_buffers = {
-            name: DelayBuffer(cfg.max_delay, num_envs, self._device, cfg.delay_interpolation)
-            for name in delayed
+            name: DelayBuffer(cfg.max_delay, num_envs, self._device, cfg.delay_interpolation) for name in delayed
         }
+        self._silent: set[str] = set()  # commands that were not given at the last control step
         self._calls_until_control = 0
         self.update_time_lags(cfg.delay)
 
@@ -206,9 +224,7 @@ class PaceDCMotor:
         Returns:
             The torque at the joint [N m], (num_envs, num_joints).
         """
-        lowest, highest = effort_bounds(
-            joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit
-        )
+        lowest, highest = effort_bounds(joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
         effort = torch.clamp(effort_command, lowest, highest)
         return effort if self.torque_enable is None else effort * self.torque_enable
 
@@ -216,7 +232,8 @@ class PaceDCMotor:
         """Forget the history of all or some environments; parameters stay."""
         for buffer in self._delay_buffers.values():
             buffer.reset(env_ids)
-        if env_ids is None or env_ids == slice(None):
+        if env_ids is None:
+            self._silent.clear()
             self._calls_until_control = 0
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
@@ -228,29 +245,44 @@ class PaceDCMotor:
         """Set the delay [control steps]: a number, (len(env_ids),) or, per joint, (len(env_ids), num_joints).
 
         Raises:
-            ValueError: If a delay lies outside 0 to ``max_delay``.
+            ValueError: If a delay lies outside 0 to ``max_delay``, or their number is wrong.
         """
+        if isinstance(delay, torch.Tensor) and delay.ndim == 2 and delay.shape[1] not in (1, self.num_joints):
+            raise ValueError(
+                f"delay has shape {tuple(delay.shape)}, expected 1 or {self.num_joints} columns: "
+                "one delay per environment or per joint."
+            )
         for buffer in self._delay_buffers.values():
             buffer.set_time_lag(delay, env_ids)
 
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
-        self.torque_enable = None if enabled is None else enabled.to(self._dtype).view(-1, 1)
+        self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
 
     def _delayed(self, name: str, data: torch.Tensor | None) -> torch.Tensor | None:
         buffer = self._delay_buffers.get(name)
-        return data if buffer is None or data is None else buffer.compute(data)
+        if buffer is None:
+            return data
+        if data is None:
+            self._silent.add(name)
+            return None
+        if name in self._silent:  # until now there was no target, or it was zero
+            self._silent.remove(name)
+            buffer.reset()
+            if name != "positions":
+                buffer.compute(torch.zeros_like(data))
+        return buffer.compute(data)
 
-    def _parameter(self, field: str, default: torch.Tensor | float, *, signed: bool = False) -> torch.Tensor:
+    def _parameter(self, field: str, default: torch.Tensor | float) -> torch.Tensor:
         value: JointValue | None = getattr(self.cfg, field)
         if value is None:
             result = self._tensor(default, field)
         else:
             result = self._tensor(resolve_joint_values(value, self._joint_names, field=field), field)
-        bad = result.isnan() if signed else ~(result >= 0)
+        valid, expected = _DOMAINS[field]
+        bad = ~valid(result)
         if bool(bad.any()):
             joint = self._joint_names[int(bad.any(dim=0).nonzero()[0])]
-            expected = "a number" if signed else "a number >= 0"
             raise ValueError(f"{field} of {joint} is {result[bad][0].item():g}, expected {expected}.")
         return result
 
@@ -268,6 +300,4 @@ class PaceDCMotor:
         if self.cfg.delay_mode not in ("command", "effort"):
             raise ValueError(f"Unknown delay_mode {self.cfg.delay_mode!r}. Available: 'command', 'effort'.")
         if not (isinstance(self.cfg.control_decimation, int) and self.cfg.control_decimation >= 1):
-            raise ValueError(
-                f"control_decimation is {self.cfg.control_decimation!r}, expected an integer >= 1."
-            )
+            raise ValueError(f"control_decimation is {self.cfg.control_decimation!r}, expected an integer >= 1.")

@@ -20,13 +20,11 @@ def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
     """Read a robot's MJCF; its base is fixed or floating as the configuration says.
 
     Raises:
-        ValueError: If the file is missing or no MJCF, or a floating base is asked of a model without one.
+        ValueError: If the file is missing or no MJCF.
     """
     path = Path(cfg.mjcf_path)
     if not path.is_file():
-        raise ValueError(
-            f"The model file {path} does not exist. Correct mjcf_path in the robot's configuration."
-        )
+        raise ValueError(f"The model file {path} does not exist. Correct mjcf_path in the robot's configuration.")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -57,27 +55,19 @@ class Articulation:
         self._sim = sim
         self._find_joints_in_model(sim.model)
         n, device = self.num_joints, sim.device
-        state = {"dtype": torch.float64, "device": device}
-
         init = cfg.init_state
-        limits = torch.tensor(
-            [
-                sim.model.joint(name).range if sim.model.joint(name).limited[0] else (-torch.inf, torch.inf)
-                for name in self.joint_names
-            ],
-            **state,
-        ).view(n, 2)
+        limits = torch.full((n, 2), torch.inf, dtype=torch.float64, device=device)
+        limits[:, 0] = -torch.inf
+        for i, name in enumerate(self.joint_names):
+            if sim.model.joint(name).limited[0]:
+                limits[i] = torch.as_tensor(sim.model.joint(name).range)
         middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
-        zeros = torch.zeros(sim.num_envs, n, **state)
-        default_pos = resolve_joint_values(
-            init.joint_pos, self.joint_names, field="init_state.joint_pos", default=0.0
-        )
-        default_vel = resolve_joint_values(
-            init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0
-        )
+        zeros = torch.zeros(sim.num_envs, n, dtype=torch.float64, device=device)
+        default_pos = resolve_joint_values(init.joint_pos, self.joint_names, field="init_state.joint_pos", default=0.0)
+        default_vel = resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
         self.data = ArticulationData(
-            joint_pos=self._view(sim.qpos, self._qpos_columns),
-            joint_vel=self._view(sim.qvel, self._dof_columns),
+            joint_pos=sim.qpos[:, self._qpos_view] if self._side_by_side else zeros.clone(),
+            joint_vel=sim.qvel[:, self._dof_view] if self._side_by_side else zeros.clone(),
             default_joint_pos=default_pos.repeat(sim.num_envs, 1),
             default_joint_vel=default_vel.repeat(sim.num_envs, 1),
             joint_pos_limits=limits,
@@ -93,7 +83,7 @@ class Articulation:
                 sim.qvel[:, v : v + 3],
                 sim.qvel[:, v + 3 : v + 6],
             )
-        self._effort = self._view(sim.qfrc_applied, self._dof_columns)
+        self._effort = sim.qfrc_applied[:, self._dof_view] if self._side_by_side else None
         self._build_actuators()
         self.reset()
 
@@ -162,16 +152,25 @@ class Articulation:
         joint_ids: JointIds = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write joint positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable."""
+        """Write positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable."""
         self._write(self._sim.qpos, self._qpos_columns, position, joint_ids, env_ids)
         self._write(self._sim.qvel, self._dof_columns, velocity, joint_ids, env_ids)
         self._refresh()
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write a floating base's state: position, quaternion, linear (world) and angular (body) velocity, (…, 13)."""
+        """Write a floating base's state, (len(env_ids), 13) or broadcastable.
+
+        Args:
+            root_state: Position [m], quaternion (w x y z), linear velocity in the world [m/s] and angular
+                velocity in the base's frame [rad/s].
+            env_ids: The environments, or ``None`` for all.
+
+        Raises:
+            ValueError: If the base is fixed.
+        """
         if self._root is None:
             raise ValueError("This robot's base is fixed: it has no root state to write.")
-        rows, (q, v) = self._rows(env_ids), self._root
+        rows, (q, v) = _indices(env_ids), self._root
         self._sim.qpos[rows, q : q + 7] = root_state[..., :7]
         self._sim.qvel[rows, v : v + 6] = root_state[..., 7:]
 
@@ -188,9 +187,7 @@ class Articulation:
         env_ids: EnvIds = None,
     ) -> None:
         """Write viscous friction [N m s/rad], (len(env_ids), len(joint_ids)) or broadcastable."""
-        self._write_parameter(
-            "viscous_friction", "dof_damping", joint_viscous_friction_coeff, joint_ids, env_ids
-        )
+        self._write_parameter("viscous_friction", "dof_damping", joint_viscous_friction_coeff, joint_ids, env_ids)
 
     def write_joint_friction_coefficient_to_sim(
         self, joint_friction_coeff: torch.Tensor | float, joint_ids: JointIds = None, env_ids: EnvIds = None
@@ -205,23 +202,21 @@ class Articulation:
         if joint_ids is None and env_ids is None:
             self.data.joint_pos_target.copy_(target)
         else:
-            _assign(self.data.joint_pos_target, self._rows(env_ids), _columns(joint_ids), target)
+            _assign(self.data.joint_pos_target, _indices(env_ids), _indices(joint_ids), target)
 
     def set_joint_velocity_target(
         self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
     ) -> None:
         """Set velocity targets [rad/s]."""
         if self.data.joint_vel_target is None:
-            self.data.joint_vel_target = torch.zeros_like(self.data.joint_pos_target)
-        _assign(self.data.joint_vel_target, self._rows(env_ids), _columns(joint_ids), target)
+            self.data.joint_vel_target = _zeros_like(self.data.joint_pos_target)
+        _assign(self.data.joint_vel_target, _indices(env_ids), _indices(joint_ids), target)
 
-    def set_joint_effort_target(
-        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
-    ) -> None:
+    def set_joint_effort_target(self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None) -> None:
         """Set feed-forward efforts [N m]."""
         if self.data.joint_effort_target is None:
-            self.data.joint_effort_target = torch.zeros_like(self.data.joint_pos_target)
-        _assign(self.data.joint_effort_target, self._rows(env_ids), _columns(joint_ids), target)
+            self.data.joint_effort_target = _zeros_like(self.data.joint_pos_target)
+        _assign(self.data.joint_effort_target, _indices(env_ids), _indices(joint_ids), target)
 
     def write_data_to_sim(self) -> None:
         """Run the drives on the present targets and state, and apply their torques."""
@@ -234,7 +229,7 @@ class Articulation:
                 None if data.joint_effort_target is None else data.joint_effort_target[:, ids],
             )
             efforts = actuator.compute(action, data.joint_pos[:, ids], data.joint_vel[:, ids]).joint_efforts
-            if len(self.actuators) == 1 and ids == slice(None):
+            if isinstance(ids, slice):  # the only group: it drives every joint
                 data.computed_torque, data.applied_torque = actuator.computed_effort, efforts
             else:
                 data.computed_torque[:, ids] = actuator.computed_effort
@@ -258,9 +253,7 @@ class Articulation:
             elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
                 single[name] = j
             else:
-                raise ValueError(
-                    f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives."
-                )
+                raise ValueError(f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives.")
         if not single:
             raise ValueError(f"The model {self.cfg.mjcf_path} has no joints to drive.")
         order = self.cfg.joint_order or tuple(single)
@@ -272,6 +265,15 @@ class Articulation:
         ids = [single[name] for name in order]
         self._qpos_columns = torch.tensor([int(model.jnt_qposadr[j]) for j in ids])
         self._dof_columns = torch.tensor([int(model.jnt_dofadr[j]) for j in ids])
+        # where the joints lie side by side in the model, tensors are views of its arrays; else copies
+        self._qpos_view, self._dof_view = _span(self._qpos_columns), _span(self._dof_columns)
+        self._side_by_side = all(
+            torch.equal(columns, torch.arange(view.start, view.stop))
+            for columns, view in [
+                (self._qpos_columns, self._qpos_view),
+                (self._dof_columns, self._dof_view),
+            ]
+        )
         self._body_ids = list(range(1, model.nbody))
         self.body_names = [model.body(i).name for i in self._body_ids]
         self.dof_columns = self._dof_columns.clone()
@@ -284,8 +286,7 @@ class Articulation:
             "friction": "dof_frictionloss",
         }
         model_values = {
-            key: torch.as_tensor(getattr(self._sim.model, field))[self._dof_columns]
-            for key, field in columns.items()
+            key: torch.as_tensor(getattr(self._sim.model, field))[self._dof_columns] for key, field in columns.items()
         }
         self.actuators: dict[str, PaceDCMotor] = {}
         owner: dict[str, str] = {}
@@ -309,17 +310,18 @@ class Articulation:
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
-            ids = actuator.joint_indices
-            self.write_joint_armature_to_sim(actuator.armature, ids)
-            self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, ids)
-            self.write_joint_friction_coefficient_to_sim(actuator.friction, ids)
+            driven = actuator.joint_indices
+            self.write_joint_armature_to_sim(actuator.armature, driven)
+            self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)
+            self.write_joint_friction_coefficient_to_sim(actuator.friction, driven)
 
     def _write_parameter(
         self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
     ) -> None:
         tensor = torch.as_tensor(value, dtype=torch.float64)
-        if not bool((tensor >= 0).all()):
-            raise ValueError(f"{name} must be >= 0, got {tensor.min().item():g}.")
+        bad = ~((tensor >= 0) & tensor.isfinite())
+        if bool(bad.any()):
+            raise ValueError(f"{name} is {tensor[bad][0].item():g}, expected a finite number >= 0.")
         self._write(self._sim.expand(field), self._dof_columns, tensor, joint_ids, env_ids)
         self._sim.constants_changed()
 
@@ -331,33 +333,30 @@ class Articulation:
         joint_ids: JointIds,
         env_ids: EnvIds,
     ) -> None:
-        _assign(field, self._rows(env_ids), columns[_columns(joint_ids)], value)
-
-    def _rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
-        """Rows in the caller's order: values belong to env_ids one by one."""
-        if env_ids is None or isinstance(env_ids, slice):
-            return slice(None) if env_ids is None else env_ids
-        rows = torch.as_tensor(env_ids)
-        return rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows.long()
-
-    def _view(self, field: torch.Tensor, columns: torch.Tensor) -> torch.Tensor | None:
-        """A live view where the joints lie side by side in the model, else ``None``/a buffer to refresh."""
-        first, n = int(columns[0]), len(columns)
-        if columns.tolist() == list(range(first, first + n)):
-            return field[:, first : first + n]
-        return None if field is self._sim.qfrc_applied else field[:, columns]
+        _assign(field, _indices(env_ids), columns[_indices(joint_ids)], value)
 
     def _refresh(self) -> None:
-        data, sim = self.data, self._sim
-        if data.joint_pos.untyped_storage().data_ptr() != sim.qpos.untyped_storage().data_ptr():
-            torch.index_select(sim.qpos, 1, self._qpos_columns, out=data.joint_pos)
-            torch.index_select(sim.qvel, 1, self._dof_columns, out=data.joint_vel)
+        if not self._side_by_side:
+            torch.index_select(self._sim.qpos, 1, self._qpos_columns, out=self.data.joint_pos)
+            torch.index_select(self._sim.qvel, 1, self._dof_columns, out=self.data.joint_vel)
 
 
-def _columns(joint_ids: JointIds) -> torch.Tensor | slice:
-    if joint_ids is None or isinstance(joint_ids, slice):
-        return slice(None) if joint_ids is None else joint_ids
-    return torch.as_tensor(joint_ids).long()
+def _indices(ids: EnvIds | JointIds) -> torch.Tensor | slice:
+    """What selects these rows or columns, in the caller's order: values belong to the ids one by one."""
+    if ids is None or isinstance(ids, slice):
+        return slice(None) if ids is None else ids
+    indices = torch.as_tensor(ids)
+    return indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
+
+
+def _span(columns: torch.Tensor) -> slice:
+    first = int(columns[0])
+    return slice(first, first + len(columns))
+
+
+def _zeros_like(tensor: torch.Tensor) -> torch.Tensor:
+    with torch.inference_mode(False):  # can be written outside of the caller's inference mode too
+        return torch.zeros_like(tensor)
 
 
 def _assign(

@@ -31,9 +31,7 @@ class PaceVectorEnv(gym.vector.VectorEnv):
         """The batched environment."""
         return self.env
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict]:  # type: ignore[override]
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:  # type: ignore[override]
         """Reset all environments; ``options={"reset_mask": mask}`` resets some of them."""
         mask = (options or {}).get("reset_mask")
         obs, _ = self.env.reset(seed=seed, env_ids=None if mask is None else np.flatnonzero(mask))
@@ -41,9 +39,7 @@ class PaceVectorEnv(gym.vector.VectorEnv):
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:  # type: ignore[override]
         """Advance all environments; those that are done start anew in the same step."""
-        obs, reward, terminated, truncated, extras = self.env.step(
-            torch.as_tensor(actions, dtype=torch.float64)
-        )
+        obs, reward, terminated, truncated, extras = self.env.step(torch.as_tensor(actions, dtype=torch.float64))
         infos: dict[str, Any] = {}
         if "final_obs" in extras:
             last = extras["final_obs"]["policy"].numpy()

@@ -55,8 +55,12 @@ class ManagerBasedEnv(gym.Env):
     turn them into torques and the simulation advances; (3) interval events happen; (4) observations.
     """
 
-    metadata = {"render_modes": [None, "rgb_array"], "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as gym.Env declares it
+        "render_modes": ["rgb_array"],
+        "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
+    }
 
+    @torch.inference_mode(False)  # whoever builds it, it can be stepped in and out of inference mode
     def __init__(self, cfg: ManagerBasedEnvCfg, render_mode: str | None = None):
         """Build the scene and the managers.
 
@@ -116,7 +120,7 @@ class ManagerBasedEnv(gym.Env):
 
     def seed(self, seed: int | None) -> int:  # type: ignore[override]
         """Seed all random draws of the environment; returns the seed."""
-        seed = int(torch.seed() % 2**31) if seed is None else int(seed)
+        seed = self._generator.seed() % 2**31 if seed is None else int(seed)
         self._generator.manual_seed(seed)
         return seed
 
@@ -199,13 +203,13 @@ class ManagerBasedEnv(gym.Env):
         self.observation_manager.reset(env_ids)
 
     def _configure_spaces(self) -> None:
-        unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
         self.single_observation_space = gym.spaces.Dict(
-            {
-                name: gym.spaces.Box(shape=shape, **unbounded)
-                for name, shape in self.observation_manager.group_obs_dim.items()
-            }
+            {name: _unbounded(shape) for name, shape in self.observation_manager.group_obs_dim.items()}
         )
-        self.single_action_space = gym.spaces.Box(shape=(self.action_manager.total_action_dim,), **unbounded)
+        self.single_action_space = _unbounded((self.action_manager.total_action_dim,))
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
+
+
+def _unbounded(shape: tuple[int, ...]) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, shape, np.float32)

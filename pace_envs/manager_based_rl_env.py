@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 
@@ -41,8 +42,8 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
 
     A step: (1) action and physics; (2) terminations; (3) rewards; (4) environments that are done are reset;
     (5) commands; (6) interval events; (7) observations. The observation of an environment that was reset is
-    the first of its new episode (Gymnasium's "same step" autoreset); ``extras["final_obs"]`` holds the last one
-    of the old episode where ``extras["_final_obs"]`` is true.
+    the first of its new episode (Gymnasium's "same step" autoreset); ``extras["final_obs"]`` holds the last
+    one of the old episode where ``extras["_final_obs"]`` is true.
     """
 
     cfg: ManagerBasedRLEnvCfg
@@ -61,7 +62,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     @property
     def max_episode_length(self) -> int:
         """Longest episode [steps]."""
-        return math.ceil(self.max_episode_length_s / self.step_dt)
+        return math.ceil(self.max_episode_length_s / self.step_dt - 1e-6)
 
     def load_managers(self) -> None:
         """Build the managers."""
@@ -71,9 +72,9 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.termination_manager = TerminationManager(self.cfg.terminations, self)
         self.reward_manager = RewardManager(self.cfg.rewards, self)
 
-    def step(
+    def step(  # type: ignore[override]  # gym.Env knows one reward, this is one per environment
         self, action: torch.Tensor
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance all environments by ``step_dt``.
 
         Args:

@@ -22,14 +22,14 @@ _TASKS = {
 
 
 def register_envs() -> None:
-    """Register the project's environments; Gymnasium calls this by itself where the project is installed."""
+    """Register the project's environments with Gymnasium, once; ``import pace_envs`` does it."""
     for task, entry_point in _TASKS.items():
         if task not in gym.registry:
             register_task(task, entry_point)
 
 
 def register_task(task: str, env_cfg_entry_point: str | Callable[[], ManagerBasedRLEnvCfg]) -> None:
-    """Register an environment: ``gym.make(task, num_envs=…)`` and ``gym.make_vec(task, num_envs=…)`` build it.
+    """Register an environment, for ``gym.make(task, num_envs=…)`` and ``gym.make_vec(task, num_envs=…)``.
 
     Args:
         task: Its name, such as ``"Pace-MyRobot-v0"``.
@@ -68,7 +68,7 @@ def load_env_cfg(task: str) -> Any:
             f"There is no environment {task!r}.{hint} Available: {', '.join(registered_tasks())}. "
             "Register your own with pace_envs.register_task."
         )
-    return _call(gym.registry[task].kwargs["env_cfg_entry_point"])
+    return _load(gym.registry[task].kwargs["env_cfg_entry_point"])
 
 
 def make_env(
@@ -91,7 +91,7 @@ def make_env(
         seed: Seed of all random draws.
         render_mode: ``None`` or ``"rgb_array"``.
     """
-    env_cfg = copy.deepcopy(cfg) if cfg is not None else _call(env_cfg_entry_point)
+    env_cfg = copy.deepcopy(cfg) if cfg is not None else _load(env_cfg_entry_point)
     if num_envs is not None:
         env_cfg.scene.num_envs = num_envs
     if seed is not None:
@@ -118,7 +118,7 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     ratio = round(cfg.sim.dt / physics_dt) if physics_dt > 0 else 0
     if ratio < 1 or abs(ratio * physics_dt - cfg.sim.dt) > 1e-9:
         raise ValueError(
-            f"physics_dt is {physics_dt:g} s, expected a whole fraction of the control step {cfg.sim.dt:g} s, "
+            f"physics_dt is {physics_dt:g} s, expected a whole fraction of the time step {cfg.sim.dt:g} s, "
             f"such as {cfg.sim.dt / 5:g}."
         )
     cfg.sim.dt = cfg.sim.dt / ratio
@@ -127,8 +127,8 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
         drive.control_decimation *= ratio
 
 
-def _call(entry_point: str | Callable[[], Any]) -> Any:
-    if isinstance(entry_point, str):
-        module, _, name = entry_point.partition(":")
-        entry_point = getattr(import_module(module), name)
-    return entry_point()
+def _load(entry_point: str | Callable[[], Any]) -> Any:
+    if not isinstance(entry_point, str):
+        return copy.deepcopy(entry_point())
+    module, _, name = entry_point.partition(":")
+    return copy.deepcopy(getattr(import_module(module), name)())

@@ -7,7 +7,7 @@ from pace_envs.simulation import Simulation
 
 
 class OffscreenRenderer:
-    """Draws environment 0 with MuJoCo's renderer (set MUJOCO_GL to egl or osmesa where there is no screen)."""
+    """Draws environment 0 with MuJoCo's renderer; without a screen, set MUJOCO_GL to egl or osmesa."""
 
     def __init__(self, sim: Simulation, width: int = 1280, height: int = 720):
         """Create the renderer; uses the model's camera ``track`` where there is one."""

@@ -35,7 +35,7 @@ class SimulationCfg:
     """Gravity [m/s^2]."""
 
     friction_timeconst: float | None = None
-    """Time constant of the joints' Coulomb friction [s]; ``None`` means two time steps, the stiffest that is stable.
+    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps, the stiffest stable one.
 
     MuJoCo's default of 20 ms is soft: a stuck joint creeps.
     """
@@ -49,9 +49,6 @@ class SimulationCfg:
     num_threads: int = 0
     """Threads of the physics; 0 means one per processor. Results do not depend on it."""
 
-    iterations: int = 100
-    """Largest number of solver iterations a step."""
-
 
 class Simulation:
     """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (float64, no copies)."""
@@ -61,7 +58,7 @@ class Simulation:
 
         Args:
             cfg: The configuration.
-            spec: The model; it is changed (options, joint friction solver parameters, no actuators).
+            spec: The model; it is changed: options, joint friction's solver parameters, no actuators or keys.
             num_envs: Number of simulations.
 
         Raises:
@@ -95,11 +92,14 @@ class Simulation:
             return torch.from_numpy(self.batch.bind(field))
 
     def expand(self, field: str) -> torch.Tensor:
-        """A live tensor over an ``MjModel`` field's values per simulation; call :meth:`constants_changed` after writing."""
+        """A live tensor over the values per simulation of an ``MjModel`` field, shape (num_envs, ...).
+
+        Call :meth:`constants_changed` after writing.
+        """
         return torch.from_numpy(self.batch.expand(field))
 
     def constants_changed(self) -> None:
-        """Note that model fields were written, so that derived constants are computed before the next step."""
+        """Note that model fields were written: what derives from them is computed before the next step."""
         self._constants_changed = True
 
     def step(self) -> None:
@@ -120,12 +120,21 @@ class Simulation:
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def resolve_env_ids(self, env_ids: EnvIds) -> np.ndarray:
-        """Environment indices, sorted and unique, as an int32 array."""
+        """Environment indices, sorted and unique, as an int32 array, of indices or a mask of any kind.
+
+        Raises:
+            ValueError: If an index is out of range or a mask has the wrong length.
+        """
         if env_ids is None:
             return np.arange(self.num_envs, dtype=np.int32)
         if isinstance(env_ids, slice):
-            return np.arange(self.num_envs, dtype=np.int32)[env_ids]
-        ids = np.unique(np.asarray(env_ids))
+            return np.sort(np.arange(self.num_envs, dtype=np.int32)[env_ids])
+        ids = np.asarray(env_ids)
+        if ids.dtype == bool:
+            if ids.shape != (self.num_envs,):
+                raise ValueError(f"The mask env_ids has shape {ids.shape}, expected ({self.num_envs},).")
+            return np.flatnonzero(ids).astype(np.int32)
+        ids = np.unique(ids)
         if ids.size and (ids[0] < 0 or ids[-1] >= self.num_envs):
             raise ValueError(f"env_ids holds {ids[0]} to {ids[-1]}, expected 0 to {self.num_envs - 1}.")
         return ids.astype(np.int32)
@@ -139,12 +148,13 @@ class Simulation:
         self._constants_changed = False
 
     def _compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        for actuator in list(spec.actuators):
-            spec.delete(actuator)  # the drive is pace_actuators' business
+        # the drive is pace_actuators' business, and keyframes have the size of the model as it was
+        sensors = [s for s in spec.sensors if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
+        for element in [*sensors, *spec.actuators, *spec.keys]:
+            spec.delete(element)
         spec.option.timestep = self.cfg.dt
         spec.option.integrator = _INTEGRATORS[self.cfg.integrator]
         spec.option.gravity = self.cfg.gravity
-        spec.option.iterations = self.cfg.iterations
         # a simulation that diverges must show it instead of starting again at rest
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if not self.cfg.contacts:

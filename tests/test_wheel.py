@@ -1,6 +1,5 @@
 """The built wheel holds the three packages, their type markers, and the assets."""
 
-import configparser
 import os
 import shutil
 import subprocess
@@ -77,14 +76,6 @@ def test_nothing_else_is_inside(names):
 def test_licence_and_notice_travel_with_it(names):
     for file in ("LICENSE", "NOTICE"):
         assert [n for n in names if n.endswith(f".dist-info/licenses/{file}")]
-
-
-def test_gymnasium_plugins_find_the_environments(wheel):
-    with zipfile.ZipFile(wheel) as archive:
-        name = next(n for n in archive.namelist() if n.endswith("entry_points.txt"))
-        table = configparser.ConfigParser()
-        table.read_string(archive.read(name).decode())
-    assert table["gymnasium.envs"]["__root__"] == "pace_envs:register_envs"
 
 
 def test_an_installed_wheel_finds_its_assets_without_the_checkout(wheel, tmp_path):

@@ -42,15 +42,18 @@ class CommandTerm:
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Draw new commands for some environments."""
-        if len(env_ids):
-            self.time_left[env_ids] = self._env.uniform((len(env_ids),), *self.cfg.resampling_time_range)
-            self._resample_command(env_ids)
+        self._resample(env_ids)
 
     def compute(self, dt: float) -> None:
         """Let time pass and draw where it has run out."""
         self.time_left -= dt
-        self.reset((self.time_left <= 0.0).nonzero()[:, 0])
+        self._resample((self.time_left <= 0.0).nonzero()[:, 0])
         self._update_command()
+
+    def _resample(self, env_ids: torch.Tensor) -> None:
+        if len(env_ids):
+            self.time_left[env_ids] = self._env.uniform((len(env_ids),), *self.cfg.resampling_time_range)
+            self._resample_command(env_ids)
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         raise NotImplementedError

@@ -38,16 +38,12 @@ class EventManager:
         self._time_left: list[torch.Tensor] = []
         for name, term_cfg in term_items(cfg).items():
             if term_cfg.mode not in self._terms:
-                raise ValueError(
-                    f"The event {name!r} has mode {term_cfg.mode!r}. Available: {', '.join(self._terms)}."
-                )
+                raise ValueError(f"The event {name!r} has mode {term_cfg.mode!r}. Available: {', '.join(self._terms)}.")
             if term_cfg.mode == "interval":
                 if term_cfg.interval_range_s is None:
-                    raise ValueError(
-                        f"The interval event {name!r} needs interval_range_s = (min, max) in seconds."
-                    )
+                    raise ValueError(f"The interval event {name!r} needs interval_range_s = (min, max) in seconds.")
                 self._time_left.append(env.uniform((env.num_envs,), *term_cfg.interval_range_s))
-            self._terms[term_cfg.mode].append(Term(name, term_cfg, env))
+            self._terms[term_cfg.mode].append(Term(name, term_cfg, env, num_args=2))
 
     @property
     def available_modes(self) -> list[str]:

@@ -37,12 +37,12 @@ class SceneEntityCfg:
 
     def resolve(self, env: ManagerBasedEnv) -> SceneEntityCfg:
         """A copy with ``joint_ids`` and ``body_ids`` filled in."""
-        entity, found = env.scene[self.name], {}
+        resolved, entity = dataclasses.replace(self), env.scene[self.name]
         if self.joint_names is not None:
-            found["joint_ids"] = entity.find_joints(self.joint_names, preserve_order=self.preserve_order)[0]
+            resolved.joint_ids = entity.find_joints(self.joint_names, preserve_order=self.preserve_order)[0]
         if self.body_names is not None:
-            found["body_ids"] = entity.find_bodies(self.body_names, preserve_order=self.preserve_order)[0]
-        return dataclasses.replace(self, **found)
+            resolved.body_ids = entity.find_bodies(self.body_names, preserve_order=self.preserve_order)[0]
+        return resolved
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -64,6 +64,10 @@ class ManagerTermBase:
         self.cfg = cfg
         self._env = env
 
+    def __call__(self, env: ManagerBasedEnv, *args: Any, **params: Any) -> Any:
+        """What a function term would do; subclasses name their parameters."""
+        raise NotImplementedError
+
     def reset(self, env_ids: torch.Tensor) -> None:
         """Forget the state of some environments."""
 
@@ -71,8 +75,14 @@ class ManagerTermBase:
 class Term:
     """A term with its function and parameters resolved."""
 
-    def __init__(self, name: str, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv):
+    def __init__(self, name: str, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv, *, num_args: int = 1):
         """Resolve scene entities, build class terms and check the arguments.
+
+        Args:
+            name: Name of the term.
+            cfg: Its configuration.
+            env: The environment.
+            num_args: Number of arguments that come before its params: ``env``, and for events ``env_ids``.
 
         Raises:
             ValueError: If an argument is missing or unknown.
@@ -81,11 +91,10 @@ class Term:
         self.cfg = cfg
         self._env = env
         self.params = {
-            key: value.resolve(env) if isinstance(value, SceneEntityCfg) else value
-            for key, value in cfg.params.items()
+            key: value.resolve(env) if isinstance(value, SceneEntityCfg) else value for key, value in cfg.params.items()
         }
-        self.func = cfg.func(cfg, env) if inspect.isclass(cfg.func) else cfg.func
-        self._check_arguments()
+        self.func: Callable[..., Any] = cfg.func(cfg, env) if isinstance(cfg.func, type) else cfg.func
+        self._check_arguments(num_args)
 
     def __call__(self, *args: Any) -> Any:
         """Call the term's function: ``func(env, *args, **params)``."""
@@ -96,21 +105,20 @@ class Term:
         if isinstance(self.func, ManagerTermBase):
             self.func.reset(env_ids)
 
-    def _check_arguments(self) -> None:
-        function = self.func.__call__ if isinstance(self.func, ManagerTermBase) else self.func
-        accepted = inspect.signature(function).parameters
-        if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in accepted.values()):
+    def _check_arguments(self, num_args: int) -> None:
+        accepted = inspect.signature(self.func).parameters
+        if any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in accepted.values()):
             return
-        unknown = set(self.params) - set(accepted)
-        if unknown:
-            raise ValueError(
-                f"The term {self.name!r} got unknown params {', '.join(sorted(unknown))}. "
-                f"Its function takes: {', '.join(accepted)}."
-            )
+        takes = list(accepted)[num_args:]
+        unknown = [name for name in self.params if name not in takes]
+        missing = [n for n in takes if accepted[n].default is inspect.Parameter.empty and n not in self.params]
+        if unknown or missing:
+            wrong = f"got unknown params {', '.join(unknown)}" if unknown else f"lacks {', '.join(missing)}"
+            raise ValueError(f"The term {self.name!r} {wrong}. Params of its function: {', '.join(takes) or 'none'}.")
 
 
 def term_items(cfg: Any) -> dict[str, Any]:
-    """Terms by name of a dict or of an object whose attributes are terms; ``None`` values are switched off."""
+    """Terms by name, of a dict or of an object whose attributes are terms; ``None`` switches a term off."""
     if cfg is None:
         return {}
     items = cfg if isinstance(cfg, Mapping) else vars(cfg)

@@ -28,9 +28,7 @@ def reset_joints_by_offset(
     position = asset.data.default_joint_pos[env_ids][:, ids]
     velocity = asset.data.default_joint_vel[env_ids][:, ids]
     limits = asset.data.soft_joint_pos_limits[ids]
-    position = (position + env.uniform(tuple(position.shape), *position_range)).clamp(
-        limits[:, 0], limits[:, 1]
-    )
+    position = (position + env.uniform(tuple(position.shape), *position_range)).clamp(limits[:, 0], limits[:, 1])
     velocity = velocity + env.uniform(tuple(velocity.shape), *velocity_range)
     asset.write_joint_state_to_sim(position, velocity, ids, env_ids)
 
@@ -42,7 +40,7 @@ def reset_root_state_uniform(
     velocity_range: Mapping[str, tuple[float, float]],
     asset_cfg: SceneEntityCfg = _ROBOT,
 ) -> None:
-    """A floating base starts at its initial state plus uniform offsets by axis: x y z [m], roll pitch yaw [rad]."""
+    """A floating base starts at its initial state plus uniform offsets: x y z [m], roll pitch yaw [rad]."""
     asset = env.scene[asset_cfg.name]
     init = asset.cfg.init_state
     pose = _draw(env, len(env_ids), pose_range)
@@ -63,6 +61,8 @@ def push_by_setting_velocity(
 ) -> None:
     """Push a floating base: add uniform draws by axis to its velocity [m/s], [rad/s]."""
     data = env.scene[asset_cfg.name].data
+    if data.root_lin_vel_w is None or data.root_ang_vel_b is None:
+        raise ValueError("This robot's base is fixed: it cannot be pushed. Remove the event or set fix_base=False.")
     change = _draw(env, len(env_ids), velocity_range)
     data.root_lin_vel_w[env_ids] += change[:, :3]
     data.root_ang_vel_b[env_ids] += change[:, 3:]

@@ -4,9 +4,7 @@ from pace_actuators import PaceDCMotorCfg
 from pace_assets import ASSETS_DIR
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 
-ANYMAL_D_JOINTS = tuple(
-    f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")
-)
+ANYMAL_D_JOINTS = tuple(f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE"))
 
 
 def anymal_d_drive_cfg() -> PaceDCMotorCfg:

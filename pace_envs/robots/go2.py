@@ -4,9 +4,7 @@ from pace_actuators import PaceDCMotorCfg
 from pace_assets import ASSETS_DIR
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 
-GO2_JOINTS = tuple(
-    f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")
-)
+GO2_JOINTS = tuple(f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf"))
 
 
 def go2_drive_cfgs() -> dict[str, PaceDCMotorCfg]:

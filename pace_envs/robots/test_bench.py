@@ -47,7 +47,8 @@ def apply_test_bench_load(env: ManagerBasedEnv, env_ids: EnvIds, load: Mapping[s
     mass, length, arm_mass = (float(values[key]) for key in TEST_BENCH_LOAD)
     if not (mass >= 0 and length > 0 and arm_mass >= 0):
         raise ValueError(
-            f"The load is {mass:g} kg at {length:g} m on an arm of {arm_mass:g} kg, expected masses >= 0 and a length > 0."
+            f"The load is {mass:g} kg at {length:g} m on an arm of {arm_mass:g} kg, "
+            "expected masses >= 0 and a length > 0."
         )
     rows = env.sim.resolve_env_ids(env_ids)
     model, sim = env.sim.model, env.sim

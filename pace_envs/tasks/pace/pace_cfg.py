@@ -18,7 +18,7 @@ class CMAESOptimizerCfg:
     """Settings of the search."""
 
     per_tree: bool = True
-    """Whether parts of the robot that do not influence each other (legs on a fixed base) are searched apart."""
+    """Whether parts of the robot that do not move each other (legs on a fixed base) are searched apart."""
 
     max_iteration: int = 200
     """Largest number of generations."""
@@ -80,7 +80,7 @@ class PaceCfg:
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 
     apply_load: Callable[[Any, Any, Mapping[str, float]], None] | None = None
-    """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to some environments,
+    """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
     def __post_init__(self) -> None:
@@ -89,8 +89,8 @@ class PaceCfg:
         self.bounds_params = torch.as_tensor(self.bounds_params, dtype=torch.float64)
         if tuple(self.bounds_params.shape) != expected:
             raise ValueError(
-                f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters for "
-                f"each of the {len(self.joint_order)} joints in joint_order, then the delay."
+                f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
+                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay."
             )
         wrong = (~(self.bounds_params[:, 0] <= self.bounds_params[:, 1])).nonzero()[:, 0]
         if len(wrong):

@@ -1,5 +1,6 @@
 """The identification environment."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -16,7 +17,7 @@ class PaceSim2realSceneCfg(InteractiveSceneCfg):
 
     def __post_init__(self) -> None:
         """Fix the base."""
-        self.robot.fix_base = True
+        self.robot = dataclasses.replace(self.robot, fix_base=True)
 
 
 def _actions() -> dict[str, ActionTermCfg]:
@@ -59,4 +60,5 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
 
     def __post_init__(self) -> None:
         """Use the identification's joint order everywhere."""
-        self.scene.robot.joint_order = tuple(self.sim2real.joint_order)
+        robot = dataclasses.replace(self.scene.robot, joint_order=tuple(self.sim2real.joint_order))
+        self.scene = dataclasses.replace(self.scene, robot=robot)

@@ -66,7 +66,7 @@ class Parameter:
                 f"expected {len(self.keys)} of each: {', '.join(self.keys)}."
             )
         if self.scale == "log" and min(self.lower) <= 0:
-            raise ValueError(f"The parameter {self.name!r} has a logarithmic scale: its bounds must be > 0.")
+            raise ValueError(f"The bounds of {self.name!r} must be > 0: its scale is logarithmic.")
 
 
 def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
