@@ -53,9 +53,7 @@ class Dataset:
     def names(self, which: str) -> list[str]:
         """Names of what is trained on or validated on: whole recordings, or their parts in time."""
         result = []
-        for r, (recording, validation_only) in enumerate(
-            zip(self.recordings, self.validation_only, strict=True)
-        ):
+        for r, (recording, validation_only) in enumerate(zip(self.recordings, self.validation_only, strict=True)):
             parts = {"train": bool(self.train[:, r].any()), "validation": bool(self.validation[:, r].any())}
             if not parts[which]:
                 continue

@@ -75,7 +75,7 @@ class ParameterSpace:
         return torch.where(width > 0, (value - self._low) / width.clamp(min=1e-300) * 2 - 1, 0.0)
 
     def slope(self, x: torch.Tensor) -> torch.Tensor:
-        """d physical / d x at normalised vectors (…, size)."""
+        """D physical / d x at normalised vectors (…, size)."""
         half_width = (self._high - self._low) / 2
         return torch.where(self._log, self.to_physical(x) * half_width, half_width)
 
@@ -108,10 +108,22 @@ class ParameterSpace:
                 entries += [float(value)] * len(parameter.keys)
         return torch.tensor(entries, dtype=torch.float64)
 
-    def apply(self, env: ManagerBasedEnv, physical: torch.Tensor) -> None:
-        """Write one vector per environment, (num_envs, size), to the simulation and its drives."""
+    def apply(
+        self,
+        env: ManagerBasedEnv,
+        physical: torch.Tensor,
+        per_joint: Mapping[str, torch.Tensor] | None = None,
+    ) -> None:
+        """Write one vector per environment to the simulation and its drives.
+
+        Args:
+            env: The environment.
+            physical: (num_envs, size).
+            per_joint: Values per joint of shared parameters, {name: (num_envs, n)}.
+        """
         for parameter in self.parameters:
-            parameter.apply(env, physical[:, self.slices[parameter.name]])
+            values = (per_joint or {}).get(parameter.name)
+            parameter.apply(env, physical[:, self.slices[parameter.name]] if values is None else values)
 
     def owners(self, trees: Sequence[Sequence[str]]) -> list[int | None]:
         """For each entry, which group of joints it influences; ``None`` for entries that all share.

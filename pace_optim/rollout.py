@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -75,17 +75,26 @@ class Rollout:
         """Control steps of the present rollout."""
         return self.dataset.last_step(self._where)
 
-    def start(self, physical: torch.Tensor, where: torch.Tensor | None = None) -> None:
+    def start(
+        self,
+        physical: torch.Tensor,
+        where: torch.Tensor | None = None,
+        per_joint: Mapping[str, torch.Tensor] | None = None,
+    ) -> None:
         """Write candidates and put every environment at its recording's first sample.
 
         Args:
             physical: Physical parameters, (num_candidates, size).
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
+            per_joint: Values per joint of shared parameters, in place of those in ``physical``:
+                {name: (num_candidates, n)}.
         """
+        count = self.dataset.num_recordings
         self._where = self.dataset.train if where is None else where
-        self.physical = physical.repeat_interleave(self.dataset.num_recordings, dim=0)
+        self.physical = physical.repeat_interleave(count, dim=0)
         self.env.scene.reset()
-        self.space.apply(self.env, self.physical)
+        copies = {name: values.repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
+        self.space.apply(self.env, self.physical, copies)
         self._set_initial_state()
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
