@@ -17,7 +17,9 @@ _LEVELS = (0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)
 _MOVING = 0.4  # share of a level's time spent on the way to the next
 
 
-@register_excitation("battery", "chirps at three amplitudes, slow triangle, random steps, gravity staircase", duration=10.0)
+@register_excitation(
+    "battery", "chirps at three amplitudes, slow triangle, random steps, gravity staircase", duration=10.0
+)
 def battery(motion: Motion) -> list[Trajectory]:
     """Six trajectories, each of the duration asked for."""
     chirp = chirp_signal(motion)

@@ -11,7 +11,9 @@ _DRAWS = 40
 _FADE = 0.5  # [s]
 
 
-@register_excitation("multisine", "four periods of sines at odd harmonics, random phases, a third left out", duration=40.0)
+@register_excitation(
+    "multisine", "four periods of sines at odd harmonics, random phases, a third left out", duration=40.0
+)
 def multisine(motion: Motion) -> list[Trajectory]:
     """Equal amplitudes, each joint with phases of its own, peak 1.
 
@@ -42,7 +44,8 @@ def excited_lines(motion: Motion, period: float) -> np.ndarray:
     if len(odd) < 3:
         raise ValueError(
             f"A multisine of {motion.duration:g} s has {len(odd)} odd harmonics of 1/{period:g} s in the band "
-            f"{motion.min_frequency:g} to {motion.max_frequency:g} Hz; expected at least 3. Make it longer or the band wider."
+            f"{motion.min_frequency:g} to {motion.max_frequency:g} Hz; expected at least 3. Make it longer, or the band "
+            "wider."
         )
     groups = len(odd) // 3
     left_out = 3 * np.arange(groups) + motion.rng.integers(0, 3, groups)

@@ -1,0 +1,99 @@
+"""What all command lines share: options that read well, and errors of one line.
+
+def main() -> None:
+    parser = make_parser("Does this.", example="scripts/this.py --task Pace-AnymalD-v0")
+    ...
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import NoReturn
+
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+def run_cli(main: Callable[[], int | None]) -> int:
+    """Run a command; return its exit code.
+
+    What a user can mend (ValueError, KeyError, OSError) is printed to stderr as one line, ``error: ...``, and exits
+    with 2; an interruption exits with 130. With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
+    """
+    try:
+        return main() or 0
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, KeyError, OSError) as error:
+        if os.environ.get("PACE_TRACEBACK"):
+            raise
+        print(f"error: {_one_line(error)}", file=sys.stderr)
+        return USER_ERROR
+
+
+def import_task(task: str) -> str:
+    """Import the module of ``module:Task``, which registers the task, and return the task's name.
+
+    Raises:
+        ValueError: If there is no such module.
+    """
+    module, colon, name = task.rpartition(":")
+    if colon:
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise ValueError(
+                f"--task {task}: the module {module!r} cannot be imported ({_one_line(error)}). Correct its name, or "
+                "put its folder on PYTHONPATH."
+            ) from None
+    return name
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line and say what was probably meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2."""
+        if message.startswith("unrecognized arguments: "):
+            known = [option for action in self._actions for option in action.option_strings]
+            for word in message.removeprefix("unrecognized arguments: ").split():
+                option = word.partition("=")[0]
+                if option.startswith("-") and (
+                    close := difflib.get_close_matches(option.replace("-", "_"), [k.replace("-", "_") for k in known])
+                ):
+                    match = next(k for k in known if k.replace("-", "_") == close[0])
+                    message += f"; did you mean {match} instead of {option}?"
+        print(f"error: {message.rstrip('.')}. See {self.prog} --help.", file=sys.stderr)
+        raise SystemExit(USER_ERROR)
+
+
+def make_parser(description: str, *, example: str) -> Parser:
+    """A parser whose ``--help`` ends with an example."""
+    return Parser(
+        description=description,
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, KeyError) and error.args:
+        text = str(error.args[0])  # str(KeyError) is a repr
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    else:
+        text = str(error) or type(error).__name__
+    return " ".join(text.split())

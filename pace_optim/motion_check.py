@@ -1,0 +1,182 @@
+"""Checking a commanded trajectory against a robot before it is sent anywhere.
+
+Positions that the joints cannot reach are errors. Speed and torque are warnings: the drive limits them itself, and
+PACE's reference chirp asks for more than the drive gives at its upper end, on purpose. Only a drive that is at its
+torque limit most of the time makes an error, since it no longer follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pace_optim.excitation import Trajectory
+
+MAX_SHARE_AT_LIMIT = 0.5
+"""A joint whose torque is at its limit for a larger share of the time is refused."""
+
+_AT_LIMIT = 1 - 1e-6  # of the limit
+_TOLERANCE = 1e-9  # [rad]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionLimits:
+    """What a robot's joints can do."""
+
+    joint_names: tuple[str, ...]
+    """The joints."""
+    position: np.ndarray
+    """Lower and upper limit, (n, 2) [rad]; infinite where there is none."""
+    velocity: np.ndarray
+    """No-load speed of the drive, (n,) [rad/s]; may be infinite."""
+    effort: np.ndarray
+    """Largest torque of the drive, (n,) [N m]; may be infinite."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFinding:
+    """One joint that leaves one of its limits."""
+
+    joint: str
+    """Name of the joint."""
+    quantity: Literal["target", "commanded speed", "position", "torque", "share of time at the torque limit"]
+    """What leaves its limit."""
+    value: float
+    """The value furthest out [rad, rad/s, N m, or 1]."""
+    limit: float
+    """The limit, in the same unit."""
+    time: float
+    """When [s]."""
+    is_error: bool
+    """Whether the trajectory must not be sent."""
+    message: str
+    """The finding as a sentence."""
+
+
+def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFinding]:
+    """Check the targets alone: positions, and speeds by differences.
+
+    A trajectory that jumps on purpose (steps) has no commanded speed; see ``Trajectory.has_jumps``.
+
+    Args:
+        trajectory: The targets.
+        limits: The robot's, with the same joints in the same order.
+
+    Raises:
+        ValueError: If the joints differ.
+    """
+    if trajectory.joint_names != limits.joint_names:
+        raise ValueError(
+            f"The trajectory {trajectory.name!r} has the joints {', '.join(trajectory.joint_names)}, but the limits are "
+            f"for {', '.join(limits.joint_names)}. Give both in the same order."
+        )
+    target, time = trajectory.des_dof_pos, trajectory.time
+    findings = _beyond_position(target, time, limits, "target", is_error=True)
+    if trajectory.has_jumps:
+        return findings
+    speed = np.abs(np.diff(target, axis=0)) / np.diff(time)[:, None]
+    for j, joint in enumerate(limits.joint_names):
+        over = speed[:, j] > limits.velocity[j]
+        if over.any():
+            k = int(np.argmax(speed[:, j]))
+            message = (
+                f"{joint}: targets move at up to {speed[k, j]:.3g} rad/s at {time[k]:.2f} s, faster than the drive's "
+                f"no-load speed of {limits.velocity[j]:.3g} rad/s; it cannot follow in {over.mean():.0%} of the time."
+            )
+            findings.append(
+                _finding(joint, "commanded speed", speed[k, j], limits.velocity[j], time[k], False, message)
+            )
+    return findings
+
+
+def check_simulated(
+    time: np.ndarray, position: np.ndarray, torque: np.ndarray, limits: MotionLimits
+) -> list[MotionFinding]:
+    """Check how the robot moved in simulation.
+
+    Args:
+        time: Instants, (T,) [s].
+        position: Joint positions, (T, n) [rad].
+        torque: Torques applied between two instants, (T - 1, n) [N m].
+        limits: The robot's.
+    """
+    findings = _beyond_position(position, time, limits, "position", is_error=False)
+    for j, joint in enumerate(limits.joint_names):
+        size, limit = np.abs(torque[:, j]), limits.effort[j]
+        at_limit = size >= _AT_LIMIT * limit
+        if not at_limit.any():
+            continue
+        k, share = int(np.argmax(at_limit)), float(at_limit.mean())
+        message = (
+            f"{joint}: the simulated torque reaches its limit of {limit:.3g} N m, first at {time[k]:.2f} s, and is there "
+            f"in {share:.1%} of the time."
+        )
+        if share > MAX_SHARE_AT_LIMIT:
+            message += " The drive hardly follows: make the motion smaller or slower, or lower the gains."
+            quantity: Literal["share of time at the torque limit"] = "share of time at the torque limit"
+            findings.append(_finding(joint, quantity, share, MAX_SHARE_AT_LIMIT, time[k], True, message))
+        else:
+            findings.append(_finding(joint, "torque", size[k], limit, time[k], False, message))
+    return findings
+
+
+def refuse_errors(findings: Sequence[MotionFinding], name: str) -> None:
+    """Raise a ValueError that lists the errors among the findings.
+
+    Args:
+        findings: The findings.
+        name: Name of the trajectory.
+    """
+    errors = [finding.message for finding in findings if finding.is_error]
+    if errors:
+        more = f" And {len(errors) - 3} more." if len(errors) > 3 else ""
+        raise ValueError(f"The motion {name!r} must not be sent to this robot. {' '.join(errors[:3])}{more}")
+
+
+def _beyond_position(
+    position: np.ndarray,
+    time: np.ndarray,
+    limits: MotionLimits,
+    quantity: Literal["target", "position"],
+    *,
+    is_error: bool,
+) -> list[MotionFinding]:
+    findings = []
+    below, above = limits.position[:, 0] - position, position - limits.position[:, 1]
+    for j, joint in enumerate(limits.joint_names):
+        k = int(np.argmax(np.maximum(below[:, j], above[:, j])))
+        if max(below[k, j], above[k, j]) <= _TOLERANCE:
+            continue
+        low, high = limits.position[j]
+        what = "its target is" if is_error else "in simulation it reaches"
+        cure = " Change PaceCfg.excitation (bias, scale)." if is_error else ""
+        message = (
+            f"{joint}: {what} {position[k, j]:.3f} rad at {time[k]:.2f} s, outside its limits of {low:.3f} to "
+            f"{high:.3f} rad.{cure}"
+        )
+        limit = low if below[k, j] > above[k, j] else high
+        findings.append(_finding(joint, quantity, position[k, j], limit, time[k], is_error, message))
+    return findings
+
+
+def _finding(
+    joint: str,
+    quantity: Literal["target", "commanded speed", "position", "torque", "share of time at the torque limit"],
+    value: float,
+    limit: float,
+    time: float,
+    is_error: bool,
+    message: str,
+) -> MotionFinding:
+    return MotionFinding(
+        joint=joint,
+        quantity=quantity,
+        value=float(value),
+        limit=float(limit),
+        time=float(time),
+        is_error=is_error,
+        message=message,
+    )
