@@ -1,0 +1,352 @@
+"""The drive's torque law, against figures worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg, resolve_joint_values
+
+JOINTS = ["hip", "knee"]
+
+
+def drive_cfg(**fields) -> PaceDCMotorCfg:
+    defaults = {"joint_names_expr": ".*", "stiffness": 10.0, "damping": 0.0}
+    return PaceDCMotorCfg(**(defaults | fields))
+
+
+def drive(num_envs=1, joints=JOINTS, dtype=torch.float64, **fields) -> PaceDCMotor:
+    return PaceDCMotor(drive_cfg(**fields), joints, slice(None), num_envs, dtype=dtype)
+
+
+def row(*values: float) -> torch.Tensor:
+    return torch.tensor([values], dtype=torch.float64)
+
+
+def torque(motor: PaceDCMotor, target=None, pos=0.0, vel=0.0, *, target_vel=None, effort=None) -> torch.Tensor:
+    """One call; numbers stand for every environment and joint."""
+
+    def full(value):
+        if value is None or isinstance(value, torch.Tensor):
+            return value
+        return torch.full_like(motor.stiffness, value)
+
+    action = ActuatorActions(full(target), full(target_vel), full(effort))
+    return motor.compute(action, full(pos), full(vel)).joint_efforts
+
+
+# ---- torque-speed limit: stall torque 100 N m, continuous limit 60 N m, no-load speed 10 rad/s; corner at 4 rad/s
+
+
+@pytest.mark.parametrize(
+    ("speed", "asked", "given"),
+    [
+        (0.0, 200.0, 60.0),  # standing: the continuous limit
+        (0.0, -200.0, -60.0),
+        (0.0, 59.0, 59.0),
+        (4.0, 200.0, 60.0),  # driving forward, at the corner
+        (7.0, 200.0, 30.0),  # beyond the corner
+        (7.0, 20.0, 20.0),
+        (7.0, -200.0, -60.0),  # braking while moving forward
+        (10.0, 200.0, 0.0),  # no-load speed
+        (12.0, 200.0, -20.0),  # faster than no load: the motor brakes
+        (16.0, 200.0, -60.0),
+        (50.0, 200.0, -60.0),  # never more than the continuous limit
+        (50.0, -200.0, -60.0),
+        (-4.0, -200.0, -60.0),  # driving backward
+        (-7.0, -200.0, -30.0),
+        (-7.0, 200.0, 60.0),  # braking while moving backward
+        (-10.0, -200.0, 0.0),
+        (-12.0, -200.0, 20.0),
+        (-50.0, -200.0, 60.0),
+        (-50.0, 200.0, 60.0),
+    ],
+)
+def test_the_torque_speed_limit_in_four_quadrants(speed, asked, given):
+    motor = drive(saturation_effort=100.0, effort_limit=60.0, velocity_limit=10.0, damping=0.0)
+    assert torque(motor, vel=speed, effort=asked).tolist() == [[given, given]]
+    assert motor.computed_effort.tolist() == [[asked, asked]]
+    assert motor.applied_effort.tolist() == [[given, given]]
+
+
+@pytest.mark.parametrize("speed", [0.0, 9.0, -1e6])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_without_a_torque_speed_curve_only_the_effort_limit_holds(speed, dtype):
+    assert torque(drive(dtype=dtype, effort_limit=60.0), vel=speed, effort=200.0).tolist() == [[60.0, 60.0]]
+    capped = drive(dtype=dtype, effort_limit=60.0, velocity_limit=1.0)
+    assert torque(capped, vel=speed, effort=200.0).tolist() == [[60.0, 60.0]]
+    infinite_speed = drive(dtype=dtype, effort_limit=60.0, saturation_effort=100.0)
+    assert torque(infinite_speed, vel=speed, effort=200.0).tolist() == [[60.0, 60.0]]
+    assert torque(drive(dtype=dtype), vel=speed, effort=200.0).tolist() == [[200.0, 200.0]]
+
+
+def test_several_types_of_drive_share_a_group():
+    motor = drive(effort_limit={"hip": 20.0, "knee": 45.0}, stiffness={"h.*": 5.0, "k.*": 7.0})
+    assert torque(motor, target=1.0).tolist() == [[5.0, 7.0]]
+    assert torque(motor, target=100.0).tolist() == [[20.0, 45.0]]
+
+
+# ---- controller and encoder
+
+
+def test_the_controller_is_pd_with_feed_forward():
+    motor = drive(stiffness=10.0, damping=2.0)
+    # 10 (0.5 - 0.2) + 2 (1.5 - 4) + 3
+    assert torque(motor, 0.5, 0.2, 4.0, target_vel=1.5, effort=3.0).flatten().tolist() == pytest.approx([1.0, 1.0])
+    # no target velocity means zero: 10 (0.5 - 0.2) - 2 * 4
+    assert torque(motor, 0.5, 0.2, 4.0).flatten().tolist() == pytest.approx([-5.0, -5.0])
+
+
+def test_without_a_position_target_only_velocity_and_effort_act():
+    motor = drive(stiffness=10.0, damping=2.0, encoder_bias=0.3)
+    assert torque(motor, None, 0.7, 4.0, effort=3.0).flatten().tolist() == pytest.approx([-5.0, -5.0])
+
+
+def test_the_encoder_shows_the_position_less_its_bias():
+    motor = drive(stiffness=10.0, encoder_bias={"hip": 0.05, "knee": -0.02})
+    # kp (q* - q + bias)
+    assert torque(motor, 0.5, 0.2).flatten().tolist() == pytest.approx([3.5, 2.8])
+    motor.update_encoder_bias(row(0.1, 0.0))
+    assert torque(motor, 0.5, 0.2).flatten().tolist() == pytest.approx([4.0, 3.0])
+
+
+def test_a_bias_can_differ_between_environments():
+    motor = drive(num_envs=3)
+    motor.update_encoder_bias(torch.tensor([[0.1, 0.2], [0.3, 0.4]]), env_ids=[2, 0])
+    assert torque(motor, 0.0, 0.0).flatten().tolist() == pytest.approx([3.0, 4.0, 0.0, 0.0, 1.0, 2.0])
+
+
+# ---- delay: q* = k/10, q = 3k/100, v = k/5 at control step k; kp 10, kd 2
+
+
+def torques_along_ramps(motor: PaceDCMotor, steps: int) -> list[float]:
+    return [torque(motor, k / 10, 3 * k / 100, k / 5)[0, 0].item() for k in range(steps)]
+
+
+@pytest.mark.parametrize("lag", [0.0, 2.0, 2.5, 3.75])
+def test_a_command_delay_leaves_the_feedback_alone(lag):
+    motor = drive(damping=2.0, delay=lag, max_delay=4.0, delay_mode="command")
+    expected = [10 * (max(k - lag, 0) / 10 - 3 * k / 100) - 2 * k / 5 for k in range(10)]
+    assert torques_along_ramps(motor, 10) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("lag", [0.0, 2.0, 2.5, 3.75])
+def test_an_effort_delay_delays_the_feedback_too(lag):
+    motor = drive(damping=2.0, delay=lag, max_delay=4.0, delay_mode="effort")
+    past = [max(k - lag, 0) for k in range(10)]
+    expected = [10 * (k / 10 - 3 * k / 100) - 2 * k / 5 for k in past]
+    assert torques_along_ramps(motor, 10) == pytest.approx(expected)
+
+
+def test_hold_rounds_the_delay_up_to_whole_steps():
+    motor = drive(delay=1.5, delay_interpolation="hold")
+    assert [torque(motor, float(k))[0, 0].item() for k in range(5)] == [0.0, 0.0, 0.0, 10.0, 20.0]
+
+
+def test_delays_can_differ_between_environments_and_joints():
+    motor = drive(num_envs=2)
+    motor.update_time_lags(torch.tensor([0.0, 1.5]))
+    assert [torque(motor, float(k)).tolist() for k in range(4)][-1] == [[30.0, 30.0], [15.0, 15.0]]
+    motor.reset()
+    motor.update_time_lags(torch.tensor([[0.0, 1.0], [2.0, 3.0]]))
+    assert [torque(motor, float(k)).tolist() for k in range(4)][-1] == [[30.0, 20.0], [10.0, 0.0]]
+    assert motor.time_lags.tolist() == [[0.0, 1.0], [2.0, 3.0]]
+
+
+@pytest.mark.parametrize("env_ids", [[1], torch.tensor([1]), torch.tensor([False, True, False])], ids=repr)
+def test_a_partial_reset_forgets_only_those_commands(env_ids):
+    motor = drive(num_envs=3, delay=2.0)
+    for k in range(6):
+        torque(motor, float(k))
+    motor.reset(env_ids)
+    assert torque(motor, 6.0)[:, 0].tolist() == [40.0, 60.0, 40.0]
+
+
+def test_feed_forward_that_starts_late_arrives_after_the_delay():
+    motor = drive(delay=2.0)
+    for _ in range(5):
+        torque(motor, 0.0)
+    assert [torque(motor, 0.0, effort=7.0)[0, 0].item() for _ in range(4)] == [0.0, 0.0, 7.0, 7.0]
+
+
+def test_a_position_target_that_was_given_up_does_not_come_back():
+    motor = drive(delay=2.0)
+    for _ in range(5):
+        torque(motor, 9.0)
+    torque(motor, None)
+    assert torque(motor, 1.0)[0, 0].item() == 10.0
+
+
+def test_the_torque_is_held_between_control_steps_but_limited_at_each_physics_step():
+    motor = drive(control_decimation=3, saturation_effort=100.0, effort_limit=60.0, velocity_limit=10.0)
+    given = [torque(motor, float(k), vel=v)[0, 0].item() for k, v in enumerate([0.0, 0, 0, 0, 0, 9.9, 0])]
+    assert given == pytest.approx([0.0, 0.0, 0.0, 30.0, 30.0, 1.0, 60.0])
+
+
+def test_a_disabled_drive_gives_no_torque():
+    motor = drive(num_envs=3)
+    motor.set_torque_enable(torch.tensor([True, False, True]))
+    assert torque(motor, 1.0)[:, 0].tolist() == [10.0, 0.0, 10.0]
+    motor.set_torque_enable(None)
+    assert torque(motor, 1.0)[:, 0].tolist() == [10.0, 10.0, 10.0]
+
+
+def test_float32_is_float64_to_rounding():
+    fields = {
+        "stiffness": 85.0,
+        "damping": 0.6,
+        "saturation_effort": 140.0,
+        "effort_limit": 89.0,
+        "velocity_limit": 8.5,
+        "encoder_bias": 0.05,
+        "delay": 2.5,
+    }
+    single, double = drive(dtype=torch.float32, **fields), drive(dtype=torch.float64, **fields)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        target, pos, vel = torch.randn(3, 1, 2, generator=generator, dtype=torch.float64)
+        a = torque(single, target.float(), pos.float(), 5 * vel.float())
+        b = torque(double, target, pos, 5 * vel)
+        assert a.dtype == torch.float32
+        assert (a - b).abs().max() < 1e-5 * 89
+
+
+def test_commands_and_state_are_left_as_they_were():
+    motor = drive(delay=0.5)
+    target, pos, vel, effort = (torch.full((1, 2), x, dtype=torch.float64) for x in (1.0, 2.0, 3.0, 4.0))
+    action = ActuatorActions(target, vel, effort)
+    result = motor.compute(action, pos, vel)
+    assert action.joint_positions is target and action.joint_efforts is effort
+    assert [x[0, 0].item() for x in (target, pos, vel, effort)] == [1.0, 2.0, 3.0, 4.0]
+    assert result.joint_positions is None and result.joint_velocities is None
+
+
+# ---- configuration
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"ankle": 1.0, ".*": 2.0}, "'ankle' matches no joint. Available: hip, knee"),
+        ({"hip": 1.0, ".*": 2.0}, r"joint 'hip' is matched twice, by 'hip' and by '\.\*'"),
+        ({"hip": 1.0}, "stiffness: no value for knee. Patterns given: hip"),
+        ([1.0, 2.0, 3.0], r"got \(3,\) values, expected one per joint \(2: hip, knee\)"),
+        ({"(": 1.0}, "not a regular expression"),
+    ],
+)
+def test_values_that_fit_no_joint_are_refused(value, message):
+    with pytest.raises(ValueError, match=message):
+        drive(stiffness=value)
+
+
+@pytest.mark.parametrize(
+    "value", [3.0, 3, [3.0, 3.0], torch.tensor(3.0), torch.tensor([3.0, 3.0]), {".*": 3.0}, {"hip": 3, "knee": 3}]
+)
+def test_values_come_as_numbers_patterns_or_lists(value):
+    assert resolve_joint_values(value, JOINTS, field="x").tolist() == [3.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"damping": -1.0}, "damping of hip is -1, expected a finite number >= 0"),
+        ({"stiffness": [1.0, math.nan]}, "stiffness of knee is nan"),
+        ({"stiffness": math.inf}, "stiffness of hip is inf"),
+        ({"encoder_bias": math.inf}, "encoder_bias of hip is inf"),
+        ({"saturation_effort": math.inf}, "or None for no torque-speed curve"),
+        ({"velocity_limit": 0.0}, "velocity_limit of hip is 0, expected a number > 0"),
+        ({"delay": 11.0}, "expected 0 to max_delay = 10"),
+        ({"delay_mode": "torque"}, "Available: 'command', 'effort'"),
+        ({"control_decimation": 0}, "control_decimation is 0"),
+    ],
+)
+def test_impossible_values_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        drive(**fields)
+
+
+def test_a_delay_per_joint_must_name_every_joint():
+    with pytest.raises(ValueError, match="expected 1 or 2 columns"):
+        drive().update_time_lags(torch.zeros(1, 3))
+
+
+# ---- as Isaac Lab uses it
+
+
+def test_isaac_labs_constructor_fills_what_the_configuration_leaves_out():
+    cfg = PaceDCMotorCfg(joint_names_expr=".*", stiffness=10.0, friction={"hip": 0.2, "knee": 0.3})
+    ones = torch.ones(4, 2)
+    motor = PaceDCMotor(
+        cfg=cfg,
+        joint_names=JOINTS,
+        joint_ids=torch.tensor([3, 5]),
+        num_envs=4,
+        device="cpu",
+        stiffness=77 * ones,
+        damping=2 * ones,
+        armature=3 * ones,
+        friction=4 * ones,
+        dynamic_friction=0 * ones,
+        viscous_friction=6 * ones,
+        effort_limit=7 * ones,
+        velocity_limit=8 * ones,
+    )
+    assert motor.stiffness.dtype == torch.float32
+    values = {
+        "stiffness": 10.0,
+        "damping": 2.0,
+        "armature": 3.0,
+        "viscous_friction": 6.0,
+        "effort_limit": 7.0,
+        "effort_limit_sim": 7.0,
+        "velocity_limit_sim": 8.0,
+        "computed_effort": 0.0,
+        "applied_effort": 0.0,
+    }
+    for name, value in values.items():
+        assert getattr(motor, name).tolist() == [[value, value]] * 4, name
+    # the configuration's friction holds at rest and in motion, whatever the simulator's defaults
+    assert motor.friction[0].tolist() == pytest.approx([0.2, 0.3])
+    assert motor.dynamic_friction[0].tolist() == pytest.approx([0.2, 0.3])
+    assert motor.num_joints == 2 and motor.joint_names == JOINTS
+    assert motor.joint_indices.tolist() == [3, 5] and not motor.is_implicit_model
+
+
+def test_isaac_labs_constructor_takes_positions_too():
+    cfg = PaceDCMotorCfg(joint_names_expr=".*")
+    motor = PaceDCMotor(cfg, JOINTS, slice(None), 1, "cpu", 1.0, 2.0, 3.0, 4.0, None, 6.0, 7.0, 8.0)
+    fields = ("stiffness", "damping", "armature", "friction", "dynamic_friction", "viscous_friction", "effort_limit")
+    assert [getattr(motor, name)[0, 0].item() for name in fields] == [1.0, 2.0, 3.0, 4.0, 4.0, 6.0, 7.0]
+
+
+def test_a_default_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"damping has shape \(3,\), expected a number, \(2,\) or \(1, 2\)"):
+        PaceDCMotor(PaceDCMotorCfg(joint_names_expr=".*"), JOINTS, slice(None), 1, damping=torch.ones(3))
+
+
+def test_it_runs_in_a_simulator_that_knows_nothing_of_ours():
+    """A pendulum in torch, semi-implicit Euler: it settles where kp (q* - q + bias) = m g l sin q."""
+    mass, length, gravity, kp, bias = 2.0, 0.3, 9.81, 40.0, 0.03
+    settled = torch.tensor([[math.pi / 6], [-math.pi / 2]])
+    target = settled - bias + mass * gravity * length * settled.sin() / kp
+    for delay_mode in ("command", "effort"):
+        cfg = drive_cfg(stiffness=kp, damping=6.0, encoder_bias=bias, delay=2.5, delay_mode=delay_mode)
+        motor = PaceDCMotor(cfg, ["pendulum"], slice(None), 2)
+        pos, vel, dt = torch.zeros(2, 1), torch.zeros(2, 1), 0.002
+        for _ in range(3000):
+            effort = motor.compute(ActuatorActions(target), pos, vel).joint_efforts
+            acceleration = (effort - mass * gravity * length * pos.sin()) / (mass * length**2)
+            vel = vel + dt * acceleration
+            pos = pos + dt * vel
+        assert (pos - settled).abs().max() < 1e-5
+        assert vel.abs().max() < 1e-4
+
+
+def test_a_motor_of_ones_own_overrides_one_stage():
+    class WeakMotor(PaceDCMotor):
+        def drive_effort(self, effort_command, joint_pos, joint_vel):
+            return 0.5 * super().drive_effort(effort_command, joint_pos, joint_vel)
+
+    motor = WeakMotor(drive_cfg(effort_limit=8.0), JOINTS, slice(None), 1, dtype=torch.float64)
+    assert torque(motor, 1.0).tolist() == [[4.0, 4.0]]
+    assert motor.computed_effort.tolist() == [[10.0, 10.0]]
