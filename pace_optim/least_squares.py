@@ -1,0 +1,185 @@
+"""Box-constrained Levenberg–Marquardt on rollout residuals, several starts and all trials in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import torch
+
+from pace_optim.evaluator import Evaluator, Residuals
+from pace_optim.jacobian import Colouring, Jacobian, jacobian, perturbed
+
+_DAMPING_TRIALS = (1.0, 10.0, 100.0, 1e3, 1e5)
+_SMALLEST_DAMPING = 1e-9
+
+
+@dataclass(kw_only=True)
+class LeastSquaresCfg:
+    """Settings of the refinement."""
+
+    max_iteration: int = 40
+    """Largest number of iterations."""
+
+    score_tolerance: float = 1e-5
+    """Stop when an iteration lowers the score by less than this part of it."""
+
+    step_tolerance: float = 1e-7
+    """Stop when no normalised parameter moves by more than this."""
+
+    target_score: float = 1e-16
+    """Stop below this score [rad²]."""
+
+    give_up_ratio: float = 100.0
+    """A start whose score is this many times the best one's after a few iterations is dropped."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Descent:
+    """One start's way down."""
+
+    x: torch.Tensor
+    """Present normalised vector, (size,)."""
+    score: float = np.inf
+    """Its score [rad²]."""
+    damping: float = 1e-3
+    """Levenberg–Marquardt damping, relative to the diagonal of JᵀJ."""
+    jacobian: Jacobian | None = None
+    """At x; ``None`` until it is known."""
+    stop_reason: str | None = None
+    iteration: int = 0
+    scores: list[float] = field(default_factory=list)
+
+    def trials(self) -> torch.Tensor:
+        """Steps at several dampings, the favoured first, (trials, size)."""
+        if self.jacobian is None:
+            return self.x[None]
+        hessian, gradient = self.jacobian.normal_equations()
+        return torch.stack(
+            [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in _DAMPING_TRIALS]
+        )
+
+
+def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor, damping: float) -> torch.Tensor:
+    """The damped Gauss–Newton step inside the box [-1, 1]:
+
+        min_d  ½ dᵀ (H + μ diag H) d + gᵀ d   with  -1 ≤ x + d ≤ 1
+
+    solved with MuJoCo's box-constrained quadratic program, so that entries at their bounds leave the active set.
+
+    Args:
+        x: Present vector, (size,).
+        hessian: JᵀJ, (size, size).
+        gradient: Jᵀr, (size,).
+        damping: μ.
+
+    Returns:
+        The new vector x + d, (size,).
+    """
+    # scaled to a unit diagonal: entries of very different influence then weigh the same
+    diagonal = hessian.diagonal()
+    scale = diagonal.clamp(min=1e-14 * float(diagonal.max()) + 1e-300).rsqrt()
+    n = len(x)
+    matrix = (hessian * scale[:, None] * scale[None, :]).numpy() + (damping + 1e-12) * np.eye(n)
+    lower, upper = ((-1 - x) / scale).clamp(max=0.0).numpy(), ((1 - x) / scale).clamp(min=0.0).numpy()
+    result, factor = np.zeros(n), np.zeros((n, n + 7))
+    free = mujoco.mju_boxQP(
+        result, factor, None, np.ascontiguousarray(matrix), (gradient * scale).numpy(), lower, upper
+    )
+    if free < 0:
+        return x.clone()
+    return (x + torch.as_tensor(result) * scale).clamp(-1.0, 1.0)
+
+
+def least_squares(
+    evaluator: Evaluator,
+    colouring: Colouring,
+    starts: Sequence[torch.Tensor],
+    cfg: LeastSquaresCfg | None = None,
+    on_iteration: Callable[[list[Descent]], None] | None = None,
+) -> list[Descent]:
+    """Refine starts to the nearest minimum of the score.
+
+    Each iteration simulates, in one batch, every start's trial steps at several dampings, and beside the favoured
+    trial the perturbed vectors for its Jacobian: where the favoured trial wins, the next Jacobian is already there.
+
+    Args:
+        evaluator: Simulates.
+        colouring: Which entries are perturbed together.
+        starts: Normalised vectors, (size,).
+        cfg: Settings.
+        on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
+
+    Returns:
+        The descents, the best first.
+    """
+    cfg = cfg or LeastSquaresCfg()
+    descents = [Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
+    while running := [d for d in descents if d.stop_reason is None]:
+        batches, steps = [], []
+        for descent in running:
+            trials = descent.trials()
+            neighbours, step = perturbed(trials[0], colouring)
+            batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
+            steps.append(step)
+        every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)))
+        start = 0
+        for descent, batch, step in zip(running, batches, steps, strict=True):
+            part = Residuals(error=every.error[start : start + len(batch)], where=every.where, step=every.step)
+            _advance(descent, batch, part, step, colouring, cfg)
+            start += len(batch)
+        _drop_hopeless(descents, cfg)
+        if on_iteration is not None:
+            on_iteration(descents)
+    return sorted(descents, key=lambda d: d.score)
+
+
+def _advance(
+    descent: Descent,
+    batch: torch.Tensor,
+    residuals: Residuals,
+    step: torch.Tensor,
+    colouring: Colouring,
+    cfg: LeastSquaresCfg,
+) -> None:
+    """Take the best trial, or raise the damping; say when it is time to stop."""
+    scores = residuals.score
+    columns = len(colouring.colours)
+    rows = [0, *range(1 + columns, len(batch))]
+    trial = int(torch.stack([scores[row] for row in rows]).argmin())
+    score, x = float(scores[rows[trial]]), batch[rows[trial]]
+    descent.iteration += 1
+    first = descent.jacobian is None and not np.isfinite(descent.score)
+    improved = score < descent.score
+    if improved:
+        moved, gain = float((x - descent.x).abs().max()), descent.score - score
+        before = descent.score
+        descent.x, descent.score = x.clone(), score
+        descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[trial] / 10.0)
+    # rows of the favoured trial hold its Jacobian; it serves when that trial is where we are
+    if torch.equal(descent.x, batch[0]):
+        descent.jacobian = jacobian(residuals, step, colouring)
+    elif improved:
+        descent.jacobian = None
+    else:
+        descent.damping *= 1e3
+    descent.scores.append(descent.score)
+    if descent.score <= cfg.target_score:
+        descent.stop_reason = f"score below {cfg.target_score:g}"
+    elif descent.iteration >= cfg.max_iteration:
+        descent.stop_reason = f"max_iteration {cfg.max_iteration}"
+    elif not np.isfinite(descent.score):
+        descent.stop_reason = "diverged at its start"
+    elif improved and not first and (gain < cfg.score_tolerance * before or moved < cfg.step_tolerance):
+        descent.stop_reason = "converged"
+    elif not improved and descent.jacobian is not None and descent.damping > 1e6:
+        descent.stop_reason = "converged (no step lowers the score)"
+
+
+def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
+    best = min(d.score for d in descents)
+    for descent in descents:
+        if descent.stop_reason is None and descent.iteration >= 5 and descent.score > cfg.give_up_ratio * best:
+            descent.stop_reason = "another start is far better"
