@@ -18,6 +18,8 @@ from pace_optim.excitation import Trajectory
 MAX_SHARE_AT_LIMIT = 0.5
 """A joint whose torque is at its limit for a larger share of the time is refused."""
 
+Quantity = Literal["target", "speed", "position", "torque"]
+
 _AT_LIMIT = 1 - 1e-6  # of the limit
 _TOLERANCE = 1e-9  # [rad]
 
@@ -42,14 +44,16 @@ class MotionFinding:
 
     joint: str
     """Name of the joint."""
-    quantity: Literal["target", "commanded speed", "position", "torque", "share of time at the torque limit"]
-    """What leaves its limit."""
+    quantity: Quantity
+    """What leaves its limit: the target [rad] or its speed [rad/s]; in simulation, position [rad] or torque [N m]."""
     value: float
-    """The value furthest out [rad, rad/s, N m, or 1]."""
+    """The value furthest out."""
     limit: float
     """The limit, in the same unit."""
     time: float
-    """When [s]."""
+    """When [s]; for a torque, when it first reaches its limit."""
+    share: float
+    """Share of the time beyond the limit, or at it."""
     is_error: bool
     """Whether the trajectory must not be sent."""
     message: str
@@ -70,8 +74,8 @@ def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFi
     """
     if trajectory.joint_names != limits.joint_names:
         raise ValueError(
-            f"The trajectory {trajectory.name!r} has the joints {', '.join(trajectory.joint_names)}, but the limits are "
-            f"for {', '.join(limits.joint_names)}. Give both in the same order."
+            f"The trajectory {trajectory.name!r} has the joints {', '.join(trajectory.joint_names)}, but the limits "
+            f"are for {', '.join(limits.joint_names)}. Give both in the same order."
         )
     target, time = trajectory.des_dof_pos, trajectory.time
     findings = _beyond_position(target, time, limits, "target", is_error=True)
@@ -82,13 +86,12 @@ def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFi
         over = speed[:, j] > limits.velocity[j]
         if over.any():
             k = int(np.argmax(speed[:, j]))
+            value, limit, share = float(speed[k, j]), float(limits.velocity[j]), float(over.mean())
             message = (
-                f"{joint}: targets move at up to {speed[k, j]:.3g} rad/s at {time[k]:.2f} s, faster than the drive's "
-                f"no-load speed of {limits.velocity[j]:.3g} rad/s; it cannot follow in {over.mean():.0%} of the time."
+                f"{joint}: its target moves at up to {value:.3g} rad/s (at {time[k]:.2f} s), faster than the drive's "
+                f"no-load speed of {limit:.3g} rad/s, and in {share:.1%} of the time too fast to be followed."
             )
-            findings.append(
-                _finding(joint, "commanded speed", speed[k, j], limits.velocity[j], time[k], False, message)
-            )
+            findings.append(_finding(joint, "speed", value, limit, time[k], share, message))
     return findings
 
 
@@ -105,22 +108,33 @@ def check_simulated(
     """
     findings = _beyond_position(position, time, limits, "position", is_error=False)
     for j, joint in enumerate(limits.joint_names):
-        size, limit = np.abs(torque[:, j]), limits.effort[j]
+        size, limit = np.abs(torque[:, j]), float(limits.effort[j])
         at_limit = size >= _AT_LIMIT * limit
         if not at_limit.any():
             continue
         k, share = int(np.argmax(at_limit)), float(at_limit.mean())
         message = (
-            f"{joint}: the simulated torque reaches its limit of {limit:.3g} N m, first at {time[k]:.2f} s, and is there "
-            f"in {share:.1%} of the time."
+            f"{joint}: in simulation its torque reaches the limit of {limit:.3g} N m, first at {time[k]:.2f} s, and "
+            f"is there in {share:.1%} of the time."
         )
-        if share > MAX_SHARE_AT_LIMIT:
+        too_much = share > MAX_SHARE_AT_LIMIT
+        if too_much:
             message += " The drive hardly follows: make the motion smaller or slower, or lower the gains."
-            quantity: Literal["share of time at the torque limit"] = "share of time at the torque limit"
-            findings.append(_finding(joint, quantity, share, MAX_SHARE_AT_LIMIT, time[k], True, message))
-        else:
-            findings.append(_finding(joint, "torque", size[k], limit, time[k], False, message))
+        findings.append(_finding(joint, "torque", float(size[k]), limit, time[k], share, message, is_error=too_much))
     return findings
+
+
+def summarise(findings: Sequence[MotionFinding]) -> list[str]:
+    """One line per quantity: the worst joint in full, the others by name."""
+    groups: dict[str, list[MotionFinding]] = {}
+    for finding in findings:
+        groups.setdefault(finding.quantity, []).append(finding)
+    lines = []
+    for group in groups.values():
+        worst = max(group, key=_severity)
+        others = [finding.joint for finding in group if finding is not worst]
+        lines.append(worst.message + (f" Likewise: {', '.join(others)}." if others else ""))
+    return lines
 
 
 def refuse_errors(findings: Sequence[MotionFinding], name: str) -> None:
@@ -136,47 +150,55 @@ def refuse_errors(findings: Sequence[MotionFinding], name: str) -> None:
         raise ValueError(f"The motion {name!r} must not be sent to this robot. {' '.join(errors[:3])}{more}")
 
 
+def _severity(finding: MotionFinding) -> float:
+    if finding.quantity in ("target", "position"):
+        return abs(finding.value - finding.limit)
+    if finding.quantity == "torque":
+        return finding.share
+    return finding.value / finding.limit
+
+
 def _beyond_position(
-    position: np.ndarray,
-    time: np.ndarray,
-    limits: MotionLimits,
-    quantity: Literal["target", "position"],
-    *,
-    is_error: bool,
+    position: np.ndarray, time: np.ndarray, limits: MotionLimits, quantity: Quantity, *, is_error: bool
 ) -> list[MotionFinding]:
     findings = []
     below, above = limits.position[:, 0] - position, position - limits.position[:, 1]
+    excess = np.maximum(below, above)
     for j, joint in enumerate(limits.joint_names):
-        k = int(np.argmax(np.maximum(below[:, j], above[:, j])))
-        if max(below[k, j], above[k, j]) <= _TOLERANCE:
+        k = int(np.argmax(excess[:, j]))
+        if excess[k, j] <= _TOLERANCE:
             continue
-        low, high = limits.position[j]
+        low, high = limits.position[j].tolist()
+        value, share = float(position[k, j]), float((excess[:, j] > _TOLERANCE).mean())
         what = "its target is" if is_error else "in simulation it reaches"
         cure = " Change PaceCfg.excitation (bias, scale)." if is_error else ""
         message = (
-            f"{joint}: {what} {position[k, j]:.3f} rad at {time[k]:.2f} s, outside its limits of {low:.3f} to "
+            f"{joint}: {what} {value:.3f} rad at {time[k]:.2f} s, outside its limits of {low:.3f} to "
             f"{high:.3f} rad.{cure}"
         )
         limit = low if below[k, j] > above[k, j] else high
-        findings.append(_finding(joint, quantity, position[k, j], limit, time[k], is_error, message))
+        findings.append(_finding(joint, quantity, value, limit, time[k], share, message, is_error=is_error))
     return findings
 
 
 def _finding(
     joint: str,
-    quantity: Literal["target", "commanded speed", "position", "torque", "share of time at the torque limit"],
+    quantity: Quantity,
     value: float,
     limit: float,
     time: float,
-    is_error: bool,
+    share: float,
     message: str,
+    *,
+    is_error: bool = False,
 ) -> MotionFinding:
     return MotionFinding(
         joint=joint,
         quantity=quantity,
-        value=float(value),
-        limit=float(limit),
+        value=value,
+        limit=limit,
         time=float(time),
+        share=share,
         is_error=is_error,
         message=message,
     )

@@ -44,8 +44,8 @@ def excited_lines(motion: Motion, period: float) -> np.ndarray:
     if len(odd) < 3:
         raise ValueError(
             f"A multisine of {motion.duration:g} s has {len(odd)} odd harmonics of 1/{period:g} s in the band "
-            f"{motion.min_frequency:g} to {motion.max_frequency:g} Hz; expected at least 3. Make it longer, or the band "
-            "wider."
+            f"{motion.min_frequency:g} to {motion.max_frequency:g} Hz; expected at least 3. Make it longer, or "
+            "widen the band."
         )
     groups = len(odd) // 3
     left_out = 3 * np.arange(groups) + motion.rng.integers(0, 3, groups)

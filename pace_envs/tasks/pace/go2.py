@@ -25,9 +25,9 @@ def go2_pace_env_cfg() -> PaceSim2realEnvCfg:
                 delay=(0.0, 20.0),
             ),
             excitation=ExcitationCfg(
-                bias=(0.0, 1.8, -5.5) * 4,
+                bias=(0.0, 1.8, -2.9) * 4,
                 direction=(1, 1, 1, -1, 1, 1) * 2,
-                scale=(0.25, 0.5, 0.3) * 4,
+                scale=(0.25, 0.5, 0.6) * 4,
             ),
             sample_params={
                 "armature": 0.02,

@@ -1,0 +1,26 @@
+"""Making recordings: command a robot's simulation with known parameters, or write the commands for a real one.
+
+>>> collection = collect(CollectionCfg(task="Pace-AnymalD-v0", output=Path("chirp.npz")))
+>>> collection.recordings, collection.plots, collection.warnings
+"""
+
+from .cfg import CollectionCfg
+from .collect import Collection, collect
+from .command_line import cfg_from_args, make_collection_parser
+from .encoder import Encoder
+from .plot import plot_motion
+from .simulate import Simulated, simulate
+from .truth import true_parameters
+
+__all__ = [
+    "Collection",
+    "CollectionCfg",
+    "Encoder",
+    "Simulated",
+    "cfg_from_args",
+    "collect",
+    "make_collection_parser",
+    "plot_motion",
+    "simulate",
+    "true_parameters",
+]

@@ -1,0 +1,80 @@
+"""What is asked of a data collection."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pace_optim.recording import Load
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectionCfg:
+    """Which motion, of which robot, with which true parameters, measured how, written where."""
+
+    task: str
+    """Identification environment, such as ``"Pace-AnymalD-v0"``."""
+    excitation: str = "chirp"
+    """Name of the motion."""
+    duration: float | None = None
+    """Duration of each trajectory [s]; ``None`` means the excitation's usual one."""
+    min_frequency: float = 0.1
+    """Lower end of the band [Hz]."""
+    max_frequency: float = 10.0
+    """Upper end of the band [Hz]."""
+    seed: int = 0
+    """Seed of the motion and of the noise."""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """True parameters in place of ``PaceCfg.sample_params``: by name, or ``name/joint``."""
+    noise: float = 0.0
+    """Standard deviation of the encoder's noise [rad]."""
+    encoder_bits: int | None = None
+    """Resolution of the encoder, 2^bits steps per turn; ``None`` means exact."""
+    stiffness: float | None = None
+    """Proportional gain of all joints [N m/rad]; ``None`` means the robot's."""
+    damping: float | None = None
+    """Derivative gain of all joints [N m s/rad]; ``None`` means the robot's."""
+    load: Load = field(default_factory=Load)
+    """What the robot carries."""
+    delay_mode: str | None = None
+    """``"command"`` or ``"effort"``; ``None`` means the robot's."""
+    physics_dt: float | None = None
+    """A finer physics step under the same control rate [s]."""
+    output: Path | None = None
+    """File of the recording; ``None`` means ``data/<robot_name>/<excitation>.npz``."""
+    export_command: Path | None = None
+    """CSV file of the commands alone."""
+    command_only: bool = False
+    """Whether only the commands are made and nothing is simulated."""
+    plot: Path | None = None
+    """PNG file of the plot; ``None`` means beside the output."""
+    no_plot: bool = False
+    """Whether to draw nothing."""
+    positions_only: bool = False
+    """Whether to leave ``dof_vel`` out of the recording."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        load = self.load
+        numbers = {
+            "noise": self.noise,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "load_mass": load.load_mass,
+            "load_length": load.load_length,
+            "arm_mass": load.arm_mass,
+            **{f"added_mass {body}": mass for body, mass in load.added_mass.items()},
+        }
+        for name, value in numbers.items():
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} is {value:g}; expected a finite number of 0 or more.")
+        if self.encoder_bits is not None and not 1 <= self.encoder_bits <= 32:
+            raise ValueError(f"encoder_bits is {self.encoder_bits}; expected 1 to 32 (12 to 20 are usual).")
+        if self.command_only and self.output is not None:
+            raise ValueError(
+                "Nothing is recorded with --command_only, so --output has no use. Name the file of the commands with "
+                "--export_command."
+            )

@@ -1,0 +1,221 @@
+"""From a request to files."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from pace_envs import load_env_cfg, registered_tasks
+from pace_envs.tasks.pace import PaceCfg
+from pace_optim.excitation import Trajectory, make_excitation, write_command_csv
+from pace_optim.motion_check import (
+    MotionFinding,
+    MotionLimits,
+    check_command,
+    check_simulated,
+    refuse_errors,
+    summarise,
+)
+from pace_optim.parameter_space import ParameterSpace
+from pace_optim.recording import SUFFIXES, Drive, save_recording
+
+from .cfg import CollectionCfg
+from .encoder import Encoder
+from .plot import plot_motion
+from .simulate import Simulated, simulate
+from .truth import true_parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collection:
+    """What was written, and what to know about it."""
+
+    recordings: tuple[Path, ...]
+    """Recordings, one per trajectory; none with ``command_only``."""
+    commands: tuple[Path, ...]
+    """CSV files of the commands."""
+    plots: tuple[Path, ...]
+    """PNG files."""
+    warnings: tuple[str, ...]
+    """What the check of the motion found, in plain sentences."""
+
+
+def collect(cfg: CollectionCfg) -> Collection:
+    """Make the motion, check it, simulate it and write everything; nothing is written if something is wrong.
+
+    Raises:
+        ValueError: If the request cannot be met, or the motion must not be sent to the robot.
+    """
+    env_cfg = load_env_cfg(cfg.task)
+    sim2real = _sim2real(env_cfg, cfg.task)
+    control_dt = env_cfg.sim.dt * env_cfg.decimation
+    trajectories = make_excitation(
+        cfg.excitation,
+        sim2real,
+        control_dt=control_dt,
+        duration=cfg.duration,
+        min_frequency=cfg.min_frequency,
+        max_frequency=cfg.max_frequency,
+        seed=cfg.seed,
+    )
+    files = [_Files.of(cfg, sim2real, trajectory, len(trajectories) > 1) for trajectory in trajectories]
+    _check_files(files)
+    space = ParameterSpace.of(sim2real)
+    truth = None if cfg.command_only else true_parameters(sim2real, space, cfg.parameters)
+
+    count = len(trajectories)
+    env: Any = gym.make(
+        cfg.task, cfg=env_cfg, num_envs=count, physics_dt=cfg.physics_dt, delay_mode=cfg.delay_mode
+    ).unwrapped
+    try:
+        limits = _limits_of(env)
+        findings = [check_command(trajectory, limits) for trajectory in trajectories]
+        for trajectory, found in zip(trajectories, findings, strict=True):
+            refuse_errors(found, trajectory.name)
+        simulated: list[Simulated] = []
+        if truth is not None:
+            simulated = simulate(
+                env,
+                trajectories,
+                space=space,
+                truth=truth,
+                encoder=Encoder(noise=cfg.noise, bits=cfg.encoder_bits, rng=np.random.default_rng([cfg.seed, 1])),
+                drive=_drive_of(cfg, env.scene["robot"].num_joints),
+                load=cfg.load,
+            )
+            for trajectory, result, found in zip(trajectories, simulated, findings, strict=True):
+                found += check_simulated(trajectory.time, result.position, result.torque, limits)
+                refuse_errors(found, trajectory.name)
+    finally:
+        env.close()
+    return _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Files:
+    """Where one trajectory's files go."""
+
+    recording: Path | None
+    command: Path | None
+    plot: Path | None
+
+    @classmethod
+    def of(cls, cfg: CollectionCfg, sim2real: PaceCfg, trajectory: Trajectory, is_part: bool) -> _Files:
+        """A part of several adds its name to the stem of every file."""
+        folder = Path("data") / sim2real.robot_name
+        command = cfg.export_command
+        if cfg.command_only and command is None:
+            command = folder / f"{cfg.excitation}_command.csv"
+        recording = None if cfg.command_only else cfg.output or folder / f"{cfg.excitation}.npz"
+        plot = cfg.plot
+        if plot is None:
+            plot = (recording or command or folder).with_suffix(".png")
+
+        def named(path: Path | None) -> Path | None:
+            return path.with_name(f"{path.stem}_{trajectory.name}{path.suffix}") if path and is_part else path
+
+        return cls(recording=named(recording), command=named(command), plot=None if cfg.no_plot else named(plot))
+
+
+def _check_files(files: Sequence[_Files]) -> None:
+    """Refuse what could not be written, before the work is done."""
+    kinds = {
+        "recording": ("--output", SUFFIXES),
+        "command": ("--export_command", (".csv",)),
+        "plot": ("--plot", (".png",)),
+    }
+    paths = []
+    for file in files:
+        for kind, (option, suffixes) in kinds.items():
+            path: Path | None = getattr(file, kind)
+            if path is None:
+                continue
+            if path.suffix.lower() not in suffixes:
+                raise ValueError(
+                    f"{option} {path}: found the suffix '{path.suffix}'; expected {' or '.join(suffixes)}. "
+                    "Rename the file."
+                )
+            if path.is_dir():
+                raise ValueError(f"{option} {path}: is a folder; expected a file. Add a file's name.")
+            obstacle = next((parent for parent in path.parents if parent.exists()), None)
+            if obstacle is not None and not obstacle.is_dir():
+                raise ValueError(f"{option} {path}: {obstacle} is a file, not a folder. Choose another place.")
+            paths.append(path)
+    if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
+        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
+
+
+def _write(
+    cfg: CollectionCfg,
+    sim2real: PaceCfg,
+    trajectories: Sequence[Trajectory],
+    simulated: Sequence[Simulated],
+    files: Sequence[_Files],
+    findings: Sequence[Sequence[MotionFinding]],
+    limits: MotionLimits,
+) -> Collection:
+    recordings, commands, plots, warnings = [], [], [], []
+    for i, (trajectory, file) in enumerate(zip(trajectories, files, strict=True)):
+        prefix = f"{trajectory.name}: " if len(trajectories) > 1 else ""
+        warnings += [prefix + line for line in summarise(findings[i])]
+        recording = simulated[i].recording if simulated else None
+        if recording is not None and file.recording is not None:
+            recording = replace(recording, name=file.recording.stem)
+            if cfg.positions_only:
+                recording = replace(recording, dof_vel=None)
+            recordings.append(save_recording(file.recording, recording))
+        if file.command is not None:
+            commands.append(write_command_csv(file.command, trajectory))
+        if file.plot is not None:
+            how = "commands" if recording is None else "simulated recording"
+            plots.append(
+                plot_motion(
+                    file.plot,
+                    trajectory,
+                    None if recording is None else recording.dof_pos,
+                    title=f"{sim2real.robot_name}, {trajectory.name}: {how}",
+                    position_limits=limits.position,
+                )
+            )
+    return Collection(
+        recordings=tuple(recordings), commands=tuple(commands), plots=tuple(plots), warnings=tuple(warnings)
+    )
+
+
+def _sim2real(env_cfg: Any, task: str) -> PaceCfg:
+    sim2real = getattr(env_cfg, "sim2real", None)
+    if sim2real is None:
+        suited = [name for name in registered_tasks() if hasattr(load_env_cfg(name), "sim2real")]
+        close = difflib.get_close_matches(task, suited, n=1, cutoff=0.0)
+        raise ValueError(
+            f"{task} is not an identification task: it has no PaceCfg. Did you mean {close[0]!r}? Available: "
+            f"{', '.join(suited)}."
+        )
+    return sim2real
+
+
+def _drive_of(cfg: CollectionCfg, num_joints: int) -> Drive:
+    gains = {"stiffness": cfg.stiffness, "damping": cfg.damping}
+    return Drive(**{key: np.full(num_joints, value) for key, value in gains.items() if value is not None})
+
+
+def _limits_of(env: Any) -> MotionLimits:
+    robot = env.scene["robot"]
+    velocity, effort = np.full(robot.num_joints, np.inf), np.full(robot.num_joints, np.inf)
+    for actuator in robot.actuators.values():
+        where = actuator.joint_indices
+        columns = where if isinstance(where, slice) else np.asarray(where)
+        velocity[columns] = actuator.velocity_limit[0].numpy()
+        effort[columns] = actuator.effort_limit[0].numpy()
+    return MotionLimits(
+        joint_names=tuple(robot.joint_names),
+        position=robot.data.joint_pos_limits.numpy(),
+        velocity=velocity,
+        effort=effort,
+    )

@@ -1,0 +1,104 @@
+"""The options of ``scripts/data_collection.py``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from pace_optim.cli import Parser, import_task, make_parser
+from pace_optim.excitation import excitations
+from pace_optim.motion_check import MAX_SHARE_AT_LIMIT
+from pace_optim.recording import Load
+
+from .cfg import CollectionCfg
+
+_CHECKS = f"""\
+The motion is checked before anything is written. Targets outside the joint limits are refused (exit code 2), and so is
+a motion in which a drive is at its torque limit for more than {MAX_SHARE_AT_LIMIT:.0%} of the time. Targets faster than
+a drive's no-load speed, and torques that touch their limit, are warnings: the drive limits them itself. Steps have no
+commanded speed, so theirs is not checked. Torques are those of the simulation, so --command_only does not check them.
+
+Noise and quantisation are what the encoder reads: recorded, and seen by the position loop (the derivative gain acts on
+the joint's own speed). dof_vel is the joint's own speed, without noise."""
+
+
+def make_collection_parser() -> Parser:
+    """The parser."""
+    parser = make_parser(
+        "Make recordings with known parameters in simulation, or write the commands for a real robot.\n\n" + _CHECKS,
+        example="scripts/data_collection.py --task Pace-AnymalD-v0 --noise 1e-4 --parameter friction/LF_KFE=0.3",
+    )
+    kinds = "; ".join(f"{e.name}: {e.description} ({e.duration:g} s)" for e in excitations())
+    add = parser.add_argument
+    add("--task", required=True, help="identification environment, see scripts/list_envs.py; module:Task imports first")
+    add("--output", type=Path, metavar="FILE", help=".npz, .pt or .csv (default data/<robot>/<excitation>.npz)")
+    motion = parser.add_argument_group("motion")
+    motion.add_argument("--excitation", default="chirp", metavar="NAME", help=f"(default chirp) {kinds}")
+    motion.add_argument("--duration", type=float, metavar="S", help="of each trajectory (default: as listed above)")
+    motion.add_argument("--min_frequency", type=float, default=0.1, metavar="HZ", help="of the band (default 0.1)")
+    motion.add_argument("--max_frequency", type=float, default=10.0, metavar="HZ", help="of the band (default 10)")
+    motion.add_argument("--seed", type=int, default=0, metavar="N", help="of the motion and the noise (default 0)")
+    robot = parser.add_argument_group("simulated robot")
+    robot.add_argument(
+        "--parameter",
+        action="append",
+        default=[],
+        metavar="NAME[/JOINT]=VALUE",
+        help="true parameter of all joints or one, in place of the robot's sample_params; may be repeated",
+    )
+    robot.add_argument("--stiffness", type=float, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
+    robot.add_argument("--damping", type=float, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
+    robot.add_argument("--delay_mode", metavar="MODE", help="command or effort: what the delay delays")
+    robot.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
+    robot.add_argument("--load_mass", type=float, metavar="KG", help="test bench: mass at the end of the arm")
+    robot.add_argument("--load_length", type=float, metavar="M", help="test bench: length of the arm")
+    robot.add_argument("--arm_mass", type=float, metavar="KG", help="test bench: mass of the arm")
+    robot.add_argument(
+        "--added_mass", action="append", default=[], metavar="BODY=KG", help="mass added to a body; may be repeated"
+    )
+    encoder = parser.add_argument_group("encoder")
+    encoder.add_argument("--noise", type=float, default=0.0, metavar="RAD", help="standard deviation (default 0)")
+    encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
+    files = parser.add_argument_group("files")
+    files.add_argument("--positions_only", action="store_true", help="leave dof_vel out: half the size")
+    files.add_argument(
+        "--export_command", type=Path, metavar="FILE.csv", help="write time and targets alone, to play on a robot"
+    )
+    files.add_argument("--command_only", action="store_true", help="write the commands and simulate nothing")
+    files.add_argument("--plot", type=Path, metavar="FILE.png", help="default: beside the recording")
+    files.add_argument("--no_plot", action="store_true", help="draw nothing")
+    return parser
+
+
+def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
+    """The request that parsed arguments make.
+
+    Raises:
+        ValueError: If one is malformed.
+    """
+    options = vars(args).copy()
+    load = Load(
+        added_mass=_pairs("--added_mass", options.pop("added_mass"), "BODY=KG"),
+        **{key: options.pop(key) for key in ("load_mass", "load_length", "arm_mass")},
+    )
+    parameters = _pairs("--parameter", options.pop("parameter"), "NAME=VALUE or NAME/JOINT=VALUE")
+    task = import_task(options.pop("task"))
+    return CollectionCfg(task=task, load=load, parameters=parameters, **options)
+
+
+def _pairs(option: str, words: Sequence[str], form: str) -> dict[str, float]:
+    pairs: dict[str, float] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not name or not math.isfinite(value):
+            raise ValueError(f"{option} {word}: expected {form} with a finite number.")
+        if name in pairs:
+            raise ValueError(f"{option} {name} is given twice. Give it once.")
+        pairs[name] = value
+    return pairs

@@ -1,0 +1,146 @@
+"""Simulating commanded trajectories with known parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from pace_optim.dataset import make_dataset
+from pace_optim.excitation import Trajectory
+from pace_optim.parameter_space import ParameterSpace
+from pace_optim.recording import Drive, Load, Recording, conform_recording
+from pace_optim.rollout import Rollout
+
+from .encoder import Encoder
+
+if TYPE_CHECKING:
+    from pace_envs import Articulation, ManagerBasedEnv
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Simulated:
+    """A simulated recording, and what no encoder sees."""
+
+    recording: Recording
+    """What is written."""
+    position: np.ndarray
+    """The joints' own positions, (T, n) [rad]."""
+    torque: np.ndarray
+    """Torques applied between two samples, (T - 1, n) [N m]."""
+
+
+def simulate(
+    env: ManagerBasedEnv,
+    trajectories: Sequence[Trajectory],
+    *,
+    space: ParameterSpace,
+    truth: torch.Tensor,
+    encoder: Encoder,
+    drive: Drive,
+    load: Load,
+) -> list[Simulated]:
+    """Let the robot follow trajectories of the same length, side by side.
+
+    The robot starts at rest with its encoder at the first target. At every control step (1) the encoder is read,
+    which is what is recorded and what the controller sees, (2) that step's target is issued, (3) the simulation
+    advances.
+
+    Args:
+        env: As many environments as trajectories.
+        trajectories: The targets.
+        space: The parameters.
+        truth: Their true values, (size,).
+        encoder: Reads the positions, bias taken off.
+        drive: Gains and limits in place of the robot's; fields that are None keep them.
+        load: What the robot carries.
+
+    Raises:
+        ValueError: If the simulation diverges, or the load does not fit the robot.
+    """
+    robot = env.scene["robot"]
+    accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
+    drafts = [
+        conform_recording(
+            _draft(trajectory, drive, load),
+            joint_order=robot.joint_names,
+            control_dt=env.step_dt,
+            load_bodies=robot.body_names,
+            accepts_load=accepts_load,
+        )
+        for trajectory in trajectories
+    ]
+    dataset = make_dataset(drafts, train_fraction=1)
+    rollout = Rollout(env, dataset, space)
+    rollout.start(truth[None], dataset.sampled)
+
+    shape = (len(trajectories[0].time), len(trajectories), robot.num_joints)
+    position, reading, speed, torque = (np.zeros(shape) for _ in range(4))
+    bias = truth[space["encoder_bias"]].numpy()
+    for k, (true_position, _) in enumerate(rollout):
+        position[k], speed[k] = true_position.numpy(), rollout.sim_dof_vel.numpy()
+        torque[k - 1] = robot.data.applied_torque.numpy()  # of the step that led here; k = 0 is dropped
+        reading[k] = encoder.read(position[k] - bias)
+        if not encoder.is_exact:
+            _show_to_controllers(robot, position[k] - reading[k])
+    _check_finite(position, trajectories)
+    drive_in_force = _drive_in_force(robot)
+    return [
+        Simulated(
+            recording=replace(
+                drafts[r],
+                dof_pos=np.ascontiguousarray(reading[:, r]),
+                des_dof_pos=trajectories[r].des_dof_pos,  # in rows: repeated values side by side make small files
+                dof_vel=np.ascontiguousarray(speed[:, r]),
+                drive=drive_in_force,
+                notes=(),
+            ),
+            position=position[:, r],
+            torque=torque[:-1, r],
+        )
+        for r in range(len(trajectories))
+    ]
+
+
+def _draft(trajectory: Trajectory, drive: Drive, load: Load) -> Recording:
+    """The recording before it is made: the encoder at the first target."""
+    target = trajectory.des_dof_pos
+    return Recording(
+        name=trajectory.name,
+        joint_names=trajectory.joint_names,
+        time=trajectory.time,
+        dof_pos=np.repeat(target[:1], len(target), axis=0),
+        des_dof_pos=target,
+        drive=drive,
+        load=load,
+    )
+
+
+def _show_to_controllers(robot: Articulation, offset: np.ndarray) -> None:
+    """Let controllers see the readings: position - offset, (num_envs, n) [rad]."""
+    values = torch.as_tensor(offset)
+    for actuator in robot.actuators.values():
+        actuator.update_encoder_bias(values[:, actuator.joint_indices])
+
+
+def _drive_in_force(robot: Articulation) -> Drive:
+    values = {field.name: np.zeros(robot.num_joints) for field in fields(Drive)}
+    for actuator in robot.actuators.values():
+        for name, array in values.items():
+            where = actuator.joint_indices
+            array[where if isinstance(where, slice) else np.asarray(where)] = getattr(actuator, name)[0].numpy()
+    return Drive(**values)
+
+
+def _check_finite(position: np.ndarray, trajectories: Sequence[Trajectory]) -> None:
+    bad = ~np.isfinite(position)
+    if bad.any():
+        k, r, j = np.argwhere(bad)[0]
+        raise ValueError(
+            f"The simulation of {trajectories[r].name!r} diverges at {trajectories[r].time[k]:.3f} s, joint "
+            f"{trajectories[r].joint_names[j]}. Give it more armature, less delay or lower gains, or a "
+            "finer --physics_dt."
+        )
