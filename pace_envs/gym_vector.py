@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 
@@ -27,6 +28,11 @@ class PaceVectorEnv(gym.vector.VectorEnv):
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
 
     @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """How ``gym.make_vec`` built it."""
+        return self.env.spec
+
+    @property
     def unwrapped(self) -> ManagerBasedRLEnv:  # type: ignore[override]
         """The batched environment."""
         return self.env
@@ -42,11 +48,10 @@ class PaceVectorEnv(gym.vector.VectorEnv):
         obs, reward, terminated, truncated, extras = self.env.step(torch.as_tensor(actions, dtype=torch.float64))
         infos: dict[str, Any] = {}
         if "final_obs" in extras:
-            last = extras["final_obs"]["policy"].numpy()
             done = extras["_final_obs"].numpy()
-            final = np.full(self.num_envs, None, dtype=object)
-            final[done] = list(last[done])
-            infos = {"final_obs": final, "_final_obs": done, "final_info": {}, "_final_info": done}
+            # an array of numbers, not of objects: NumpyToTorch can convert it
+            last = extras["final_obs"]["policy"].numpy()
+            infos = {"final_obs": last, "_final_obs": done, "final_info": {}, "_final_info": done}
         return obs["policy"].numpy(), reward.numpy(), terminated.numpy(), truncated.numpy(), infos
 
     def render(self) -> tuple[np.ndarray | None, ...]:  # type: ignore[override]

@@ -10,13 +10,22 @@ class OffscreenRenderer:
     """Draws environment 0 with MuJoCo's renderer; without a screen, set MUJOCO_GL to egl or osmesa."""
 
     def __init__(self, sim: Simulation, width: int = 1280, height: int = 720):
-        """Create the renderer; uses the model's camera ``track`` where there is one."""
+        """Create the renderer; uses the model's camera ``track`` where there is one.
+
+        Raises:
+            RuntimeError: If there is no OpenGL.
+        """
         self._sim = sim
         cameras = [sim.model.camera(i).name for i in range(sim.model.ncam)]
         self._camera: str | int = "track" if "track" in cameras else -1
         self._model = sim.batch.get_model(0)
         self._data = mujoco.MjData(self._model)
-        self._renderer = mujoco.Renderer(self._model, height, width)
+        try:
+            self._renderer = mujoco.Renderer(self._model, height, width)
+        except (mujoco.FatalError, RuntimeError) as error:
+            raise RuntimeError(
+                f"MuJoCo cannot draw: {error}. Without a screen, set MUJOCO_GL=egl (or osmesa) before Python starts."
+            ) from None
 
     def render(self) -> np.ndarray:
         """The picture, (height, width, 3) uint8."""
