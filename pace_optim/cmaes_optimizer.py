@@ -18,7 +18,7 @@ _CONSENSUS_LATEST = 0.9
 
 
 class CMAESOptimizer:
-    """Ask, simulate, tell, evolve, until finished:
+    """Searches by CMA-ES: ask, simulate, tell, evolve, until finished.
 
         while not optimizer.finished():
             optimizer.ask()
@@ -106,6 +106,7 @@ class CMAESOptimizer:
             )
         self._consensus: np.ndarray | None = None if len(groups) > 1 and self._shared else np.zeros(0)
         self._line: np.ndarray | None = None
+        self.line_generation = self._planned_line = -1
         self.sim_params = torch.empty(0)
         self.scores_buffer: torch.Tensor | None = None
         self._stopped: list[str] = []
@@ -116,6 +117,7 @@ class CMAESOptimizer:
         """Draw the next generation; physical parameters, (population_size, size)."""
         if self._line is None and self._consensus is None and self._ready_for_consensus():
             self._line = self._consensus_line()
+            self.line_generation = self.generation
         self._asked = [s.ask() for s in self.strategies] if self._line is None else []
         shown = []
         for g, strategy in enumerate(self.strategies):
@@ -232,13 +234,24 @@ class CMAESOptimizer:
         """Make :meth:`finished` true."""
         self._stopped = [reason]
 
-    def restore(self, history: Sequence[np.ndarray]) -> None:
+    def restore(self, history: Sequence[np.ndarray], line_generation: int = -1) -> None:
         """Bring a fresh optimizer to where another one, of the same seed and settings, was.
 
         Args:
             history: The other one's ``history``: scores of each generation, (population_size, trees).
+            line_generation: The other one's ``line_generation``.
+
+        Raises:
+            ValueError: If the history does not fit.
         """
+        self._planned_line = line_generation
         for scores in history:
+            if scores.shape != (self.population_size, len(self.strategies)):
+                raise ValueError(
+                    f"The checkpoint's generations have the shape {scores.shape}, expected "
+                    f"{(self.population_size, len(self.strategies))} (population, trees). "
+                    "Resume with the same settings."
+                )
             self.ask()
             self._learn(np.asarray(scores))
 
@@ -262,6 +275,8 @@ class CMAESOptimizer:
 
     def _ready_for_consensus(self) -> bool:
         """Whether all trees know their shared parameters well, or time is running out."""
+        if self._planned_line >= 0:  # as in the run that is restored, whatever its max_iteration was
+            return self.generation == self._planned_line
         if self.generation >= _CONSENSUS_LATEST * self.cfg.max_iteration:
             return self.generation > 0
         known = [

@@ -56,7 +56,8 @@ class Evaluator:
         self.space = space
         self._make_env = make_env
         self._rollouts: dict[int, Rollout] = {}
-        self._finished_steps = 0
+        self.simulations = 0
+        """Candidates simulated so far by :meth:`residuals`."""
 
     @property
     def simulated_steps(self) -> int:
@@ -77,10 +78,13 @@ class Evaluator:
             physical: Physical parameters, (m, size).
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
         """
+        self.simulations += len(physical)
         widest = max(1, _WIDEST // self.dataset.num_recordings)
         parts = [self._residuals(part, where) for part in physical.split(widest)]
-        return parts[0] if len(parts) == 1 else Residuals(
-            error=torch.cat([part.error for part in parts]), where=parts[0].where, step=parts[0].step
+        return (
+            parts[0]
+            if len(parts) == 1
+            else Residuals(error=torch.cat([part.error for part in parts]), where=parts[0].where, step=parts[0].step)
         )
 
     def _residuals(self, physical: torch.Tensor, where: torch.Tensor | None) -> Residuals:

@@ -34,7 +34,7 @@ def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: S
     index = {name: i for i, name in enumerate(joint_names)}
     owners = space.owners(trees)
     by_tree: list[list[int]] = [[] for _ in trees]
-    alone = []
+    alone: list[int] = []
     for entry, owner in enumerate(owners):
         (alone if owner is None else by_tree[owner]).append(entry)
     depth = max((len(entries) for entries in by_tree), default=0)
@@ -74,7 +74,7 @@ class Jacobian:
     colouring: Colouring
 
     def column(self, entry: int) -> torch.Tensor:
-        """d error / d x_entry, (K, R, n); zero for joints that the entry does not move."""
+        """D error / d x_entry, (K, R, n); zero for joints that the entry does not move."""
         row = next(c for c, entries in enumerate(self.colouring.colours) if entry in entries)
         result = torch.zeros_like(self.columns[row])
         joints = list(self.colouring.joints[entry])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -52,6 +53,24 @@ class Descent:
     iteration: int = 0
     scores: list[float] = field(default_factory=list)
 
+    @classmethod
+    def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
+        """Descents as a run's checkpoint has them; their Jacobians are computed again."""
+        scores = json.loads(str(checkpoint["descent_scores"]))
+        return [
+            cls(
+                x=torch.as_tensor(x),
+                score=float(score),
+                damping=float(damping),
+                iteration=int(iteration) - (not stop),  # the Jacobian takes an iteration that was counted already
+                stop_reason=str(stop) or None,
+                scores=history,
+            )
+            for x, (score, damping, iteration), stop, history in zip(
+                checkpoint["descent_x"], checkpoint["descent_state"], checkpoint["descent_stop"], scores, strict=True
+            )
+        ]
+
     def trials(self) -> torch.Tensor:
         """Steps at several dampings, the favoured first, (trials, size)."""
         if self.jacobian is None:
@@ -63,7 +82,7 @@ class Descent:
 
 
 def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor, damping: float) -> torch.Tensor:
-    """The damped Gauss–Newton step inside the box [-1, 1]:
+    """The damped Gauss–Newton step inside the box [-1, 1].
 
         min_d  ½ dᵀ (H + μ diag H) d + gᵀ d   with  -1 ≤ x + d ≤ 1
 
@@ -96,7 +115,7 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
 def least_squares(
     evaluator: Evaluator,
     colouring: Colouring,
-    starts: Sequence[torch.Tensor],
+    starts: Sequence[torch.Tensor | Descent],
     cfg: LeastSquaresCfg | None = None,
     on_iteration: Callable[[list[Descent]], None] | None = None,
 ) -> list[Descent]:
@@ -108,7 +127,7 @@ def least_squares(
     Args:
         evaluator: Simulates.
         colouring: Which entries are perturbed together.
-        starts: Normalised vectors, (size,).
+        starts: Normalised vectors, (size,), or descents to go on with.
         cfg: Settings.
         on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
 
@@ -116,7 +135,7 @@ def least_squares(
         The descents, the best first.
     """
     cfg = cfg or LeastSquaresCfg()
-    descents = [Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
+    descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
     while running := [d for d in descents if d.stop_reason is None]:
         batches, steps = [], []
         for descent in running:

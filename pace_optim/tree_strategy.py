@@ -93,7 +93,7 @@ class TreeStrategy:
             generation=len(self.best_scores), scores=scores, best_scores=self.best_scores, spread=self.spread
         )
         own = [reason for criterion in self.criteria if (reason := criterion(state))]
-        pycma = [f"cma: {name} {value:g}" for name, value in self._strategy.stop().items() if np.isscalar(value)]
+        pycma = [f"cma: {name}" for name in self._strategy.stop()]
         self.stop_reason = next(iter(own + pycma), None)
 
     def forget_best(self) -> None:

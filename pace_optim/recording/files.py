@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import pickle
-from collections.abc import Callable
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
+
+from pace_optim.atomic import write_atomically
 
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
@@ -59,15 +60,15 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
     facts = _facts_of(recording)
     if suffix == ".csv":
         text = json.dumps(facts, indent=2).encode()
-        _write_atomically(path.with_suffix(".json"), lambda file: file.write(text))
-        _write_atomically(path, lambda file: write_csv(file, series, recording.joint_names))
+        write_atomically(path.with_suffix(".json"), lambda file: file.write(text))
+        write_atomically(path, lambda file: write_csv(file, series, recording.joint_names))
     elif suffix == ".npz":
         if "added_mass" in facts:
             facts["added_mass"] = json.dumps(facts["added_mass"])
-        _write_atomically(path, lambda file: np.savez_compressed(file, **series, **facts))
+        write_atomically(path, lambda file: np.savez_compressed(file, **series, **facts))
     else:
         tensors = {key: torch.from_numpy(np.ascontiguousarray(array)) for key, array in series.items()}
-        _write_atomically(path, lambda file: torch.save({**tensors, **facts}, file))
+        write_atomically(path, lambda file: torch.save({**tensors, **facts}, file))
     return path
 
 
@@ -176,16 +177,6 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, dict) or isinstance(other, dict):
         return one == other
     return np.array_equal(np.asarray(one), np.asarray(other))
-
-
-def _write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _first_line(error: Exception) -> str:

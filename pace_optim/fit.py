@@ -1,0 +1,302 @@
+"""A fit from settings to a run's folder: load, search, refine, assess, write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pace_optim.cmaes_optimizer import CMAESOptimizer
+from pace_optim.evaluator import Evaluator, Residuals
+from pace_optim.fit_result import FitResult, make_result, rmse_by_joint
+from pace_optim.fit_settings import FitSettings
+from pace_optim.fit_warnings import fit_warnings
+from pace_optim.history import History
+from pace_optim.jacobian import Colouring, colour, jacobian, perturbed
+from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem import Problem, file_digest, load_problem
+from pace_optim.progress import ProgressLine
+from pace_optim.report import write_report
+from pace_optim.run_folder import RunFolder
+from pace_optim.search import RefiningPays, search
+from pace_optim.tensorboard_log import TensorBoardLog
+from pace_optim.uncertainty import Uncertainty, estimate_uncertainty
+
+_HYBRID_POPULATION = 48
+"""Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+
+
+def fit(settings: FitSettings, progress: ProgressLine | None = None) -> tuple[FitResult, Path]:
+    """Identify a robot.
+
+    Args:
+        settings: What to fit, and how.
+        progress: Shows how far it is.
+
+    Returns:
+        The result and the run's folder.
+
+    Raises:
+        ValueError: If anything does not fit; nothing has been written then.
+    """
+    problem = _load(settings)
+    folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
+    folder.write_start(settings.to_dict(), _digests(settings, problem), problem)
+    return _Fit(settings, problem, folder, progress or ProgressLine()).run()
+
+
+def resume(
+    path: str | Path, max_iteration: int | None = None, progress: ProgressLine | None = None
+) -> tuple[FitResult, Path]:
+    """Go on with an interrupted fit; the result is that of one that was never interrupted.
+
+    Args:
+        path: The run's folder.
+        max_iteration: Another largest number of generations.
+        progress: Shows how far it is.
+
+    Raises:
+        ValueError: If the run cannot be resumed, or its recordings have changed.
+    """
+    folder = RunFolder(Path(path))
+    settings, digests = FitSettings.load(folder.path / "settings.json")
+    if max_iteration is not None:
+        settings = replace(settings, max_iteration=max_iteration)
+    checkpoint = folder.read_checkpoint()
+    for name, digest in digests.items():
+        if not Path(name).is_file() or file_digest(name) != digest:
+            raise ValueError(f"{name} has changed or gone since the run was started. Put it back, or start a new fit.")
+    problem = _load(settings)
+    run = _Fit(settings, problem, folder, progress or ProgressLine())
+    run.restore(checkpoint)
+    return run.run()
+
+
+def _load(settings: FitSettings) -> Problem:
+    problem = load_problem(
+        settings.task,
+        data=settings.data,
+        validation=settings.validation,
+        delay_mode=settings.delay_mode,
+        physics_dt=settings.physics_dt,
+    )
+    cmaes = problem.env_cfg.sim2real.cmaes
+    chosen = {
+        name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None
+    }
+    problem.env_cfg.sim2real.cmaes = replace(
+        cmaes,
+        per_tree=cmaes.per_tree and not settings.joint_strategy,
+        save_optimization_process=cmaes.save_optimization_process or settings.save_optimization_process,
+        **chosen,
+    )
+    if problem.dataset.num_recordings * 4 > settings.num_envs and settings.optimizer == "cmaes":
+        raise ValueError(
+            f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
+            f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
+        )
+    return problem
+
+
+def _digests(settings: FitSettings, problem: Problem) -> dict[str, str]:
+    names = [*(settings.data or [str(problem.env_cfg.sim2real.data_dir)]), *settings.validation]
+    return {str(name): file_digest(name) for name in names}
+
+
+@dataclass(kw_only=True, eq=False)
+class Outcome:
+    """Where the optimizers ended."""
+
+    x: torch.Tensor
+    """Best normalised vector, (size,)."""
+    stop_reasons: list[str] = field(default_factory=list)
+
+
+class _Fit:
+    """One run: the optimizers' state and what is written along the way."""
+
+    def __init__(self, settings: FitSettings, problem: Problem, folder: RunFolder, progress: ProgressLine):
+        self.settings = settings
+        self.problem = problem
+        self.folder = folder
+        self.progress = progress
+        self.history = History()
+        self.evaluator: Evaluator = problem.evaluator()
+        self.colouring = colour(problem.space, problem.trees, problem.joint_names)
+        self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
+        self.descents: list[Descent] = []
+        self._steps_before = 0
+        self._saved: dict[str, list] = {"params": [], "scores": []}
+        self.log = TensorBoardLog(folder.path)
+
+    @property
+    def steps(self) -> int:
+        """Simulated steps, with those before a resume."""
+        return self._steps_before + self.evaluator.simulated_steps
+
+    def run(self) -> tuple[FitResult, Path]:
+        """Search, refine, assess, write."""
+        try:
+            outcome = self._optimize()
+        except KeyboardInterrupt:  # keep the best so far; --resume goes on from the checkpoint
+            outcome = Outcome(x=self._best_so_far(), stop_reasons=["interrupted"])
+        self.progress.close()
+        result = self._assess(outcome)
+        self.log.log_result(result)
+        self.log.close()
+        write_report(self.folder.path)
+        return result, self.folder.path
+
+    def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
+        """Bring the optimizers to where the checkpoint has them."""
+        self._steps_before = int(checkpoint["simulated_steps"])
+        self.history = self.folder.read_history()
+        if self.optimizer is not None and checkpoint["history"].size:
+            self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]))
+        self.descents = Descent.restore(checkpoint)
+
+    def _optimize(self) -> Outcome:
+        reasons: list[str] = []
+        starts = [torch.zeros(self.problem.space.size, dtype=torch.float64)]
+        if self.optimizer is not None and not self.descents:
+            starts = self._search(self.optimizer) + starts
+            reasons += self.optimizer.stop_reasons
+            if self.settings.optimizer == "cmaes":
+                return Outcome(x=self.optimizer.best, stop_reasons=reasons)
+        self.descents = least_squares(
+            self.evaluator, self.colouring, self.descents or starts, on_iteration=self._after_iteration
+        )
+        return Outcome(x=self.descents[0].x, stop_reasons=[*reasons, str(self.descents[0].stop_reason)])
+
+    def _search(self, optimizer: CMAESOptimizer) -> list[torch.Tensor]:
+        """Run CMA-ES; for the hybrid, until refining pays. Returns starts for the refinement, the best first."""
+        probe = RefiningPays(self.evaluator, self.colouring) if self.settings.optimizer == "hybrid" else None
+
+        def after_generation(_: CMAESOptimizer) -> None:
+            self._after_generation(optimizer)
+            if probe is not None:
+                probe(optimizer)
+
+        search(optimizer, self.evaluator.rollout(optimizer.population_size), after_generation)
+        optimizer.close()
+        best = optimizer.best if probe is None or probe.refined is None else probe.refined
+        return [best, *self._other_valleys(optimizer.best)]
+
+    def _other_valleys(self, best: torch.Tensor) -> list[torch.Tensor]:
+        """The best with another delay, and with neither bias nor friction: where least squares can get stuck."""
+        space, starts = self.problem.space, []
+        for delay in (-0.5, 0.5):
+            other = best.clone()
+            other[space["delay"]] = delay
+            starts.append(other)
+        other = best.clone()
+        other[space["encoder_bias"]] = 0.0
+        other[space["friction"]] = 0.0
+        return [*starts, other]
+
+    def _make_optimizer(self) -> CMAESOptimizer:
+        cfg = self.problem.env_cfg.sim2real.cmaes
+        population = max(4, self.settings.num_envs // self.problem.dataset.num_recordings)
+        if self.settings.optimizer == "hybrid":
+            population = min(population, _HYBRID_POPULATION)
+        return CMAESOptimizer(self.problem.space, population, cfg, trees=self.problem.trees, seed=self.settings.seed)
+
+    def _after_generation(self, optimizer: CMAESOptimizer) -> None:
+        cfg, space, history = optimizer.cfg, self.problem.space, self.history
+        history.search_best.append(optimizer.best_score)
+        history.search_mean.append(float(optimizer.scores.sum(axis=1).mean()))
+        history.search_steps.append(self.steps)
+        history.search_time_s.append(self.progress.elapsed)
+        self.log.log_generation(optimizer)
+        spread = float(optimizer.spread.max())
+        self.progress.show("search", optimizer.generation, cfg.max_iteration, optimizer.best_score, spread, self.steps)
+        if cfg.save_optimization_process:
+            self._saved["params"].append(optimizer.candidates)
+            self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
+        if optimizer.generation % cfg.save_interval == 0:
+            self.folder.write_mean(optimizer.generation, space.to_physical(optimizer.mean))
+            if cfg.save_optimization_process:
+                self.folder.write_tensors("progress.pt", {k: torch.stack(v) for k, v in self._saved.items()})
+        self.folder.write_checkpoint(optimizer, [], self.steps, self.history)
+
+    def _after_iteration(self, descents: Sequence[Descent]) -> None:
+        best = min(d.score for d in descents)
+        self.descents = list(descents)
+        self.history.refine_best.append(best)
+        self.history.refine_steps.append(self.steps)
+        self.history.refine_time_s.append(self.progress.elapsed)
+        iteration = max(d.iteration for d in descents)
+        self.log.log_refinement(iteration, best)
+        self.progress.show("refine", iteration, LeastSquaresCfg().max_iteration, best, None, self.steps)
+        self.folder.write_checkpoint(self.optimizer, descents, self.steps, self.history)
+
+    def _best_so_far(self) -> torch.Tensor:
+        known = [d for d in self.descents if np.isfinite(d.score)]
+        if known:
+            return min(known, key=lambda d: d.score).x
+        if self.optimizer is not None and self.optimizer.generation:
+            return self.optimizer.best
+        return torch.zeros(self.problem.space.size, dtype=torch.float64)
+
+    def _assess(self, outcome: Outcome) -> FitResult:
+        """Simulate the result once more on everything, with its derivatives, and write it down."""
+        problem, space, data = self.problem, self.problem.space, self.problem.dataset
+        uncertainty, every = assess(problem, self.evaluator, self.colouring, outcome.x)
+        physical = space.to_physical(outcome.x)
+        where = {"train": data.train[every.step], "validation": data.validation[every.step]}
+        rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
+        self.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
+        result = make_result(
+            problem,
+            outcome.x,
+            every,
+            uncertainty,
+            effects=[],
+            optimizer=self.settings.optimizer,
+            seed=self.settings.seed,
+            generations=self.optimizer.generation if self.optimizer else 0,
+            simulated_steps=self.steps,
+            wall_time_s=self.progress.elapsed,
+            stop_reasons=outcome.stop_reasons,
+            warnings=fit_warnings(problem, physical, uncertainty, rmse),
+        )
+        result.save(self.folder.path / "result.json")
+        return result
+
+
+def assess(
+    problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
+) -> tuple[Uncertainty, Residuals]:
+    """Error bars at x from the training samples, and x's residuals on all samples."""
+    neighbours, step = perturbed(x, colouring)
+    data = problem.dataset
+    every = evaluator.residuals(problem.space.to_physical(torch.cat([x[None], neighbours])), data.sampled)
+    train = data.train[every.step]
+    steps = train.any(dim=1)
+    trained = Residuals(
+        error=every.error[:, steps] * train[steps][None, :, :, None], where=train[steps], step=every.step[steps]
+    )
+    uncertainty = estimate_uncertainty(jacobian(trained, step, colouring), problem.space, x)
+    return uncertainty, Residuals(error=every.error[:1], where=every.where, step=every.step)
+
+
+def trajectories(problem: Problem, residuals: Residuals) -> dict:
+    """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
+    data, result = problem.dataset, []
+    for r, recording in enumerate(data.recordings):
+        at = residuals.where[:, r]
+        measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
+        result.append(
+            {
+                "name": recording.name,
+                "time": torch.as_tensor(recording.time)[: len(measured)],
+                "des_dof_pos": torch.as_tensor(recording.des_dof_pos)[: len(measured)],
+                "dof_pos": measured,
+                "sim_dof_pos": measured + residuals.error[0, at, r],
+                "train": data.train[residuals.step][at, r],
+            }
+        )
+    return {"joint_names": list(problem.joint_names), "recordings": result}

@@ -1,0 +1,93 @@
+"""What a user asks of a fit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
+
+
+@dataclass(kw_only=True)
+class FitSettings:
+    """One fit, as on the command line of ``scripts/fit.py``."""
+
+    task: str
+    """Registered name of the environment."""
+
+    data: list[str] = field(default_factory=list)
+    """Recordings to train on; none means the robot's own sample."""
+
+    validation: list[str] = field(default_factory=list)
+    """Recordings that are never trained on; none keeps the last 30 % of each for that."""
+
+    num_envs: int = 512
+    """Simulations at once in a search; refining takes as many as it needs."""
+
+    optimizer: str = "hybrid"
+    """``hybrid``, ``least_squares`` or ``cmaes``."""
+
+    max_iteration: int | None = None
+    """Largest number of generations of the search; ``None`` keeps the robot's."""
+
+    epsilon: float | None = None
+    """PACE's stopping rule, (max - min) / min of a generation's scores; ``None`` keeps the robot's."""
+
+    sigma: float | None = None
+    """Initial standard deviation of the search, normalised; ``None`` keeps the robot's."""
+
+    seed: int = 0
+    """Seed of the search."""
+
+    delay_mode: str | None = None
+    """``command`` or ``effort``; ``None`` keeps the robot's."""
+
+    physics_dt: float | None = None
+    """A finer physics step under the same control rate [s]."""
+
+    joint_strategy: bool = False
+    """Search all joints with one strategy although they do not influence each other."""
+
+    save_optimization_process: bool = False
+    """Keep every generation's parameters and scores in ``progress.pt``."""
+
+    log_dir: str = "logs/pace"
+    """Where runs are kept."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without reading anything.
+
+        Raises:
+            ValueError: If a value is unusable.
+        """
+        if self.optimizer not in OPTIMIZERS:
+            raise ValueError(f"Unknown optimizer {self.optimizer!r}. Available: {', '.join(OPTIMIZERS)}.")
+        for name, lowest in (("num_envs", 1), ("max_iteration", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and value < lowest:
+                raise ValueError(f"{name} is {value}, expected at least {lowest}.")
+        for name in ("epsilon", "sigma", "physics_dt"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"{name} is {value}, expected a number > 0.")
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return asdict(self)
+
+    @classmethod
+    def load(cls, path: Path) -> tuple[FitSettings, dict[str, str]]:
+        """Settings of a run and the digests of its recordings, from its ``settings.json``.
+
+        Raises:
+            ValueError: If the file is missing or unreadable.
+        """
+        try:
+            content = json.loads(path.read_text())
+            return cls(**content["settings"]), content["digests"]
+        except FileNotFoundError:
+            raise ValueError(f"{path.parent} is no run that can be resumed: it has no {path.name}.") from None
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None

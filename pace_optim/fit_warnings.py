@@ -1,0 +1,118 @@
+"""What a user must know before trusting a result."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from pace_optim.problem import Problem
+from pace_optim.uncertainty import Uncertainty
+
+_OVERFIT_RATIO = 1.5
+
+
+def fit_warnings(
+    problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty, rmse: dict[str, dict[str, float]]
+) -> list[str]:
+    """Plain sentences, none if all is well.
+
+    Args:
+        problem: What was fitted.
+        physical: The result, (size,).
+        uncertainty: At the result.
+        rmse: Errors as in ``result.json``.
+    """
+    warnings = []
+    values = dict(zip(problem.space.labels, physical.tolist(), strict=True))
+    bounds = dict(
+        zip(
+            problem.space.labels,
+            zip(problem.space.lower.tolist(), problem.space.upper.tolist(), strict=True),
+            strict=True,
+        )
+    )
+    for label in uncertainty.at_bound:
+        low, high = bounds[label]
+        side = "lower" if values[label] - low < high - values[label] else "upper"
+        warnings.append(
+            f"{label} is at its {side} bound ({values[label]:.4g}): widen the bound, or physics is missing that this "
+            "parameter stands in for."
+        )
+    for label in uncertainty.no_influence:
+        warnings.append(f"{label} has no influence on this recording: its value means nothing.")
+    for group in uncertainty.indistinguishable:
+        warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
+    warnings += _critical_delays(problem, physical)
+    train, validation = rmse["train"].get("all"), rmse["validation"].get("all")
+    if train and validation and validation > _OVERFIT_RATIO * train and validation > 1e-6:
+        warnings.append(
+            f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
+            f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
+        )
+    return warnings
+
+
+def in_words(labels: tuple[str, ...]) -> str:
+    """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
+    names = [label.split("/")[0].replace("_", " ") for label in labels]
+    keys = {label.split("/")[1] for label in labels} - {"all"}
+    if len(keys) == 1:
+        return f"{_listed(names)} of {keys.pop()}"
+    return _listed([label.replace("_", " ", 1).replace("/", " of ") for label in labels])
+
+
+def _listed(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
+
+
+def critical_delay(inertia: float, viscous_friction: float, stiffness: float, damping: float) -> float:
+    """The delay of the whole torque at which a PD loop starts to oscillate [s].
+
+    The characteristic equation I s² + d s + (P + D s) e^(-sT) = 0 has a root on the imaginary axis, s = iω, where
+    |P + iDω| = |Iω² - idω|; then T = (arg(P + iDω) - arg(Iω² - idω)) / ω.
+
+    Args:
+        inertia: I, armature and load [kg m²].
+        viscous_friction: d [N m s/rad].
+        stiffness: P [N m/rad].
+        damping: D [N m s/rad].
+
+    Returns:
+        T; infinite if no delay makes it oscillate.
+    """
+    # I²w² + (d² - D²) w - P² = 0 with w = ω²
+    a, b, c = inertia**2, viscous_friction**2 - damping**2, -(stiffness**2)
+    if stiffness <= 0 or a <= 0:
+        return math.inf
+    omega = math.sqrt((-b + math.sqrt(b * b - 4 * a * c)) / (2 * a))
+    phase = math.atan2(damping * omega, stiffness) - math.atan2(-viscous_friction * omega, inertia * omega**2)
+    return phase % (2 * math.pi) / omega
+
+
+def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
+    """Only a delay of the whole torque lies inside the loop."""
+    if problem.delay_mode != "effort":
+        return []
+    env = problem.make_env(1)
+    robot, space = env.scene["robot"], problem.space
+    space.apply(env, physical[None])
+    env.sim.forward()
+    model = env.sim.batch.get_model(0)
+    inertia = torch.as_tensor(model.dof_M0)[robot.dof_columns].tolist()
+    delay_s = float(physical[space["delay"]]) * problem.control_dt
+    result = []
+    for actuator in robot.actuators.values():
+        for column, name in enumerate(actuator.joint_names):
+            j = robot.joint_names.index(name)
+            viscous = float(physical[space["viscous_friction"]][j])
+            kp, kd = float(actuator.stiffness[0, column]), float(actuator.damping[0, column])
+            limit = critical_delay(inertia[j], viscous, kp, kd)
+            if delay_s > limit:
+                result.append(
+                    f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of {name}'s control loop "
+                    f"({1e3 * limit:.1f} ms): the simulation oscillates by itself. Lower the delay's bound, or use "
+                    "--delay_mode command."
+                )
+    env.close()
+    return result

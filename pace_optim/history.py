@@ -1,0 +1,29 @@
+"""Scores over iterations, for plots and TensorBoard."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+
+@dataclass(kw_only=True)
+class History:
+    """What happened: the search by generations, then the refinement by iterations."""
+
+    search_best: list[float] = field(default_factory=list)
+    """Best score so far after each generation [rad²]."""
+    search_mean: list[float] = field(default_factory=list)
+    """Mean score of each generation [rad²]."""
+    search_steps: list[int] = field(default_factory=list)
+    """Simulated steps after each generation."""
+    search_time_s: list[float] = field(default_factory=list)
+    """Wall time after each generation [s]."""
+    refine_best: list[float] = field(default_factory=list)
+    """Best score so far after each iteration of the refinement [rad²]."""
+    refine_steps: list[int] = field(default_factory=list)
+    """Simulated steps after each iteration of the refinement."""
+    refine_time_s: list[float] = field(default_factory=list)
+    """Wall time after each iteration of the refinement [s]."""
+
+    def to_dict(self) -> dict[str, list]:
+        """For a JSON file."""
+        return asdict(self)

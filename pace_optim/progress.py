@@ -1,0 +1,58 @@
+"""One live line on the terminal."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from typing import TextIO
+
+
+class ProgressLine:
+    """Shows how far a fit is; on a terminal the line is overwritten, elsewhere it is printed now and then."""
+
+    def __init__(self, stream: TextIO | None = None, seconds_between_lines: float = 10.0):
+        """Start the clock."""
+        self._stream = stream or sys.stderr
+        self._live = self._stream.isatty()
+        self._between = seconds_between_lines
+        self._last_line = 0.0
+        self._start = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the start [s]."""
+        return time.perf_counter() - self._start
+
+    def show(self, phase: str, done: int, total: int, best: float, spread: float | None, steps: int) -> None:
+        """Update the line.
+
+        Args:
+            phase: What is going on.
+            done: Iterations so far in this phase.
+            total: Most iterations in this phase.
+            best: Best score so far [rad²].
+            spread: Widest standard deviation of the search, normalised; ``None`` when there is none.
+            steps: Simulated steps so far.
+        """
+        elapsed = self.elapsed
+        filled = round(20 * done / max(1, total))
+        left = elapsed / max(1, done) * (total - done)
+        text = (
+            f"{phase} [{'#' * filled}{'.' * (20 - filled)}] {done}/{total}  best {best:.3e} rad²"
+            + ("" if spread is None else f"  spread {spread:.2g}")
+            + f"  {steps / max(elapsed, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {left:.0f} s left"
+        )
+        if self._live:
+            width = shutil.get_terminal_size().columns - 1
+            self._stream.write("\r" + text[:width].ljust(width))
+        elif elapsed - self._last_line >= self._between or done == total:
+            self._last_line = elapsed
+            self._stream.write(text + "\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        """End the line."""
+        if self._live:
+            self._stream.write("\n")
+            self._stream.flush()

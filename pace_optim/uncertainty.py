@@ -1,0 +1,152 @@
+"""How well each parameter is known: error bars that know of the residuals' autocorrelation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import signal
+
+from pace_optim.jacobian import Jacobian
+from pace_optim.parameter_space import ParameterSpace
+
+AT_BOUND = 1e-3
+"""A normalised entry this close to -1 or 1 is at its bound."""
+NO_INFLUENCE = 1e-6
+"""A parameter whose whole range moves the joints by less than this (RMS) has no influence [rad]."""
+WEAK_STD = 0.05
+"""A direction known no better than this part of the bound range cannot be told apart."""
+_WEAK_SHARE = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Uncertainty:
+    """What the recording says about the parameters, in the order of the space's labels."""
+
+    std: np.ndarray
+    """Standard deviation in physical units, (size,); NaN where a parameter is at its bound or has no influence."""
+    correlation: np.ndarray
+    """(size, size); NaN rows where ``std`` is NaN."""
+    at_bound: tuple[str, ...]
+    """Labels of parameters at a bound."""
+    no_influence: tuple[str, ...]
+    """Labels of parameters that do not move the joints."""
+    indistinguishable: tuple[tuple[str, ...], ...]
+    """Sets of labels that the recording cannot tell apart."""
+
+
+def estimate_uncertainty(jacobian: Jacobian, space: ParameterSpace, x: torch.Tensor) -> Uncertainty:
+    """Error bars at an optimum.
+
+    With J the Jacobian, H = JᵀJ and Σ the covariance of the residuals, the estimate's covariance is
+
+        C = H⁻¹ (Jᵀ Σ J) H⁻¹
+
+    (Huber's sandwich; Hansen 1982 for autocorrelated errors). Σ is taken as stationary for each joint of each
+    recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise.
+
+    Args:
+        jacobian: At x.
+        space: The parameters.
+        x: The optimum, normalised (size,).
+    """
+    size = space.size
+    samples = int(jacobian.residuals.where.sum())
+    hessian, _ = jacobian.normal_equations()
+    whole_range = 2 * hessian.diagonal().clamp(min=0).sqrt().numpy()
+    position = x.numpy()
+    fixed = (space.upper <= space.lower).numpy()
+    bound = (np.abs(position) > 1 - AT_BOUND) & ~fixed
+    silent = (whole_range < NO_INFLUENCE) & ~fixed
+    free = np.flatnonzero(~(bound | silent | fixed))
+    std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
+    groups: list[tuple[str, ...]] = []
+    if len(free):
+        h = hessian.numpy()[np.ix_(free, free)] * samples
+        middle = _middle(jacobian, free)
+        scale = 1 / np.sqrt(h.diagonal())
+        values, vectors = np.linalg.eigh(h * scale[:, None] * scale)
+        kept = values > 1e-12
+        inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T * scale[:, None] * scale
+        covariance = inverse @ middle @ inverse * samples / max(1, samples - len(free))
+        normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
+        std[free] = normalised * space.slope(x).numpy()[free]
+        outer = np.where(normalised > 0, normalised, 1.0)
+        correlation[np.ix_(free, free)] = covariance / outer[:, None] / outer
+        groups = _weak_directions(values, vectors, covariance, free, space)
+    labels = np.asarray(space.labels)
+    return Uncertainty(
+        std=std,
+        correlation=correlation,
+        at_bound=tuple(labels[bound]),
+        no_influence=tuple(labels[silent]),
+        indistinguishable=tuple(groups),
+    )
+
+
+def _middle(jacobian: Jacobian, free: np.ndarray) -> np.ndarray:
+    """JᵀΣJ over the free entries."""
+    total = np.zeros((len(free), len(free)))
+    residuals = jacobian.residuals
+    moved = {entry: set(jacobian.colouring.joints[entry]) for entry in free.tolist()}
+    row = {entry: c for c, entries in enumerate(jacobian.colouring.colours) for entry in entries}
+    for r in range(residuals.where.shape[1]):
+        at = residuals.where[:, r]
+        if not bool(at.any()):
+            continue
+        for joint in range(residuals.error.shape[-1]):
+            own = [i for i, entry in enumerate(free.tolist()) if joint in moved[entry]]
+            columns = jacobian.columns[[row[int(free[i])] for i in own]][:, at, r, joint].numpy()
+            error = residuals.error[0, at, r, joint].numpy()
+            total[np.ix_(own, own)] += columns @ _filtered(columns, autocovariance(error)).T
+    return total
+
+
+def autocovariance(error: np.ndarray) -> np.ndarray:
+    """Autocovariance of a series about zero, lags 0 … L, tapered (Parzen) to zero where it is lost in the noise.
+
+    Args:
+        error: (T,).
+    """
+    count = len(error)
+    full = signal.correlate(error, error, mode="full", method="fft")[count - 1 :] / count
+    if full[0] <= 0:
+        return np.zeros(1)
+    quiet = np.abs(full / full[0]) < 2 / np.sqrt(count)
+    run = 5
+    lags = np.flatnonzero(np.convolve(quiet[: count // 4], np.ones(run), mode="valid") == run)
+    last = int(lags[0]) if len(lags) else count // 4
+    length = min(count // 4, 3 * last) if last > 1 else 1
+    taper = signal.windows.parzen(2 * length + 1)[length:]
+    return (full[: length + 1] * taper)[: max(1, length)]
+
+
+def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Σ applied to each row of (entries, T), Σ the Toeplitz matrix of an autocovariance."""
+    kernel = np.concatenate([covariance[:0:-1], covariance])
+    return signal.fftconvolve(columns, kernel[None, :], mode="same", axes=1) if len(kernel) > 1 else columns * kernel
+
+
+def _weak_directions(
+    values: np.ndarray,
+    vectors: np.ndarray,
+    covariance: np.ndarray,
+    free: np.ndarray,
+    space: ParameterSpace,
+) -> list[tuple[str, ...]]:
+    """Sets of parameters that move the joints almost alike and are, together, hardly known.
+
+    ``values`` and ``vectors`` are those of JᵀJ scaled to a unit diagonal: a small value is a combination of
+    parameters that hardly moves the joints although each of its members does.
+    """
+    groups: list[tuple[str, ...]] = []
+    normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
+    for value, vector in zip(values, vectors.T, strict=True):
+        members = np.flatnonzero(np.abs(vector) > _WEAK_SHARE)
+        hardly_known = (normalised[members] > 2 * WEAK_STD).any()
+        if len(members) > 1 and (value < 1e-10 or (value < 0.1 and hardly_known)):
+            group = tuple(space.labels[int(free[i])] for i in members)
+            if group not in groups:
+                groups.append(group)
+    return groups
