@@ -247,6 +247,20 @@ def test_events_happen_in_their_mode_to_their_environments():
     assert seen == {"startup": [[0, 1, 2]], "reset": [[0, 1, 2], [0, 2]], "interval": [[0, 1, 2], [0, 1, 2]]}
 
 
+def test_a_reset_starts_the_interval_anew():
+    seen = []
+    record = EventTermCfg(
+        func=lambda env, env_ids: seen.append(env_ids.tolist()), mode="interval", interval_range_s=(0.01, 0.01)
+    )
+    env = make(2, events={"record": record})
+    env.reset()
+    for k in range(6):
+        if k == 2:
+            env.reset(env_ids=[1])
+        env.step(act(env))
+    assert seen == [[0], [1]]
+
+
 @pytest.mark.parametrize(
     ("term", "message"),
     [({"mode": "always"}, "Available: startup, reset, interval"), ({"mode": "interval"}, "needs interval_range_s")],

@@ -34,7 +34,7 @@ class EventManager:
             ValueError: If a mode is unknown or an interval is missing.
         """
         self._env = env
-        self._terms: dict[str, list[Term]] = {"startup": [], "reset": [], "interval": []}
+        self._terms: dict[str, list[Term[EventTermCfg]]] = {"startup": [], "reset": [], "interval": []}
         self._time_left: list[torch.Tensor] = []
         for name, term_cfg in term_items(cfg).items():
             if term_cfg.mode not in self._terms:
@@ -62,7 +62,7 @@ class EventManager:
                 time_left -= dt or 0.0
                 due = (time_left <= 0.0).nonzero()[:, 0]
                 if len(due):
-                    time_left[due] = self._env.uniform((len(due),), *term.cfg.interval_range_s)  # type: ignore[attr-defined]
+                    self._draw_time(term, time_left, due)
                     term(due)
             return
         ids = torch.arange(self._env.num_envs, device=self._env.device) if env_ids is None else env_ids
@@ -70,7 +70,13 @@ class EventManager:
             term(ids)
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Reset class terms."""
+        """Reset class terms, and start the intervals of these environments anew."""
         for terms in self._terms.values():
             for term in terms:
                 term.reset(env_ids)
+        for term, time_left in zip(self._terms["interval"], self._time_left, strict=True):
+            self._draw_time(term, time_left, env_ids)
+
+    def _draw_time(self, term: Term[EventTermCfg], time_left: torch.Tensor, env_ids: torch.Tensor) -> None:
+        low, high = term.cfg.interval_range_s or (0.0, 0.0)
+        time_left[env_ids] = self._env.uniform((len(env_ids),), low, high)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 
@@ -72,10 +72,13 @@ class ManagerTermBase:
         """Forget the state of some environments."""
 
 
-class Term:
+CfgT = TypeVar("CfgT", bound=ManagerTermBaseCfg)
+
+
+class Term(Generic[CfgT]):
     """A term with its function and parameters resolved."""
 
-    def __init__(self, name: str, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv, *, num_args: int = 1):
+    def __init__(self, name: str, cfg: CfgT, env: ManagerBasedEnv, *, num_args: int = 1):
         """Resolve scene entities, build class terms and check the arguments.
 
         Args:

@@ -55,7 +55,7 @@ class ObservationManager:
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms and find the size of each group."""
         self._env = env
-        self._groups = {
+        self._groups: dict[str, tuple[ObservationGroupCfg, list[Term[ObservationTermCfg]]]] = {
             name: (group, [Term(key, term, env) for key, term in term_items(group.terms).items()])
             for name, group in term_items(cfg).items()
         }
@@ -81,9 +81,8 @@ class ObservationManager:
             for term in terms:
                 term.reset(env_ids)
 
-    def _compute_term(self, term: Term, corrupt: bool) -> torch.Tensor:
-        cfg: Any = term.cfg
-        value = term()
+    def _compute_term(self, term: Term[ObservationTermCfg], corrupt: bool) -> torch.Tensor:
+        cfg, value = term.cfg, term()
         if corrupt and cfg.noise is not None:
             value = value + self._env.uniform(tuple(value.shape), cfg.noise.n_min, cfg.noise.n_max)
         if cfg.clip is not None:

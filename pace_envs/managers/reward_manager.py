@@ -26,7 +26,7 @@ class RewardManager:
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
-        self._terms = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        self._terms: list[Term[RewardTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
         self._reward = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
         self._sums = {term.name: torch.zeros_like(self._reward) for term in self._terms}
         self._max_episode_length_s = getattr(env, "max_episode_length_s", 1.0)
@@ -38,13 +38,13 @@ class RewardManager:
 
     def get_term_cfg(self, name: str) -> RewardTermCfg:
         """The configuration of a term; its weight can be changed."""
-        return next(term.cfg for term in self._terms if term.name == name)  # type: ignore[return-value]
+        return next(term.cfg for term in self._terms if term.name == name)
 
     def compute(self, dt: float) -> torch.Tensor:
         """The reward of this step, (num_envs,)."""
         self._reward.zero_()
         for term in self._terms:
-            weight = term.cfg.weight  # type: ignore[attr-defined]
+            weight = term.cfg.weight
             if weight != 0.0:
                 value = term() * (weight * dt)
                 self._reward += value

@@ -26,7 +26,7 @@ class TerminationManager:
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
-        self._terms = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        self._terms: list[Term[TerminationTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
         self.terminated = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self.time_outs = torch.zeros_like(self.terminated)
         self._last = {term.name: torch.zeros_like(self.terminated) for term in self._terms}
@@ -52,7 +52,7 @@ class TerminationManager:
         for term in self._terms:
             value = term()
             self._last[term.name] = value
-            if term.cfg.time_out:  # type: ignore[attr-defined]
+            if term.cfg.time_out:
                 self.time_outs |= value
             else:
                 self.terminated |= value
