@@ -23,10 +23,11 @@ from pace_optim.motion_check import (
     summarise,
 )
 from pace_optim.parameter_space import ParameterSpace
-from pace_optim.recording import SUFFIXES, Drive, save_recording
+from pace_optim.recording import Drive, save_recording
 
 from .cfg import CollectionCfg
 from .encoder import Encoder
+from .files import Files, plan_files
 from .plot import plot_motion
 from .simulate import Simulated, simulate
 from .truth import true_parameters
@@ -64,8 +65,7 @@ def collect(cfg: CollectionCfg) -> Collection:
         max_frequency=cfg.max_frequency,
         seed=cfg.seed,
     )
-    files = [_Files.of(cfg, sim2real, trajectory, len(trajectories) > 1) for trajectory in trajectories]
-    _check_files(files)
+    files = plan_files(cfg, sim2real.robot_name, [trajectory.name for trajectory in trajectories])
     space = ParameterSpace.of(sim2real)
     truth = None if cfg.command_only else true_parameters(sim2real, space, cfg.parameters)
 
@@ -97,66 +97,12 @@ def collect(cfg: CollectionCfg) -> Collection:
     return _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Files:
-    """Where one trajectory's files go."""
-
-    recording: Path | None
-    command: Path | None
-    plot: Path | None
-
-    @classmethod
-    def of(cls, cfg: CollectionCfg, sim2real: PaceCfg, trajectory: Trajectory, is_part: bool) -> _Files:
-        """A part of several adds its name to the stem of every file."""
-        folder = Path("data") / sim2real.robot_name
-        command = cfg.export_command
-        if cfg.command_only and command is None:
-            command = folder / f"{cfg.excitation}_command.csv"
-        recording = None if cfg.command_only else cfg.output or folder / f"{cfg.excitation}.npz"
-        plot = cfg.plot
-        if plot is None:
-            plot = (recording or command or folder).with_suffix(".png")
-
-        def named(path: Path | None) -> Path | None:
-            return path.with_name(f"{path.stem}_{trajectory.name}{path.suffix}") if path and is_part else path
-
-        return cls(recording=named(recording), command=named(command), plot=None if cfg.no_plot else named(plot))
-
-
-def _check_files(files: Sequence[_Files]) -> None:
-    """Refuse what could not be written, before the work is done."""
-    kinds = {
-        "recording": ("--output", SUFFIXES),
-        "command": ("--export_command", (".csv",)),
-        "plot": ("--plot", (".png",)),
-    }
-    paths = []
-    for file in files:
-        for kind, (option, suffixes) in kinds.items():
-            path: Path | None = getattr(file, kind)
-            if path is None:
-                continue
-            if path.suffix.lower() not in suffixes:
-                raise ValueError(
-                    f"{option} {path}: found the suffix '{path.suffix}'; expected {' or '.join(suffixes)}. "
-                    "Rename the file."
-                )
-            if path.is_dir():
-                raise ValueError(f"{option} {path}: is a folder; expected a file. Add a file's name.")
-            obstacle = next((parent for parent in path.parents if parent.exists()), None)
-            if obstacle is not None and not obstacle.is_dir():
-                raise ValueError(f"{option} {path}: {obstacle} is a file, not a folder. Choose another place.")
-            paths.append(path)
-    if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
-        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
-
-
 def _write(
     cfg: CollectionCfg,
     sim2real: PaceCfg,
     trajectories: Sequence[Trajectory],
     simulated: Sequence[Simulated],
-    files: Sequence[_Files],
+    files: Sequence[Files],
     findings: Sequence[Sequence[MotionFinding]],
     limits: MotionLimits,
 ) -> Collection:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from pace_optim.atomic import write_atomically
 from pace_optim.excitation import Trajectory
 
 _TARGET, _TARGET_ALONE, _MEASURED, _LIMIT = "#b4b9bf", "#5f6368", "#1f5fa8", "#c0392b"
@@ -74,10 +75,5 @@ def plot_motion(
     for line in legend.get_lines():
         line.set_linewidth(2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        figure.savefig(temporary, format="png", dpi=110)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=110))
     return path

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from pace_optim.atomic import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,13 +41,10 @@ def write_command_csv(path: str | os.PathLike[str], trajectory: Trajectory) -> P
     if path.suffix.lower() != ".csv":
         raise ValueError(f"{path}: found the suffix '{path.suffix}'; expected '.csv'. Rename the file.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["time", *(f"des_dof_pos/{joint}" for joint in trajectory.joint_names)])
-            writer.writerows(np.column_stack([trajectory.time, trajectory.des_dof_pos]).tolist())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    header = ["time", *(f"des_dof_pos/{joint}" for joint in trajectory.joint_names)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(np.column_stack([trajectory.time, trajectory.des_dof_pos]).tolist())
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
     return path

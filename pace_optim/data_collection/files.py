@@ -1,0 +1,75 @@
+"""Where a collection's files go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pace_optim.recording import SUFFIXES
+
+from .cfg import CollectionCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """Where one trajectory's files go; None where there is none."""
+
+    recording: Path | None
+    """The recording."""
+    command: Path | None
+    """The commands alone."""
+    plot: Path | None
+    """The picture."""
+
+
+def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> list[Files]:
+    """Name the files of every trajectory, and refuse what could not be written before the work is done.
+
+    Args:
+        cfg: The request.
+        robot_name: Names the folder under ``data/`` where the request names none.
+        names: Names of the trajectories; with several, each adds its own to the stem of its files.
+
+    Raises:
+        ValueError: If a suffix is wrong, a path is taken by a folder, or two files have the same name.
+    """
+    _check("--output", cfg.output, SUFFIXES)
+    _check("--export_command", cfg.export_command, (".csv",))
+    _check("--plot", cfg.plot, (".png",))
+    folder = Path("data") / robot_name
+    recording = None if cfg.command_only else cfg.output or folder / f"{cfg.excitation}.npz"
+    command = cfg.export_command
+    if command is None and cfg.command_only:
+        command = folder / f"{cfg.excitation}_command.csv"
+    plot = cfg.plot or (recording or command or folder).with_suffix(".png")
+    files = [
+        Files(
+            recording=_part(recording, name, len(names)),
+            command=_part(command, name, len(names)),
+            plot=None if cfg.no_plot else _part(plot, name, len(names)),
+        )
+        for name in names
+    ]
+    paths = [path for file in files for path in (file.recording, file.command, file.plot) if path]
+    if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
+        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
+    return files
+
+
+def _part(path: Path | None, name: str, count: int) -> Path | None:
+    return path.with_name(f"{path.stem}_{name}{path.suffix}") if path and count > 1 else path
+
+
+def _check(option: str, path: Path | None, suffixes: Sequence[str]) -> None:
+    if path is None:
+        return
+    if path.is_dir():
+        raise ValueError(f"{option} {path}: is a folder; expected a file. Add a file's name.")
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(
+            f"{option} {path}: found the suffix '{path.suffix}'; expected {' or '.join(suffixes)}. Rename the file."
+        )
+    obstacle = next((parent for parent in path.parents if parent.exists()), None)
+    if obstacle is not None and not obstacle.is_dir():
+        raise ValueError(f"{option} {path}: {obstacle} is a file, not a folder. Choose another place.")
