@@ -46,11 +46,14 @@ def run_cli(main: Callable[[], int | None]) -> int:
 def import_task(task: str) -> str:
     """Import the module of ``module:Task``, which registers the task, and return the task's name.
 
+    The module may lie in the present folder.
+
     Raises:
         ValueError: If there is no such module.
     """
     module, colon, name = task.rpartition(":")
     if colon:
+        sys.path.append(os.getcwd())  # as `python -m` would find it
         try:
             import_module(module)
         except ImportError as error:

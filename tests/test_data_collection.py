@@ -298,6 +298,21 @@ def test_a_drive_that_hangs_at_its_torque_limit_is_refused(tmp_path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_task_of_ones_own_is_imported_from_the_present_folder(tmp_path, monkeypatch):
+    (tmp_path / "my_bench.py").write_text(
+        "from pace_envs import register_task\n"
+        "from pace_envs.tasks.pace.test_bench import test_bench_pace_env_cfg\n"
+        "register_task('Pace-MyBench-v0', test_bench_pace_env_cfg)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    try:
+        recording = record(tmp_path, "--task", "my_bench:Pace-MyBench-v0", *SHORT)
+    finally:
+        gym.registry.pop("Pace-MyBench-v0", None)
+    assert replay_score(recording, "Pace-TestBench-v0") <= EXACT
+
+
 def test_warnings_go_to_stderr_and_do_not_stop(tmp_path, capsys):
     record(tmp_path, *BENCH, "--no_plot", "--duration", "5")
     out, err = capsys.readouterr()
