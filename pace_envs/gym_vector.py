@@ -37,13 +37,13 @@ class PaceVectorEnv(gym.vector.VectorEnv):
         """The batched environment."""
         return self.env
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:  # type: ignore[override]
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Reset all environments; ``options={"reset_mask": mask}`` resets some of them."""
         mask = (options or {}).get("reset_mask")
         obs, _ = self.env.reset(seed=seed, env_ids=None if mask is None else np.flatnonzero(mask))
         return obs["policy"].numpy(), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:  # type: ignore[override]
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance all environments; those that are done start anew in the same step."""
         obs, reward, terminated, truncated, extras = self.env.step(torch.as_tensor(actions, dtype=torch.float64))
         infos: dict[str, Any] = {}

@@ -118,7 +118,7 @@ class ManagerBasedEnv(gym.Env):
         self.action_manager = ActionManager(self.cfg.actions, self)
         self.observation_manager = ObservationManager(self.cfg.observations, self)
 
-    def seed(self, seed: int | None) -> int:  # type: ignore[override]
+    def seed(self, seed: int | None) -> int:
         """Seed all random draws of the environment; returns the seed."""
         seed = self._generator.seed() % 2**31 if seed is None else int(seed)
         self._generator.manual_seed(seed)

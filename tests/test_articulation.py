@@ -51,8 +51,8 @@ def build(tmp_path):
 
     def build_scene(num_envs=3, fix_base=True, actuators=None, **fields) -> InteractiveScene:
         fields.setdefault("init_state", InitialStateCfg(joint_pos=START, pos=(0.0, 0.0, 1.0)))
+        fields.setdefault("mjcf_path", path)
         robot = ArticulationCfg(
-            mjcf_path=path,
             fix_base=fix_base,
             actuators={"all": drive()} if actuators is None else actuators,
             **fields,
@@ -241,6 +241,19 @@ def test_masks_and_single_numbers_are_taken_too(build):
     scene["robot"].write_joint_friction_coefficient_to_sim(0.8, slice(1, None), slice(0, 2))
     assert (scene.sim.expand("dof_armature") == 0.9).nonzero().tolist() == [[1, 0], [3, 0]]
     assert (scene.sim.expand("dof_frictionloss") == 0.8).nonzero().tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
+
+
+def test_a_written_parameter_is_as_good_as_one_in_the_model(build, tmp_path):
+    written, other = build(actuators={}), tmp_path / "other.xml"
+    values = {"armature": 0.07, "damping": 0.4, "frictionloss": 0.3}
+    given = "".join(f' {name}="{value}"' for name, value in values.items())
+    text = MJCF.replace(' armature="0.02"', "").replace(' damping="0.7"', "").replace(' frictionloss="0.01"', "")
+    other.write_text(text.replace('axis="', given[1:] + ' axis="'))
+    compiled = build(actuators={}, mjcf_path=other)
+    written["robot"].write_joint_armature_to_sim(0.07)
+    written["robot"].write_joint_viscous_friction_coefficient_to_sim(0.4)
+    written["robot"].write_joint_friction_coefficient_to_sim(0.3)
+    assert torch.equal(step(written, 100), step(compiled, 100))
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])

@@ -163,6 +163,19 @@ def test_a_partial_reset_leaves_the_others_bit_identical(task, env_ids):
     assert not torch.equal(a["policy"][[0, 2]], b["policy"][[0, 2]])
 
 
+def test_an_episode_that_ends_leaves_the_others_bit_identical():
+    cfg = load_env_cfg("Pace-AnymalD-v0")
+    cfg.scene.robot.actuators["legs"].friction, cfg.episode_length_s = 0.3, 1.0
+    ends, goes_on = (gym.make("Pace-AnymalD-v0", num_envs=3, cfg=cfg).unwrapped for _ in range(2))
+    for env in (ends, goes_on):
+        env.reset()
+    ends.episode_length_buf[[0, 2]] = 390  # of 400
+    for target in 0.2 * torch.randn(30, 3, 12, generator=torch.Generator().manual_seed(0)):
+        (a, *_), (b, *_) = ends.step(target), goes_on.step(target)
+        assert torch.equal(a["policy"][1], b["policy"][1])
+    assert ends.episode_length_buf.tolist() == [20, 30, 20]
+
+
 def test_it_steps_in_and_out_of_inference_mode():
     with torch.inference_mode():
         env = short_episodes()

@@ -134,6 +134,7 @@ def test_the_last_action_is_remembered_until_a_reset():
     assert mdp.action_rate_l2(env).tolist() == [4.0] * 4
     env.reset(env_ids=[0])
     assert mdp.last_action(env)[:, 0].tolist() == [0.0, 3.0, 3.0, 3.0]
+    assert mdp.action_rate_l2(env).tolist() == [0.0, 4.0, 4.0, 4.0]
 
 
 # ---- observations

@@ -38,6 +38,8 @@ class RewardManager:
 
     def get_term_cfg(self, name: str) -> RewardTermCfg:
         """The configuration of a term; its weight can be changed."""
+        if name not in self._sums:
+            raise KeyError(f"There is no reward {name!r}. Available: {', '.join(self._sums) or 'none'}.")
         return next(term.cfg for term in self._terms if term.name == name)
 
     def compute(self, dt: float) -> torch.Tensor:
