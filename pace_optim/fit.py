@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from pace_optim.assessment import assess, trajectories
 from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.evaluator import Evaluator, Residuals
+from pace_optim.consistency import Consistency, check_consistency
+from pace_optim.evaluator import Evaluator
 from pace_optim.fit_result import FitResult, make_result, rmse_by_joint
 from pace_optim.fit_settings import FitSettings
 from pace_optim.fit_warnings import fit_warnings
 from pace_optim.history import History
-from pace_optim.jacobian import Colouring, colour, jacobian, perturbed
+from pace_optim.jacobian import colour
 from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem import Problem, file_digest, load_problem
 from pace_optim.progress import ProgressLine
@@ -23,7 +25,6 @@ from pace_optim.report import write_report
 from pace_optim.run_folder import RunFolder
 from pace_optim.search import RefiningPays, search
 from pace_optim.tensorboard_log import TensorBoardLog
-from pace_optim.uncertainty import Uncertainty, estimate_uncertainty
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
@@ -241,6 +242,15 @@ class _Fit:
             return self.optimizer.best
         return torch.zeros(self.problem.space.size, dtype=torch.float64)
 
+    def _check_consistency(self, outcome: Outcome, score: float) -> Consistency:
+        """Fit each recording alone, where there are several and the optimizer can afford it."""
+        if self.settings.optimizer == "cmaes" or outcome.stop_reasons == ["interrupted"]:
+            return Consistency()
+        result = check_consistency(self.problem, outcome.x, score, self.progress.say)
+        if result.recordings:
+            self.folder.write_json("consistency.json", asdict(result))
+        return result
+
     def _assess(self, outcome: Outcome) -> FitResult:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
@@ -249,6 +259,8 @@ class _Fit:
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
         rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
         self.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
+        score = float(every.error[0].square()[where["train"]].sum(dim=1).mean())
+        consistency = self._check_consistency(outcome, score)
         result = make_result(
             problem,
             outcome.x,
@@ -261,42 +273,7 @@ class _Fit:
             simulated_steps=self.steps,
             wall_time_s=self.progress.elapsed,
             stop_reasons=outcome.stop_reasons,
-            warnings=fit_warnings(problem, physical, uncertainty, rmse),
+            warnings=[*fit_warnings(problem, physical, uncertainty, rmse), *consistency.sentences],
         )
         result.save(self.folder.path / "result.json")
         return result
-
-
-def assess(
-    problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
-) -> tuple[Uncertainty, Residuals]:
-    """Error bars at x from the training samples, and x's residuals on all samples."""
-    neighbours, step = perturbed(x, colouring)
-    data = problem.dataset
-    every = evaluator.residuals(problem.space.to_physical(torch.cat([x[None], neighbours])), data.sampled)
-    train = data.train[every.step]
-    steps = train.any(dim=1)
-    trained = Residuals(
-        error=every.error[:, steps] * train[steps][None, :, :, None], where=train[steps], step=every.step[steps]
-    )
-    uncertainty = estimate_uncertainty(jacobian(trained, step, colouring), problem.space, x)
-    return uncertainty, Residuals(error=every.error[:1], where=every.where, step=every.step)
-
-
-def trajectories(problem: Problem, residuals: Residuals) -> dict:
-    """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
-    data, result = problem.dataset, []
-    for r, recording in enumerate(data.recordings):
-        at = residuals.where[:, r]
-        measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
-        result.append(
-            {
-                "name": recording.name,
-                "time": torch.as_tensor(recording.time)[: len(measured)],
-                "des_dof_pos": torch.as_tensor(recording.des_dof_pos)[: len(measured)],
-                "dof_pos": measured,
-                "sim_dof_pos": measured + residuals.error[0, at, r],
-                "train": data.train[residuals.step][at, r],
-            }
-        )
-    return {"joint_names": list(problem.joint_names), "recordings": result}

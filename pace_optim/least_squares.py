@@ -24,7 +24,7 @@ class LeastSquaresCfg:
     max_iteration: int = 40
     """Largest number of iterations."""
 
-    score_tolerance: float = 1e-5
+    score_tolerance: float = 1e-6
     """Stop when an iteration lowers the score by less than this part of it."""
 
     step_tolerance: float = 1e-7
@@ -35,6 +35,9 @@ class LeastSquaresCfg:
 
     give_up_ratio: float = 100.0
     """A start whose score is this many times the best one's after a few iterations is dropped."""
+
+    same_valley: float = 1e-2
+    """A start whose score is within this part of the best one's, without being better, is dropped."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -198,7 +201,12 @@ def _advance(
 
 
 def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
-    best = min(d.score for d in descents)
+    """Stop starts that are far behind the best one, or that have come down into its valley."""
+    best = min(descents, key=lambda d: d.score)
     for descent in descents:
-        if descent.stop_reason is None and descent.iteration >= 5 and descent.score > cfg.give_up_ratio * best:
+        if descent is best or descent.stop_reason is not None or descent.iteration < 5:
+            continue
+        if descent.score > cfg.give_up_ratio * best.score:
             descent.stop_reason = "another start is far better"
+        elif descent.score < (1 + cfg.same_valley) * best.score:
+            descent.stop_reason = "another start is in the same valley"

@@ -44,10 +44,17 @@ class ProgressLine:
             + f"  {steps / max(elapsed, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {left:.0f} s left"
         )
         if self._live:
-            width = shutil.get_terminal_size().columns - 1
-            self._stream.write("\r" + text[:width].ljust(width))
+            self.say(text)
         elif elapsed - self._last_line >= self._between or done == total:
             self._last_line = elapsed
+            self.say(text)
+
+    def say(self, text: str) -> None:
+        """Show a step that has no counter."""
+        if self._live:
+            width = shutil.get_terminal_size().columns - 1
+            self._stream.write("\r" + text[:width].ljust(width))
+        else:
             self._stream.write(text + "\n")
         self._stream.flush()
 

@@ -1,0 +1,184 @@
+"""Do several recordings agree? Each is fitted alone; where they disagree, misreported gains are tried."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from pace_envs import ManagerBasedEnv
+from pace_envs.tasks.pace import GLOBAL, Parameter
+from pace_optim.assessment import assess
+from pace_optim.dataset import Dataset
+from pace_optim.jacobian import colour
+from pace_optim.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem import Problem
+from pace_optim.uncertainty import Uncertainty
+
+DISAGREEMENT = 4.0
+"""Recordings disagree on a parameter that differs by this many standard deviations of the difference."""
+_SMALLEST_PART = 0.01
+"""Differences below this part of the bound range are not worth a sentence."""
+_GAIN_RANGE = 0.6
+_GAIN_SMALLEST = 0.05
+_GAIN_PAYS = 1.1
+_REFINE = LeastSquaresCfg(max_iteration=12)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consistency:
+    """What fitting each recording alone says."""
+
+    recordings: tuple[str, ...] = ()
+    """Names of the recordings."""
+    values: dict[str, list[float]] = field(default_factory=dict)
+    """Physical value of each parameter by recording, {label: [per recording]}."""
+    std: dict[str, list[float | None]] = field(default_factory=dict)
+    """Standard deviations, shaped as ``values``; ``None`` at a bound or without influence."""
+    sentences: tuple[str, ...] = ()
+    """What disagrees, in words; empty when all recordings agree."""
+
+
+def check_consistency(
+    problem: Problem, x: torch.Tensor, score: float, report: Callable[[str], None] = lambda text: None
+) -> Consistency:
+    """Fit each training recording alone, from the joint result, and compare beyond the error bars.
+
+    Args:
+        problem: The joint problem.
+        x: Its result, normalised (size,).
+        score: Its score [rad²].
+        report: Gets a line of progress.
+    """
+    trained = [r for r in range(problem.dataset.num_recordings) if bool(problem.dataset.train[:, r].any())]
+    if len(trained) < 2:
+        return Consistency()
+    fits = []
+    for r in trained:
+        report(f"fitting {problem.dataset.recordings[r].name} alone")
+        fits.append(_fit_from(replace(problem, dataset=one_recording(problem.dataset, r)), x)[1:])
+    names = tuple(problem.dataset.recordings[r].name for r in trained)
+    values = torch.stack([problem.space.to_physical(alone) for alone, _ in fits]).numpy()
+    std = np.stack([uncertainty.std for _, uncertainty in fits])
+    sentences = _disagreements(problem.space, names, values, std)
+    if sentences:
+        report("trying misreported gains")
+        gains = _misreported_gains(problem, x, score, trained)
+        sentences = [*gains, *sentences]
+    labels = problem.space.labels
+    return Consistency(
+        recordings=names,
+        values={label: values[:, i].tolist() for i, label in enumerate(labels)},
+        std={label: [None if np.isnan(v) else float(v) for v in std[:, i]] for i, label in enumerate(labels)},
+        sentences=tuple(sentences),
+    )
+
+
+def one_recording(dataset: Dataset, r: int) -> Dataset:
+    """A dataset of one of its recordings."""
+    return Dataset(
+        recordings=(dataset.recordings[r],),
+        command=dataset.command[:, r : r + 1],
+        measured=dataset.measured[:, r : r + 1],
+        measured_vel=dataset.measured_vel[:, r : r + 1],
+        sampled=dataset.sampled[:, r : r + 1],
+        train=dataset.train[:, r : r + 1],
+        torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[:, r : r + 1],
+        validation_only=(dataset.validation_only[r],),
+    )
+
+
+def _fit_from(problem: Problem, x: torch.Tensor) -> tuple[float, torch.Tensor, Uncertainty]:
+    """Least squares from x: score, normalised result, uncertainty."""
+    evaluator = problem.evaluator()
+    colouring = colour(problem.space, problem.trees, problem.joint_names)
+    best = least_squares(evaluator, colouring, [x], _REFINE)[0]
+    uncertainty, _ = assess(problem, evaluator, colouring, best.x)
+    return best.score, best.x, uncertainty
+
+
+def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
+    """One sentence per parameter that a recording sees otherwise than the others do."""
+    sentences = []
+    width = (space.upper - space.lower).numpy()
+    units = [p.unit for p in space.parameters for _ in p.keys]
+    for i, label in enumerate(space.labels):
+        known = np.flatnonzero(~np.isnan(std[:, i]))
+        worst: tuple[float, int, float, float] | None = None
+        for r in known:
+            others = [o for o in known if o != r]
+            if not others:
+                continue
+            weight = 1 / np.maximum(std[others, i], 1e-12) ** 2
+            mean, error = float((weight * values[others, i]).sum() / weight.sum()), float(weight.sum() ** -0.5)
+            difference = abs(values[r, i] - mean)
+            z = difference / float(np.hypot(std[r, i], error) + 1e-12)
+            if difference > _SMALLEST_PART * width[i] and (worst is None or z > worst[0]):
+                worst = (z, int(r), mean, error)
+        if worst is not None and worst[0] > DISAGREEMENT:
+            z, r, mean, error = worst
+            name = label.replace("_", " ").replace("/", " of ", 1)
+            sentences.append(
+                f"{name}: {values[r, i]:.4g} ± {std[r, i]:.1g} {units[i]} in {names[r]}, {mean:.4g} ± {error:.1g} in the "
+                f"others ({z:.0f} standard deviations apart)."
+            )
+    return sentences
+
+
+def _misreported_gains(problem: Problem, x: torch.Tensor, score: float, trained: list[int]) -> list[str]:
+    """The recording whose gains, were they other than stated, would explain most; none if that does not pay."""
+    best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
+    for r in trained:
+        extra = [_gain_parameter(problem, r, name) for name in ("stiffness", "damping")]
+        space = ParameterSpace((*problem.space.parameters, *extra))
+        start = torch.cat([x, torch.zeros(len(extra), dtype=torch.float64)])
+        tried, end, uncertainty = _fit_from(replace(problem, space=space), start)
+        physical = space.to_physical(end)
+        found = {p.name: (float(physical[space[p.name]]), float(uncertainty.std[space[p.name]][0])) for p in extra}
+        if best is None or tried < best[0]:
+            best = (tried, r, found)
+    if best is None or score < _GAIN_PAYS**2 * best[0]:
+        return []
+    _, r, found = best
+    name = problem.dataset.recordings[r].name
+    sentences = []
+    for key, (value, error) in found.items():
+        field_name = key.split(":")[0]
+        if abs(value) > _GAIN_SMALLEST and not abs(value) < DISAGREEMENT * error:
+            nominal = float(np.mean(_nominal_gain(problem, r, field_name).numpy()))
+            sentences.append(
+                f"{name} behaves as if its {field_name} were {abs(value):.0%} {'higher' if value > 0 else 'lower'} than "
+                f"stated ({nominal * (1 + value):.3g} instead of {nominal:.3g}, ± {abs(nominal) * error:.1g}): check "
+                f"the {field_name} that was in force."
+            )
+    return sentences
+
+
+def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
+    """The gain of every joint as the recording, or else the configuration, states it, (n,)."""
+    stated = getattr(problem.dataset.recordings[r].drive, field_name)
+    if stated is not None:
+        return torch.as_tensor(stated, dtype=torch.float64)
+    env = problem.make_env(1)
+    result = torch.zeros(len(problem.joint_names), dtype=torch.float64)
+    for actuator in env.scene["robot"].actuators.values():
+        result[actuator.joint_indices] = getattr(actuator, field_name)[0]
+    env.close()
+    return result
+
+
+def _gain_parameter(problem: Problem, r: int, field_name: str) -> Parameter:
+    """A relative error of one recording's gain, common to all joints."""
+    nominal, count = _nominal_gain(problem, r, field_name), problem.dataset.num_recordings
+
+    def apply(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+        rows = slice(r, None, count)
+        for actuator in env.scene["robot"].actuators.values():
+            getattr(actuator, field_name)[rows] = nominal[actuator.joint_indices] * (1 + values[rows])
+
+    return Parameter(
+        name=f"{field_name}:{r}", unit="1", lower=(-_GAIN_RANGE,), upper=(_GAIN_RANGE,), apply=apply, keys=(GLOBAL,)
+    )
