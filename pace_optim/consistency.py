@@ -102,30 +102,43 @@ def _fit_from(problem: Problem, x: torch.Tensor) -> tuple[float, torch.Tensor, U
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
     """One sentence per parameter that a recording sees otherwise than the others do."""
-    sentences = []
     width = (space.upper - space.lower).numpy()
-    units = [p.unit for p in space.parameters for _ in p.keys]
+    found: dict[tuple[str, str], list[str]] = {}
     for i, label in enumerate(space.labels):
-        known = np.flatnonzero(~np.isnan(std[:, i]))
-        worst: tuple[float, int, float, float] | None = None
-        for r in known:
-            others = [o for o in known if o != r]
-            if not others:
-                continue
-            weight = 1 / np.maximum(std[others, i], 1e-12) ** 2
-            mean, error = float((weight * values[others, i]).sum() / weight.sum()), float(weight.sum() ** -0.5)
-            difference = abs(values[r, i] - mean)
-            z = difference / float(np.hypot(std[r, i], error) + 1e-12)
-            if difference > _SMALLEST_PART * width[i] and (worst is None or z > worst[0]):
-                worst = (z, int(r), mean, error)
-        if worst is not None and worst[0] > DISAGREEMENT:
-            z, r, mean, error = worst
-            name = label.replace("_", " ").replace("/", " of ", 1)
-            sentences.append(
-                f"{name}: {values[r, i]:.4g} ± {std[r, i]:.1g} {units[i]} in {names[r]}, {mean:.4g} ± {error:.1g} in the "
-                f"others ({z:.0f} standard deviations apart)."
-            )
-    return sentences
+        odd = _odd_one_out(values[:, i], std[:, i], _SMALLEST_PART * float(width[i]))
+        if odd is not None:
+            r, mean, error = odd
+            name, key = label.split("/")
+            text = f"{values[r, i]:.4g} ± {std[r, i]:.1g} against {mean:.4g} ± {error:.1g}"
+            found.setdefault((name, names[r]), []).append(text if key == GLOBAL else f"{key} {text}")
+    return [
+        f"{name.replace('_', ' ')} [{space.units[name]}] is another in {recording} than in the other recordings: "
+        f"{'; '.join(places)}."
+        for (name, recording), places in found.items()
+    ]
+
+
+def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[int, float, float] | None:
+    """The recording whose value is furthest from the others', if that is beyond the error bars.
+
+    Args:
+        values: One per recording, (R,).
+        std: Their standard deviations, (R,); NaN where there is none.
+        smallest: Differences below this do not count.
+
+    Returns:
+        The recording, and mean and standard deviation of the others; ``None`` if all agree.
+    """
+    known = np.flatnonzero(~np.isnan(std))
+    furthest, result = DISAGREEMENT, None
+    for r in known.tolist() if len(known) > 1 else []:
+        others = known[known != r]
+        weight = 1 / np.maximum(std[others], 1e-12) ** 2
+        mean, error = float((weight * values[others]).sum() / weight.sum()), float(weight.sum() ** -0.5)
+        distance = abs(values[r] - mean) / float(np.hypot(std[r], error) + 1e-12)
+        if abs(values[r] - mean) > smallest and distance > furthest:
+            furthest, result = distance, (r, mean, error)
+    return result
 
 
 def _misreported_gains(problem: Problem, x: torch.Tensor, score: float, trained: list[int]) -> list[str]:

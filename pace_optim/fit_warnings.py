@@ -6,6 +6,7 @@ import math
 
 import torch
 
+from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem import Problem
 from pace_optim.uncertainty import Uncertainty
 
@@ -23,24 +24,10 @@ def fit_warnings(
         uncertainty: At the result.
         rmse: Errors as in ``result.json``.
     """
-    warnings = []
-    values = dict(zip(problem.space.labels, physical.tolist(), strict=True))
-    bounds = dict(
-        zip(
-            problem.space.labels,
-            zip(problem.space.lower.tolist(), problem.space.upper.tolist(), strict=True),
-            strict=True,
-        )
-    )
-    for label in uncertainty.at_bound:
-        low, high = bounds[label]
-        side = "lower" if values[label] - low < high - values[label] else "upper"
-        warnings.append(
-            f"{label} is at its {side} bound ({values[label]:.4g}): widen the bound, or physics is missing that this "
-            "parameter stands in for."
-        )
-    for label in uncertainty.no_influence:
-        warnings.append(f"{label} has no influence on this recording: its value means nothing.")
+    warnings = _at_bounds(problem, physical, uncertainty)
+    if uncertainty.no_influence:
+        listed = ", ".join(uncertainty.no_influence)
+        warnings.append(f"No influence on these recordings, so the value means nothing: {listed}.")
     for group in uncertainty.indistinguishable:
         warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
     warnings += _critical_delays(problem, physical)
@@ -53,13 +40,31 @@ def fit_warnings(
     return warnings
 
 
+def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:
+    """One sentence per parameter and side."""
+    space = problem.space
+    low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
+    places: dict[tuple[str, str, float], list[str]] = {}
+    for label in uncertainty.at_bound:
+        i = space.labels.index(label)
+        name, key = label.split("/")
+        side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
+        places.setdefault((name, side, bound), []).append(key)
+    return [
+        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.units[name]})"
+        + ("" if keys == [GLOBAL] else f" on {', '.join(keys)}")
+        + ": widen the bound, or physics is missing that this parameter stands in for."
+        for (name, side, bound), keys in places.items()
+    ]
+
+
 def in_words(labels: tuple[str, ...]) -> str:
     """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
     names = [label.split("/")[0].replace("_", " ") for label in labels]
     keys = {label.split("/")[1] for label in labels} - {"all"}
     if len(keys) == 1:
         return f"{_listed(names)} of {keys.pop()}"
-    return _listed([label.replace("_", " ", 1).replace("/", " of ") for label in labels])
+    return _listed([f"{name} of {label.split('/')[1]}" for name, label in zip(names, labels, strict=True)])
 
 
 def _listed(words: list[str]) -> str:

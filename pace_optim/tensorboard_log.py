@@ -114,7 +114,7 @@ class TensorBoardLog:
             "recordings": ", ".join(result.recordings.get("train", [])),
         }
         for summary in hparams(settings, metrics):
-            self._writer.file_writer.add_summary(summary)  # type: ignore[union-attr]
+            self._writer.file_writer.add_summary(summary)  # type: ignore[attr-defined]
         for tag, value in metrics.items():
             self._writer.add_scalar(tag, value)
 

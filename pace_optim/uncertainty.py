@@ -66,15 +66,18 @@ def estimate_uncertainty(jacobian: Jacobian, space: ParameterSpace, x: torch.Ten
         h = hessian.numpy()[np.ix_(free, free)] * samples
         middle = _middle(jacobian, free)
         scale = 1 / np.sqrt(h.diagonal())
-        values, vectors = np.linalg.eigh(h * scale[:, None] * scale)
+        values, vectors = _eigen(h * scale[:, None] * scale)
         kept = values > 1e-12
-        inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T * scale[:, None] * scale
+        inverse = (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
         covariance = inverse @ middle @ inverse * samples / max(1, samples - len(free))
         normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
         std[free] = normalised * space.slope(x).numpy()[free]
         outer = np.where(normalised > 0, normalised, 1.0)
         correlation[np.ix_(free, free)] = covariance / outer[:, None] / outer
-        groups = _weak_directions(values, vectors, covariance, free, space)
+        for members in _trees(jacobian, free):
+            for group in _weak_directions(h[np.ix_(members, members)], normalised[members], free[members], space):
+                if group not in groups:
+                    groups.append(group)
     labels = np.asarray(space.labels)
     return Uncertainty(
         std=std,
@@ -128,25 +131,39 @@ def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return signal.fftconvolve(columns, kernel[None, :], mode="same", axes=1) if len(kernel) > 1 else columns * kernel
 
 
+def _trees(jacobian: Jacobian, free: np.ndarray) -> list[list[int]]:
+    """Positions in ``free`` of the entries that move the same joints, each with those that move all joints."""
+    joints = [jacobian.colouring.joints[entry] for entry in free.tolist()]
+    widest = max(len(moved) for moved in joints)
+    parts = sorted({moved for moved in joints if len(moved) < widest}) or [joints[0]]
+    return [[i for i, moved in enumerate(joints) if moved == part or len(moved) == widest] for part in parts]
+
+
 def _weak_directions(
-    values: np.ndarray,
-    vectors: np.ndarray,
-    covariance: np.ndarray,
-    free: np.ndarray,
-    space: ParameterSpace,
+    hessian: np.ndarray, std: np.ndarray, entries: np.ndarray, space: ParameterSpace
 ) -> list[tuple[str, ...]]:
     """Sets of parameters that move the joints almost alike and are, together, hardly known.
 
-    ``values`` and ``vectors`` are those of JᵀJ scaled to a unit diagonal: a small value is a combination of
-    parameters that hardly moves the joints although each of its members does.
+    A small eigenvalue of JᵀJ scaled to a unit diagonal is a combination of parameters that hardly moves the joints
+    although each of its members does.
+
+    Args:
+        hessian: JᵀJ of some entries, (m, m).
+        std: Their standard deviations, normalised (m,).
+        entries: Where they are in the full vector, (m,).
+        space: The parameters.
     """
     groups: list[tuple[str, ...]] = []
-    normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
-    for value, vector in zip(values, vectors.T, strict=True):
+    scale = 1 / np.sqrt(hessian.diagonal())
+    for value, vector in zip(*_eigen(hessian * scale[:, None] * scale), strict=True):
         members = np.flatnonzero(np.abs(vector) > _WEAK_SHARE)
-        hardly_known = (normalised[members] > 2 * WEAK_STD).any()
+        hardly_known = bool((std[members] > 2 * WEAK_STD).any())
         if len(members) > 1 and (value < 1e-10 or (value < 0.1 and hardly_known)):
-            group = tuple(space.labels[int(free[i])] for i in members)
-            if group not in groups:
-                groups.append(group)
+            groups.append(tuple(space.labels[int(entries[i])] for i in members))
     return groups
+
+
+def _eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and, row by row, eigenvectors of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return values, vectors.T
