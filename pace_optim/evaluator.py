@@ -71,28 +71,39 @@ class Evaluator:
             self._rollouts[num_candidates] = Rollout(env, self.dataset, self.space)
         return self._rollouts[num_candidates]
 
-    def residuals(self, physical: torch.Tensor, where: torch.Tensor | None = None) -> Residuals:
+    def residuals(
+        self,
+        physical: torch.Tensor,
+        where: torch.Tensor | None = None,
+        initial_offset: torch.Tensor | None = None,
+    ) -> Residuals:
         """Simulate candidates and keep their errors.
 
         Args:
             physical: Physical parameters, (m, size).
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
+            initial_offset: Added to each recording's first position, (m, n) [rad].
         """
         self.simulations += len(physical)
         widest = max(1, _WIDEST // self.dataset.num_recordings)
-        parts = [self._residuals(part, where) for part in physical.split(widest)]
+        offsets = [None] * len(physical) if initial_offset is None else initial_offset.split(widest)
+        parts = [
+            self._residuals(part, where, offset) for part, offset in zip(physical.split(widest), offsets, strict=False)
+        ]
         return (
             parts[0]
             if len(parts) == 1
             else Residuals(error=torch.cat([part.error for part in parts]), where=parts[0].where, step=parts[0].step)
         )
 
-    def _residuals(self, physical: torch.Tensor, where: torch.Tensor | None) -> Residuals:
+    def _residuals(
+        self, physical: torch.Tensor, where: torch.Tensor | None, initial_offset: torch.Tensor | None
+    ) -> Residuals:
         data = self.dataset
         mask = data.train if where is None else where
         step = mask.any(dim=1).nonzero()[:, 0]
         rollout = self.rollout(len(physical))
-        rollout.start(physical, mask)
+        rollout.start(physical, mask, initial_offset=initial_offset)
         bias = rollout.physical[:, self.space["encoder_bias"]]
         m, count, n = len(physical), data.num_recordings, bias.shape[1]
         error = torch.zeros(len(step), m * count, n, dtype=torch.float64)

@@ -80,6 +80,7 @@ class Rollout:
         physical: torch.Tensor,
         where: torch.Tensor | None = None,
         per_joint: Mapping[str, torch.Tensor] | None = None,
+        initial_offset: torch.Tensor | None = None,
     ) -> None:
         """Write candidates and put every environment at its recording's first sample.
 
@@ -88,6 +89,7 @@ class Rollout:
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
             per_joint: Values per joint of shared parameters, in place of those in ``physical``:
                 {name: (num_candidates, n)}.
+            initial_offset: Added to each recording's first position, (num_candidates, n) [rad].
         """
         count = self.dataset.num_recordings
         self._where = self.dataset.train if where is None else where
@@ -95,7 +97,8 @@ class Rollout:
         self.env.scene.reset()
         copies = {name: values.repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
         self.space.apply(self.env, self.physical, copies)
-        self._set_initial_state()
+        offset = 0.0 if initial_offset is None else initial_offset.repeat_interleave(count, dim=0)
+        self._set_initial_state(offset)
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
@@ -124,13 +127,13 @@ class Rollout:
             return per_recording.expand(self.env.num_envs, -1)
         return per_recording.repeat(self.num_candidates, 1)
 
-    def _set_initial_state(self) -> None:
+    def _set_initial_state(self, offset: torch.Tensor | float) -> None:
         position = self._rows(self.dataset.measured[0]).clone()
         for actuator in self.robot.actuators.values():
             position[:, actuator.joint_indices] += actuator.encoder_bias
         measured = [recording.dof_vel is not None for recording in self.dataset.recordings]
         speed = self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None]
-        self.robot.write_joint_state_to_sim(position, self._rows(speed))
+        self.robot.write_joint_state_to_sim(position + offset, self._rows(speed))
 
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +37,13 @@ class Uncertainty:
     """Sets of labels that the recording cannot tell apart."""
 
 
-def estimate_uncertainty(jacobian: Jacobian, space: ParameterSpace, x: torch.Tensor) -> Uncertainty:
+def estimate_uncertainty(
+    jacobian: Jacobian,
+    space: ParameterSpace,
+    x: torch.Tensor,
+    initial: torch.Tensor | None = None,
+    initial_joints: Sequence[tuple[int, ...]] = (),
+) -> Uncertainty:
     """Error bars at an optimum.
 
     With J the Jacobian, H = JᵀJ and Σ the covariance of the residuals, the estimate's covariance is
@@ -44,12 +51,15 @@ def estimate_uncertainty(jacobian: Jacobian, space: ParameterSpace, x: torch.Ten
         C = H⁻¹ (Jᵀ Σ J) H⁻¹
 
     (Huber's sandwich; Hansen 1982 for autocorrelated errors). Σ is taken as stationary for each joint of each
-    recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise.
+    recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A
+    simulation starts at the first measured position: that sample's noise moves all that follows, and is added to Σ.
 
     Args:
         jacobian: At x.
         space: The parameters.
         x: The optimum, normalised (size,).
+        initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
+        initial_joints: Joints whose first position was moved together.
     """
     size = space.size
     samples = int(jacobian.residuals.where.sum())
@@ -65,6 +75,8 @@ def estimate_uncertainty(jacobian: Jacobian, space: ParameterSpace, x: torch.Ten
     if len(free):
         h = hessian.numpy()[np.ix_(free, free)] * samples
         middle = _middle(jacobian, free)
+        if initial is not None:
+            middle += _from_first_sample(jacobian, free, initial, initial_joints)
         scale = 1 / np.sqrt(h.diagonal())
         values, vectors = _eigen(h * scale[:, None] * scale)
         kept = values > 1e-12
@@ -103,6 +115,31 @@ def _middle(jacobian: Jacobian, free: np.ndarray) -> np.ndarray:
             columns = jacobian.columns[[row[int(free[i])] for i in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
             total[np.ix_(own, own)] += columns @ _filtered(columns, autocovariance(error)).T
+    return total
+
+
+def _from_first_sample(
+    jacobian: Jacobian, free: np.ndarray, initial: torch.Tensor, initial_joints: Sequence[tuple[int, ...]]
+) -> np.ndarray:
+    """JᵀSSᵀJ σ², S the derivative by a joint's first position and σ² the variance of its samples' white noise."""
+    total = np.zeros((len(free), len(free)))
+    residuals, colouring = jacobian.residuals, jacobian.colouring
+    row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
+    rows = [row[entry] for entry in free.tolist()]
+    for moved, joints in zip(initial, initial_joints, strict=True):
+        for joint in joints:
+            # what a joint moves is its tree: the joints of the entries that move it and not all joints
+            tree = min((set(j) for j in colouring.joints if joint in j), key=len)
+            influenced = np.array([bool(tree & set(colouring.joints[entry])) for entry in free.tolist()])
+            for r in range(residuals.where.shape[1]):
+                at = residuals.where[:, r]
+                if int(at.sum()) < 2:
+                    continue
+                error = residuals.error[0, at, r, joint]
+                noise = 0.5 * float(error.diff().square().mean())
+                columns = jacobian.columns[rows][:, :, r, sorted(tree)]
+                effect = (columns * moved[None, :, r, sorted(tree)]).sum(dim=(1, 2)).numpy() * influenced
+                total += noise * np.outer(effect, effect)
     return total
 
 
