@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -65,6 +66,12 @@ class Parameter:
                 f"The parameter {self.name!r} has {len(self.lower)} lower and {len(self.upper)} upper bounds, "
                 f"expected {len(self.keys)} of each: {', '.join(self.keys)}."
             )
+        for key, low, high in zip(self.keys, self.lower, self.upper, strict=True):
+            if not -math.inf < low <= high < math.inf:
+                raise ValueError(
+                    f"The bounds of {self.name!r} on {key} are ({low:g}, {high:g}), expected finite numbers, "
+                    "lower <= upper."
+                )
         if self.scale == "log" and min(self.lower) <= 0:
             raise ValueError(f"The bounds of {self.name!r} must be > 0: its scale is logarithmic.")
 
