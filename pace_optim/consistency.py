@@ -11,7 +11,6 @@ import torch
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
 from pace_optim.assessment import assess
-from pace_optim.dataset import Dataset
 from pace_optim.jacobian import colour
 from pace_optim.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.parameter_space import ParameterSpace
@@ -53,20 +52,21 @@ def check_consistency(
         score: Its score [rad²].
         report: Gets a line of progress.
     """
-    trained = [r for r in range(problem.dataset.num_recordings) if bool(problem.dataset.train[:, r].any())]
+    trained = problem.dataset.trained()
+    problem = replace(problem, dataset=problem.dataset.select(trained))
     if len(trained) < 2:
         return Consistency()
     fits = []
-    for r in trained:
+    for r in range(len(trained)):
         report(f"fitting {problem.dataset.recordings[r].name} alone")
-        fits.append(_fit_from(replace(problem, dataset=one_recording(problem.dataset, r)), x)[1:])
-    names = tuple(problem.dataset.recordings[r].name for r in trained)
+        fits.append(_fit_from(replace(problem, dataset=problem.dataset.select([r])), x)[1:])
+    names = tuple(recording.name for recording in problem.dataset.recordings)
     values = torch.stack([problem.space.to_physical(alone) for alone, _ in fits]).numpy()
     std = np.stack([uncertainty.std for _, uncertainty in fits])
     sentences = _disagreements(problem.space, names, values, std)
     if sentences:
         report("trying misreported gains")
-        gains = _misreported_gains(problem, x, score, trained)
+        gains = _misreported_gains(problem, x, score)
         sentences = [*gains, *sentences]
     labels = problem.space.labels
     return Consistency(
@@ -77,23 +77,9 @@ def check_consistency(
     )
 
 
-def one_recording(dataset: Dataset, r: int) -> Dataset:
-    """A dataset of one of its recordings."""
-    return Dataset(
-        recordings=(dataset.recordings[r],),
-        command=dataset.command[:, r : r + 1],
-        measured=dataset.measured[:, r : r + 1],
-        measured_vel=dataset.measured_vel[:, r : r + 1],
-        sampled=dataset.sampled[:, r : r + 1],
-        train=dataset.train[:, r : r + 1],
-        torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[:, r : r + 1],
-        validation_only=(dataset.validation_only[r],),
-    )
-
-
 def _fit_from(problem: Problem, x: torch.Tensor) -> tuple[float, torch.Tensor, Uncertainty]:
     """Least squares from x: score, normalised result, uncertainty."""
-    evaluator = problem.evaluator()
+    evaluator = problem.training_evaluator()
     colouring = colour(problem.space, problem.trees, problem.joint_names)
     best = least_squares(evaluator, colouring, [x], _REFINE)[0]
     uncertainty, _ = assess(problem, evaluator, colouring, best.x)
@@ -141,10 +127,10 @@ def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[
     return result
 
 
-def _misreported_gains(problem: Problem, x: torch.Tensor, score: float, trained: list[int]) -> list[str]:
+def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> list[str]:
     """The recording whose gains, were they other than stated, would explain most; none if that does not pay."""
     best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
-    for r in trained:
+    for r in range(problem.dataset.num_recordings):
         extra = [_gain_parameter(problem, r, name) for name in ("stiffness", "damping")]
         space = ParameterSpace((*problem.space.parameters, *extra))
         start = torch.cat([x, torch.zeros(len(extra), dtype=torch.float64)])
@@ -160,12 +146,13 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float, trained:
     sentences = []
     for key, (value, error) in found.items():
         field_name = key.split(":")[0]
-        if abs(value) > _GAIN_SMALLEST and not abs(value) < DISAGREEMENT * error:
+        if abs(value) > _GAIN_SMALLEST and abs(value) > DISAGREEMENT * error:  # false where error is NaN: at its bound
             nominal = float(np.mean(_nominal_gain(problem, r, field_name).numpy()))
+            direction = "higher" if value > 0 else "lower"
             sentences.append(
-                f"{name} behaves as if its {field_name} were {abs(value):.0%} {'higher' if value > 0 else 'lower'} than "
-                f"stated ({nominal * (1 + value):.3g} instead of {nominal:.3g}, ± {abs(nominal) * error:.1g}): check "
-                f"the {field_name} that was in force."
+                f"{name} behaves as if its {field_name} were {abs(value):.0%} {direction} than stated "
+                f"({nominal * (1 + value):.3g} instead of {nominal:.3g}, ± {abs(nominal) * error:.1g}): check the "
+                f"{field_name} that was in force."
             )
     return sentences
 

@@ -45,6 +45,24 @@ class Dataset:
         """Where there is a sample that is not trained on, (T, R) bool."""
         return self.sampled & ~self.train
 
+    def select(self, indices: Sequence[int]) -> Dataset:
+        """Some of the recordings, by index."""
+        chosen = list(indices)
+        return Dataset(
+            recordings=tuple(self.recordings[r] for r in chosen),
+            command=self.command[:, chosen],
+            measured=self.measured[:, chosen],
+            measured_vel=self.measured_vel[:, chosen],
+            sampled=self.sampled[:, chosen],
+            train=self.train[:, chosen],
+            torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
+            validation_only=tuple(self.validation_only[r] for r in chosen),
+        )
+
+    def trained(self) -> list[int]:
+        """Indices of the recordings that have samples to train on."""
+        return self.train.any(dim=0).nonzero()[:, 0].tolist()
+
     def last_step(self, where: torch.Tensor) -> int:
         """Control steps up to and including the last true entry of a (T, R) mask."""
         steps = where.any(dim=1).nonzero()

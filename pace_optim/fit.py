@@ -125,7 +125,7 @@ class _Fit:
         self.folder = folder
         self.progress = progress
         self.history = History()
-        self.evaluator: Evaluator = problem.evaluator()
+        self.evaluator: Evaluator = problem.training_evaluator()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
         self.descents: list[Descent] = []
@@ -200,7 +200,7 @@ class _Fit:
 
     def _make_optimizer(self) -> CMAESOptimizer:
         cfg = self.problem.env_cfg.sim2real.cmaes
-        population = max(4, self.settings.num_envs // self.problem.dataset.num_recordings)
+        population = max(4, self.settings.num_envs // self.evaluator.dataset.num_recordings)
         if self.settings.optimizer == "hybrid":
             population = min(population, _HYBRID_POPULATION)
         return CMAESOptimizer(self.problem.space, population, cfg, trees=self.problem.trees, seed=self.settings.seed)
@@ -254,7 +254,7 @@ class _Fit:
     def _assess(self, outcome: Outcome) -> FitResult:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
-        uncertainty, every = assess(problem, self.evaluator, self.colouring, outcome.x)
+        uncertainty, every = assess(problem, problem.evaluator(), self.colouring, outcome.x)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
         rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}

@@ -52,8 +52,12 @@ class Problem:
         return ManagerBasedRLEnv(cfg)
 
     def evaluator(self) -> Evaluator:
-        """An evaluator of this problem's candidates."""
+        """An evaluator of candidates on all recordings."""
         return Evaluator(self.make_env, self.dataset, self.space)
+
+    def training_evaluator(self) -> Evaluator:
+        """An evaluator of candidates on the recordings that are trained on."""
+        return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space)
 
 
 def load_problem(
