@@ -105,14 +105,15 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
     scale = diagonal.clamp(min=1e-14 * float(diagonal.max()) + 1e-300).rsqrt()
     n = len(x)
     matrix = (hessian * scale[:, None] * scale[None, :]).numpy() + (damping + 1e-12) * np.eye(n)
-    lower, upper = ((-1 - x) / scale).clamp(max=0.0).numpy(), ((1 - x) / scale).clamp(min=0.0).numpy()
+    slope = gradient * scale
+    size = max(float(slope.norm()), 1e-300)  # of the problem; the solver's tolerances are absolute
+    lower = ((-1 - x) / scale / size).clamp(max=0.0).numpy()
+    upper = ((1 - x) / scale / size).clamp(min=0.0).numpy()
     result, factor = np.zeros(n), np.zeros((n, n + 7))
-    free = mujoco.mju_boxQP(
-        result, factor, None, np.ascontiguousarray(matrix), (gradient * scale).numpy(), lower, upper
-    )
+    free = mujoco.mju_boxQP(result, factor, None, np.ascontiguousarray(matrix), (slope / size).numpy(), lower, upper)
     if free < 0:
         return x.clone()
-    return (x + torch.as_tensor(result) * scale).clamp(-1.0, 1.0)
+    return (x + torch.as_tensor(result) * (size * scale)).clamp(-1.0, 1.0)
 
 
 def least_squares(
@@ -181,7 +182,7 @@ def _advance(
         descent.x, descent.score = x.clone(), score
         descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[trial] / 10.0)
     # rows of the favoured trial hold its Jacobian; it serves when that trial is where we are
-    if torch.equal(descent.x, batch[0]):
+    if torch.equal(descent.x, batch[0]) and (improved or descent.jacobian is None):
         descent.jacobian = jacobian(residuals, step, colouring)
     elif improved:
         descent.jacobian = None
