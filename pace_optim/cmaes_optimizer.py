@@ -38,6 +38,8 @@ class CMAESOptimizer:
         armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
         sim_params: Physical parameters of every environment, (num_envs, size); set by :meth:`update_simulator`.
         generation: Generations so far.
+        history: Scores of each generation, (population_size, trees) [rad²].
+        best_scores: Best score so far after each generation [rad²].
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class CMAESOptimizer:
         self.population_size = population_size
         self.generation = 0
         self.history: list[np.ndarray] = []
+        self.best_scores: list[float] = []
         self.armature_idx, self.damping_idx = space["armature"], space["viscous_friction"]
         self.friction_idx, self.bias_idx = space["friction"], space["encoder_bias"]
         self.delay_idx = space["delay"]
@@ -261,6 +264,10 @@ class CMAESOptimizer:
         self.scores = scores
         self.history.append(scores)
         self.generation += 1
+        self._update_strategies(scores)
+        self.best_scores.append(self.best_score)
+
+    def _update_strategies(self, scores: np.ndarray) -> None:
         if self._line is not None:
             winner = int(scores.sum(axis=1).argmin())
             self._consensus, self._line = self._line[winner], None

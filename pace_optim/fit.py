@@ -130,6 +130,7 @@ class _Fit:
         self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
         self.descents: list[Descent] = []
         self._steps_before = 0
+        self._search_stop: list[str] = []
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
@@ -157,29 +158,33 @@ class _Fit:
         self.history = self.folder.read_history()
         if self.optimizer is not None and checkpoint["history"].size:
             self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]))
+            self._search_stop = checkpoint["search_stop"].tolist()
         self.descents = Descent.restore(checkpoint)
 
     def _optimize(self) -> Outcome:
-        reasons: list[str] = []
-        starts = [torch.zeros(self.problem.space.size, dtype=torch.float64)]
-        if self.optimizer is not None and not self.descents:
-            starts = self._search(self.optimizer) + starts
-            reasons += self.optimizer.stop_reasons
-            if self.settings.optimizer == "cmaes":
-                return Outcome(x=self.optimizer.best, stop_reasons=reasons)
-        self.descents = least_squares(
-            self.evaluator, self.colouring, self.descents or starts, on_iteration=self._after_iteration
-        )
-        return Outcome(x=self.descents[0].x, stop_reasons=[*reasons, str(self.descents[0].stop_reason)])
+        if not self.descents:
+            starts = [torch.zeros(self.problem.space.size, dtype=torch.float64)]
+            if self.optimizer is not None:
+                starts = self._search(self.optimizer) + starts
+                self._search_stop = self.optimizer.stop_reasons
+                if self.settings.optimizer == "cmaes":
+                    return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
+            self.descents = [Descent(x=start) for start in starts]
+            self._write_checkpoint()
+        self.descents = least_squares(self.evaluator, self.colouring, self.descents, on_iteration=self._after_iteration)
+        return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
+
+    def _write_checkpoint(self) -> None:
+        self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
 
     def _search(self, optimizer: CMAESOptimizer) -> list[torch.Tensor]:
         """Run CMA-ES; for the hybrid, until refining pays. Returns starts for the refinement, the best first."""
         probe = RefiningPays(self.evaluator, self.colouring) if self.settings.optimizer == "hybrid" else None
 
         def after_generation(_: CMAESOptimizer) -> None:
-            self._after_generation(optimizer)
             if probe is not None:
                 probe(optimizer)
+            self._after_generation(optimizer)
 
         search(optimizer, self.evaluator.rollout(optimizer.population_size), after_generation)
         optimizer.close()
@@ -221,7 +226,7 @@ class _Fit:
             self.folder.write_mean(optimizer.generation, space.to_physical(optimizer.mean))
             if cfg.save_optimization_process:
                 self.folder.write_tensors("progress.pt", {k: torch.stack(v) for k, v in self._saved.items()})
-        self.folder.write_checkpoint(optimizer, [], self.steps, self.history)
+        self._write_checkpoint()
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         best = min(d.score for d in descents)
@@ -232,7 +237,7 @@ class _Fit:
         iteration = max(d.iteration for d in descents)
         self.log.log_refinement(iteration, best)
         self.progress.show("refine", iteration, LeastSquaresCfg().max_iteration, best, None, self.steps)
-        self.folder.write_checkpoint(self.optimizer, descents, self.steps, self.history)
+        self._write_checkpoint()
 
     def _best_so_far(self) -> torch.Tensor:
         known = [d for d in self.descents if np.isfinite(d.score)]

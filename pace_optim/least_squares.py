@@ -65,7 +65,8 @@ class Descent:
                 x=torch.as_tensor(x),
                 score=float(score),
                 damping=float(damping),
-                iteration=int(iteration) - (not stop),  # the Jacobian takes an iteration that was counted already
+                # the Jacobian, computed again, takes an iteration that was counted already
+                iteration=int(iteration) - (iteration > 0 and not stop),
                 stop_reason=str(stop) or None,
                 scores=history,
             )

@@ -77,7 +77,12 @@ class RunFolder:
         write_atomically(self.path / "README.txt", lambda file: file.write(text.encode()))
 
     def write_checkpoint(
-        self, optimizer: CMAESOptimizer | None, descents: Sequence[Descent], steps: int, scores: History
+        self,
+        optimizer: CMAESOptimizer | None,
+        descents: Sequence[Descent],
+        search_stop: Sequence[str],
+        steps: int,
+        scores: History,
     ) -> None:
         """The state of the search and of the refinement, as plain numbers, and the scores so far."""
         write_json(self.path / "history.json", scores.to_dict())
@@ -85,6 +90,7 @@ class RunFolder:
         arrays = {
             "history": history,
             "line_generation": np.array(optimizer.line_generation if optimizer else -1),
+            "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),
             "descent_x": np.stack([d.x.numpy() for d in descents]) if descents else np.zeros((0, 0)),
             "descent_state": np.array([[d.score, d.damping, d.iteration] for d in descents]).reshape(-1, 3),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 
@@ -52,28 +51,24 @@ class RefiningPays:
         """Keep what a trial needs."""
         self._evaluator = evaluator
         self._colouring = colouring
-        self._best: list[float] = []
         self.refined: torch.Tensor | None = None
         """Where the last trial ended, normalised (size,)."""
 
     def __call__(self, optimizer: CMAESOptimizer) -> None:
         """Look at the search after a generation; stop it where refining pays."""
-        self._best.append(optimizer.best_score)
-        if len(self._best) % _PROBE_EVERY:
+        if optimizer.generation % _PROBE_EVERY:
             return
-        before = self._evaluator.simulations
-        trial = least_squares(
-            self._evaluator,
-            self._colouring,
-            [optimizer.best],
-            replace(LeastSquaresCfg(), max_iteration=_PROBE_ITERATIONS),
-        )[0]
-        cost = self._evaluator.simulations - before
-        start = trial.scores[0]
-        refining = math.log(max(start, 1e-300) / max(trial.score, 1e-300)) / cost
-        last = self._best[-1 - _PROBE_EVERY] if len(self._best) > _PROBE_EVERY else self._best[0]
-        generations = min(_PROBE_EVERY, len(self._best) - 1)
-        searching = math.log(last / max(self._best[-1], 1e-300)) / (generations * optimizer.population_size)
+        simulations = self._evaluator.simulations
+        cfg = LeastSquaresCfg(max_iteration=_PROBE_ITERATIONS)
+        trial = least_squares(self._evaluator, self._colouring, [optimizer.best], cfg)[0]
+        refining = _gain(trial.scores[0], trial.score) / (self._evaluator.simulations - simulations)
+        best = optimizer.best_scores[-1 - _PROBE_EVERY :]
+        searching = _gain(best[0], best[-1]) / ((len(best) - 1) * optimizer.population_size)
         if refining > searching:
             self.refined = trial.x
             optimizer.stop("refining is worth more than searching")
+
+
+def _gain(before: float, after: float) -> float:
+    """How far the score fell, log(before / after)."""
+    return math.log(max(before, 1e-300) / max(after, 1e-300))
