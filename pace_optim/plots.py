@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -47,6 +48,10 @@ def plot_trajectories(
     return figures
 
 
+def _tight_layout() -> ConstrainedLayoutEngine:
+    return ConstrainedLayoutEngine(h_pad=0.02, hspace=0.0)
+
+
 def _plot_joints(
     recording: Mapping[str, Any],
     names: Sequence[str],
@@ -57,11 +62,9 @@ def _plot_joints(
     """One figure of some joints of one recording."""
     columns = min(3, len(joints))
     rows = -(-len(joints) // columns)
-    figure = make_figure(figsize=(max(9.0, 5.4 * columns), 1.1 + max(3.9, 3.1 * rows)), layout="constrained")
+    figure = make_figure(figsize=(max(9.0, 5.4 * columns), 1.1 + max(3.9, 3.1 * rows)), layout=_tight_layout())
     series = {key: np.asarray(recording[key]) for key in ("time", "des_dof_pos", "dof_pos", "sim_dof_pos", "train")}
     factor, unit = angle_unit(np.abs(series["sim_dof_pos"] - series["dof_pos"])[:, list(joints)].max(axis=0))
-    if (engine := figure.get_layout_engine()) is not None:
-        engine.set(h_pad=0.02, hspace=0.0)
     outer = figure.add_gridspec(rows, columns)
     for place, j in enumerate(joints):
         inner = outer[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2.6, 1), hspace=0.04)
@@ -119,7 +122,7 @@ def plot_scores(history: History, *, title: str = "", make_figure: Callable[...,
         title: Above everything.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
     """
-    figure = make_figure(figsize=(9.0, 5.0), layout="constrained")
+    figure = make_figure(figsize=(9.0, 5.0), layout=_tight_layout())
     axes = figure.add_subplot()
     searched, refined = len(history.search_best), len(history.refine_best)
     search = np.arange(1, searched + 1)

@@ -1,8 +1,5 @@
-"""A run as one page to look at: ``report.html``."""
+"""A run as one page to look at, ``report.html``: run folder -> :class:`RunData` -> sections -> page."""
 
-from pathlib import Path
+from .page import write_report
 
-
-def write_report(folder: Path) -> Path:
-    """Write ``report.html`` of a run's folder."""
-    return folder / "report.html"
+__all__ = ["write_report"]

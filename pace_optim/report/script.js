@@ -1,0 +1,132 @@
+"use strict";
+// Draws what the page holds: figures as plotly specifications, and the trajectories to choose from.
+(() => {
+  const CONFIG = {
+    responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    doubleClick: "reset", toImageButtonOptions: { scale: 2 },
+  };
+  const read = (element) => JSON.parse(element.querySelector('script[type="application/json"]').textContent);
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+  /** A copy in which every "var(--name)" is the style sheet's present colour. */
+  function inColor(value) {
+    if (typeof value === "string") {
+      const name = /^var\((--[a-z]+)\)$/.exec(value);
+      return name ? css(name[1]) : value;
+    }
+    if (Array.isArray(value)) return value.map(inColor);
+    if (value === null || typeof value !== "object" || ArrayBuffer.isView(value)) return value;
+    return Object.fromEntries(Object.entries(value).map(([key, entry]) => [key, inColor(entry)]));
+  }
+
+  /** A layout in the page's look: every axis quiet, everything transparent. */
+  function inStyle(layout) {
+    const axis = { gridcolor: "var(--line)", zerolinecolor: "var(--line)", linecolor: "var(--line)", automargin: true };
+    const result = {
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12.5, color: "var(--ink)" },
+      legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" },
+      hoverlabel: { bgcolor: "var(--card)", bordercolor: "var(--line)", font: { color: "var(--ink)" }, namelength: -1 },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: "var(--target)", activecolor: "var(--ink)" },
+      ...layout,
+      margin: { l: 64, r: 16, t: 34, b: 44, ...layout.margin },
+    };
+    for (const name of new Set(["xaxis", "yaxis", ...Object.keys(layout).filter((key) => /^[xy]axis\d*$/.test(key))]))
+      result[name] = { ...axis, ...layout[name] };
+    return inColor(result);
+  }
+
+  function makeFigure(element) {
+    const spec = read(element), canvas = element.querySelector(".canvas"), bar = element.querySelector(".views");
+    let shown = spec.views[0];
+    const update = (view) => {
+      shown = view;
+      for (const button of bar.children) button.setAttribute("aria-pressed", button.textContent === view.label);
+      return Plotly.update(canvas, view.trace, view.layout);
+    };
+    for (const view of spec.views) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = view.label;
+      button.addEventListener("click", () => update(view));
+      bar.append(button);
+    }
+    return async () => {
+      await Plotly.react(canvas, inColor(spec.data), inStyle(spec.layout), CONFIG);
+      if (shown) await update(shown);
+    };
+  }
+
+  function decode(text, Type) {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    return new Type(bytes.buffer);
+  }
+
+  function makeExplorer(element) {
+    const content = read(element), canvas = element.querySelector(".canvas");
+    const chosen = (name) => Number(element.querySelector(`[data-choice="${name}"] input:checked`).value);
+    const line = (name, x, y, color, more) => ({
+      type: "scatter", mode: "lines", name, x, y, line: { color, width: 1.5, ...more }, hovertemplate: "%{y:.4f} rad",
+    });
+
+    function draw() {
+      const recording = content.recordings[chosen("recording")], curve = recording.joints[chosen("joint")];
+      const time = decode(recording.time, Float32Array);
+      const x = curve.sample === null ? time : decode(curve.sample, Uint32Array).reduce((kept, sample, i) => {
+        kept[i] = time[sample];
+        return kept;
+      }, new Float32Array(decode(curve.sample, Uint32Array).length));
+      const measured = decode(curve.measured, Float32Array), error = decode(curve.error, Float32Array);
+      const data = [
+        line("target", x, decode(curve.target, Float32Array), "var(--target)", { width: 1.2 }),
+        line("measured", x, measured, "var(--measured)", { width: 2 }),
+        line("simulated", x, measured.map((value, i) => value + error[i]), "var(--simulated)", { dash: "5px,2px" }),
+        {
+          ...line("error", x, error.map((value) => value * curve.factor), "var(--simulated)", { width: 1.1 }),
+          yaxis: "y2", showlegend: false, hovertemplate: `%{y:.3g} ${curve.unit}`,
+        },
+      ];
+      if (recording.held_out.length)
+        data.push({
+          type: "bar", x: [null], y: [null], name: "kept for validation", marker: { color: "var(--held)" }, hoverinfo: "skip",
+        });
+      const title = (text) => ({ text, standoff: 8 });
+      const layout = {
+        uirevision: `recording ${chosen("recording")}`,
+        hovermode: "x unified", hoversubplots: "axis",
+        xaxis: { title: title("time [s]"), anchor: "y2", range: [x[0], x[x.length - 1]] },
+        yaxis: { title: title("position [rad]"), domain: [0.34, 1], uirevision: `joint ${chosen("joint")}` },
+        yaxis2: {
+          title: title(`error [${curve.unit}]`), domain: [0, 0.27], uirevision: `joint ${chosen("joint")}`,
+          zerolinecolor: "var(--muted)",
+        },
+        shapes: recording.held_out.map(([x0, x1]) => ({
+          type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1, layer: "below", line: { width: 0 },
+          fillcolor: "var(--held)",
+        })),
+      };
+      element.querySelector(".errors-here").textContent = curve.text;
+      return Plotly.react(canvas, inColor(data), inStyle(layout), CONFIG);
+    }
+    element.addEventListener("change", draw);
+    document.addEventListener("click", (event) => {
+      const joint = event.target.closest?.("[data-joint]")?.dataset.joint;
+      const input = element.querySelector(`[data-choice="joint"] input[value="${content.joints.indexOf(joint)}"]`);
+      if (!input) return;
+      input.checked = true;
+      draw();
+    });
+    return draw;
+  }
+
+  const drawers = [
+    ...[...document.querySelectorAll(".explorer")].map(makeExplorer),
+    ...[...document.querySelectorAll("figure.plot")].map(makeFigure),
+  ];
+  const drawAll = async () => {
+    for (const draw of drawers) await draw();
+    document.documentElement.dataset.drawn = "true";
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+  drawAll();
+})();

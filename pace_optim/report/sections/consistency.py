@@ -1,0 +1,67 @@
+"""Whether the recordings agree: what each of them says alone."""
+
+from __future__ import annotations
+
+from ..markup import Section, bullets, figure
+from ..run_data import RunData
+from ..wording import in_words, pretty_unit
+
+_CONFIDENCE = 1.96
+_COLORS = ("var(--measured)", "var(--simulated)", "var(--third)", "var(--fourth)", "var(--target)")
+
+
+def consistency(run: RunData) -> Section | None:
+    """Each parameter as each recording has it, when several were fitted."""
+    content = run.read_json("consistency.json")
+    if not content or len(content.get("recordings", [])) < 2:
+        return None
+    sentences = content.get("sentences", [])
+    names = list(dict.fromkeys(label.split("/")[0] for label in content["values"]))
+    said = bullets(sentences) if sentences else "<p>All recordings agree within their error bars.</p>"
+    return Section(
+        id="consistency",
+        title="Recordings compared",
+        lead="Every recording was fitted alone, starting at the common result. Bars span 95 %.",
+        html=said + "".join(_plot(run, content, i, name) for i, name in enumerate(names)),
+    )
+
+
+def _plot(run: RunData, content: dict, number: int, name: str) -> str:
+    labels = [label for label in content["values"] if label.split("/")[0] == name]
+    keys = [label.split("/", 1)[1] for label in labels]
+    data: list[dict] = []
+    for r, recording in enumerate(content["recordings"]):
+        std = [content["std"][label][r] for label in labels]
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": recording,
+                "x": [i + 0.5 * ((r + 0.5) / len(content["recordings"]) - 0.5) for i in range(len(keys))],
+                "y": [content["values"][label][r] for label in labels],
+                "error_y": {
+                    "type": "data",
+                    "array": [_CONFIDENCE * (s or 0.0) for s in std],
+                    "thickness": 1.5,
+                    "width": 0,
+                },
+                "marker": {
+                    "size": 7,
+                    "color": _COLORS[r % len(_COLORS)],
+                    "symbol": ["circle-open" if s is None else "circle" for s in std],
+                },
+                "text": keys,
+                "hovertemplate": "%{text} %{y:.4g}",
+            }
+        )
+    layout = {
+        "title": {
+            "text": f"{in_words(name)} [{pretty_unit(run.result.units.get(name, ''))}]",
+            "x": 0,
+            "font": {"size": 14},
+        },
+        "xaxis": {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if k == "all" else k for k in keys]},
+        "showlegend": True,
+        "margin": {"t": 40},
+    }
+    return figure(f"consistency-{number}", data, layout, height=260)

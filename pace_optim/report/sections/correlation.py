@@ -1,0 +1,93 @@
+"""Which parameters could stand in for each other."""
+
+from __future__ import annotations
+
+from ..markup import Section, bullets, figure
+from ..run_data import RunData
+from ..wording import in_words
+
+_STRONG = 0.9
+_MOST_PAIRS = 8
+_MOST_LABELS = 30
+"""With more parameters the axes name the groups alone."""
+
+
+def correlation(run: RunData) -> Section | None:
+    """The heat map of the estimates' correlation, and its strongest pairs in words."""
+    labels: list[str] = run.result.correlation.get("labels", [])
+    matrix: list[list[float | None]] = run.result.correlation.get("matrix", [])
+    if not any(value is not None for row in matrix for value in row):
+        return None
+    strong = strong_pairs(labels, matrix)
+    words = [f"{_say(a)} and {_say(b)}: {value:+.2f}" for value, a, b in strong[:_MOST_PAIRS]]
+    if len(strong) > _MOST_PAIRS:
+        words.append(f"and {len(strong) - _MOST_PAIRS} more pairs")
+    said = (
+        f"<p>Beyond ±{_STRONG:g}, so that the recording hardly tells one from the other:</p>" + bullets(words)
+        if words
+        else f"<p>No pair is beyond ±{_STRONG:g}.</p>"
+    )
+    return Section(
+        id="correlation",
+        title="Correlation",
+        lead="+1 or −1: if one parameter were off, the other would make up for it. Empty: at its bound, or without "
+        "influence.",
+        html=said + figure("correlation-map", [_heat_map(labels, matrix)], _layout(labels), height=620),
+    )
+
+
+def strong_pairs(labels: list[str], matrix: list[list[float | None]]) -> list[tuple[float, str, str]]:
+    """Pairs of labels beyond ±0.9, the strongest first, as (correlation, label, label)."""
+    pairs = [
+        (value, labels[i], labels[j])
+        for i in range(len(labels))
+        for j in range(i)
+        if (value := matrix[i][j]) is not None and abs(value) >= _STRONG
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[0]))
+
+
+def _say(label: str) -> str:
+    name, key = label.split("/", 1)
+    return in_words(name).lower() + ("" if key == "all" else f" of {key}")
+
+
+def _heat_map(labels: list[str], matrix: list[list[float | None]]) -> dict:
+    return {
+        "type": "heatmap",
+        "z": [[None if value is None else round(value, 3) for value in row] for row in matrix],
+        "zmin": -1,
+        "zmax": 1,
+        "colorscale": [[0, "var(--measured)"], [0.5, "var(--paper)"], [1, "var(--simulated)"]],
+        "colorbar": {"thickness": 12, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+        "hovertemplate": "%{y}<br>%{x}<br><b>%{z:.3f}</b><extra></extra>",
+        "x": labels,
+        "y": labels,
+        "xgap": 0.5,
+        "ygap": 0.5,
+    }
+
+
+def _layout(labels: list[str]) -> dict:
+    """Axes that name every parameter, or the groups where there are many."""
+    axis: dict = {"type": "category", "showgrid": False, "zeroline": False}
+    shapes = []
+    groups: dict[str, list[int]] = {}
+    for i, label in enumerate(labels):
+        groups.setdefault(label.split("/")[0], []).append(i)
+    if len(labels) > _MOST_LABELS:
+        axis |= {
+            "tickvals": [labels[(where[0] + where[-1]) // 2] for where in groups.values()],
+            "ticktext": [in_words(name) for name in groups],
+        }
+    for where in list(groups.values())[1:]:
+        edge = where[0] - 0.5
+        line = {"type": "line", "line": {"color": "var(--muted)", "width": 1}}
+        shapes.append(line | {"xref": "x", "yref": "paper", "x0": edge, "x1": edge, "y0": 0, "y1": 1})
+        shapes.append(line | {"yref": "y", "xref": "paper", "y0": edge, "y1": edge, "x0": 0, "x1": 1})
+    return {
+        "xaxis": axis | {"tickangle": 0 if len(labels) > _MOST_LABELS else -45},
+        "yaxis": axis | {"autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
+        "shapes": shapes,
+        "margin": {"l": 110, "b": 60},
+    }

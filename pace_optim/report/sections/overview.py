@@ -1,0 +1,123 @@
+"""What the fit is worth, in words, with everything to be warned of on top."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pace_optim.fit_result import FitResult
+from pace_optim.trajectory_errors import angle_text, angle_unit
+
+from ..markup import Section, bullets, esc
+from ..run_data import RunData
+from ..wording import duration
+
+
+def overview(run: RunData) -> Section:
+    """The head of the page."""
+    result = run.result
+    head = (
+        f'<p class="eyebrow">{esc(result.robot_name)} · {esc(result.task)} · {esc(run.folder.resolve().name)}</p>'
+        f"<h1>{esc(_headline(result))}</h1>"
+        f'<p class="lead">{esc(_verdict(run))}</p>'
+    )
+    return Section(
+        id="overview", title="Overview", html=head + _figures(result) + _warnings(result) + _errors_by_joint(result)
+    )
+
+
+def _headline(result: FitResult) -> str:
+    error = result.rmse.get("validation", {}).get("all")
+    if error is not None:
+        return f"The simulation follows the robot to {angle_text(error)} on data it was not fitted to"
+    return f"The simulation follows the robot to {angle_text(result.rmse['train']['all'])} on the data it was fitted to"
+
+
+def _verdict(run: RunData) -> str:
+    train = run.result.rmse["train"].get("all")
+    held_out = run.result.rmse.get("validation", {}).get("all")
+    sentences = ["That is the root mean square error over all joints"]
+    if held_out is not None:
+        sentences[0] += f"; on the training data it is {angle_text(train)}"
+    share = _share_of_motion(run)
+    sentences[0] += "." if share is None else f", and {_percent(share)} of how far the joints move."
+    if held_out is None:
+        sentences.append("Nothing was kept for validation, so this says little of other motions.")
+    elif train and held_out > 1.5 * train and held_out > 1e-6:
+        sentences.append("The much larger error on unseen data says that the fit does not carry over.")
+    worst, where = _worst_joint(run.result)
+    sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
+    if not run.result.warnings:
+        sentences.append(
+            "Nothing speaks against the result: no parameter is at a bound, without influence, or impossible to tell "
+            "from another."
+        )
+    return " ".join(sentences)
+
+
+def _percent(share: float) -> str:
+    return "less than 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %"
+
+
+def _share_of_motion(run: RunData) -> float | None:
+    """The error as a part of the joints' standard deviation, over all recordings."""
+    if not run.recordings:
+        return None
+    error = np.concatenate([r.error for r in run.recordings])
+    moved = np.concatenate([r.measured - r.measured.mean(axis=0) for r in run.recordings])
+    still = float(np.square(moved).mean())
+    share = float(np.square(error).mean() / still) ** 0.5 if still > 0 else np.nan
+    return share if np.isfinite(share) else None
+
+
+def _worst_joint(result: FitResult) -> tuple[str, float]:
+    errors = result.rmse.get("validation") or result.rmse["train"]
+    return max(((joint, value) for joint, value in errors.items() if joint != "all"), key=lambda item: item[1])
+
+
+def _figures(result: FitResult) -> str:
+    """The handful of numbers that everyone asks for."""
+    worst, error = _worst_joint(result)
+    figures = [
+        ("Validation", angle_text(result.rmse.get("validation", {}).get("all")), "error of all joints"),
+        ("Training", angle_text(result.rmse["train"].get("all")), "error of all joints"),
+        ("Worst joint", angle_text(error), worst),
+        ("Delay", f"{1e3 * result.delay_s:.3g} ms", f"of the {result.delay_mode}"),
+        ("Score", f"{result.score:.2e}", "rad², sum over the joints"),
+        ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
+    ]
+    cells = "".join(
+        f"<div><dt>{esc(name)}</dt><dd>{esc(value)}</dd><dd class='small'>{esc(about)}</dd></div>"
+        for name, value, about in figures
+    )
+    return f'<dl class="figures">{cells}</dl>'
+
+
+def _warnings(result: FitResult) -> str:
+    count = len(result.warnings)
+    if not count:
+        return '<div class="callout good"><h3>No warnings</h3></div>'
+    title = "1 warning" if count == 1 else f"{count} warnings"
+    return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{bullets(result.warnings)}</div>'
+
+
+def _errors_by_joint(result: FitResult) -> str:
+    """A row of bars per joint; a click shows its curves."""
+    parts = [(name, result.rmse[name]) for name in ("train", "validation") if result.rmse.get(name)]
+    every = [value for _, errors in parts for joint, value in errors.items() if joint != "all"]
+    factor, unit = angle_unit(every)
+    largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
+    rows = []
+    for joint in result.joint_names:
+        bars = "".join(
+            f'<div class="bar {name}"><i style="width:{100 * errors[joint] / largest:.1f}%"></i>'
+            f"<span>{factor * errors[joint]:.3g}</span></div>"
+            for name, errors in parts
+        )
+        rows.append(
+            f'<a class="error" href="#trajectories" data-joint="{esc(joint)}"><b>{esc(joint)}</b><div>{bars}</div></a>'
+        )
+    key = "".join(
+        f'<span class="key {name}">{ {"train": "training", "validation": "validation"}[name] }</span>'
+        for name, _ in parts
+    )
+    return f'<h3>Error of each joint [{esc(unit)}] {key}</h3><div class="errors">{"".join(rows)}</div>'

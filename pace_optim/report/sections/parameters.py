@@ -1,0 +1,140 @@
+"""The identified values, their error bars and where they are between their bounds."""
+
+from __future__ import annotations
+
+import math
+
+from ..markup import Section, esc, table
+from ..run_data import RunData
+from ..wording import in_words, pretty_unit, value_and_error
+
+_CONFIDENCE = 1.96
+"""Standard deviations on either side that hold the value with 95 % probability."""
+_WIDTH, _HEIGHT, _INSET = 240, 20, 6
+
+
+def parameters(run: RunData) -> Section:
+    """A table per parameter; those of the whole robot share one."""
+    result = run.result
+    shared = [name for name, values in result.parameters.items() if set(values) == {"all"}]
+    cards = [_card(run, name) for name in result.parameters if name not in shared]
+    if shared:
+        rows = [_row(run, name, "all", in_words(name), pretty_unit(result.units[name]), None) for name in shared]
+        note = (
+            f"<p>The delay is that of the <b>{esc(result.delay_mode)}</b>: "
+            f"{1e3 * result.delay_s:.4g} ms at a control step of {1e3 * result.control_dt:g} ms.</p>"
+            if "delay" in shared
+            else ""
+        )
+        head = ["", "value", "± std", "unit", "between its bounds", ""]
+        cards.append(f"<article><h3>The whole robot</h3>{table(head, rows, 'values')}{note}</article>")
+    return Section(
+        id="parameters",
+        title="Parameters",
+        lead="Bars span 1.96 standard deviations to either side (95 %). They know of noise and of the residuals' "
+        "correlation in time, not of physics that the model lacks.",
+        html=f'<div class="cards">{"".join(cards)}</div>',
+    )
+
+
+def _card(run: RunData, name: str) -> str:
+    """One parameter of all joints: a table whose rows are also a plot."""
+    values, std = run.result.parameters[name], run.result.std.get(name, {})
+    ends = [v + side * _CONFIDENCE * (std.get(key) or 0.0) for key, v in values.items() for side in (-1, 1)]
+    low, high = _padded(min(ends), max(ends), run, name)
+    rows = [_row(run, name, key, key, "", (low, high)) for key in values]
+    rows.append(["", "", "", _axis(low, high), "", ""])
+    head = ["joint", "value", "± std", "value and 95 % interval", "between its bounds", ""]
+    unit = pretty_unit(run.result.units.get(name, ""))
+    return f"<article><h3>{esc(in_words(name))} <small>{esc(unit)}</small></h3>{table(head, rows, 'values')}</article>"
+
+
+def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, float]:
+    """The plot's range; intervals much wider than the bounds are cut, and a single value gets some room."""
+    own = [bound for label, bound in run.bounds.items() if label.split("/")[0] == name]
+    if own:
+        lower, upper = min(b[0] for b in own), max(b[1] for b in own)
+        low, high = max(low, lower - (upper - lower) / 4), min(high, upper + (upper - lower) / 4)
+    room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+    if high - low < 1e-3 * abs(high):  # all alike to many digits: do not blow up nothing
+        room = 0.05 * abs(high)
+    return low - room, high + room
+
+
+def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None) -> list[str]:
+    value, std = run.result.parameters[name][key], run.result.std.get(name, {}).get(key)
+    label = f"{name}/{key}"
+    text, error = value_and_error(value, std)
+    plot = esc(unit) if span is None else _interval(value, std, *span)
+    return [f"<b>{esc(title)}</b>", text, error, plot, _between(run, label, value), _flags(run, label, value)]
+
+
+def _x(value: float, low: float, high: float) -> float:
+    share = min(max((value - low) / (high - low), 0.0), 1.0)
+    return round(_INSET + share * (_WIDTH - 2 * _INSET), 1)
+
+
+def _interval(value: float, std: float | None, low: float, high: float) -> str:
+    """A dot with its whiskers, to the scale that the table's last row shows; hollow where there is no error bar."""
+    middle, x = _HEIGHT / 2, _x(value, low, high)
+    parts = [f'<line class="base" x1="0" x2="{_WIDTH}" y1="{middle}" y2="{middle}"/>']
+    if low < 0 < high:
+        parts.append(f'<line class="zero" x1="{_x(0, low, high)}" x2="{_x(0, low, high)}" y1="0" y2="{_HEIGHT}"/>')
+    if std is not None:
+        a, b = (_x(value + side * _CONFIDENCE * std, low, high) for side in (-1, 1))
+        parts.append(f'<line class="whisker" x1="{a}" x2="{b}" y1="{middle}" y2="{middle}"/>')
+    parts.append(f'<circle class="{"unknown" if std is None else "dot"}" cx="{x}" cy="{middle}" r="3.5"/>')
+    return _svg("".join(parts))
+
+
+def _axis(low: float, high: float) -> str:
+    """The scale of a table's plots."""
+    parts = []
+    for tick in nice_ticks(low, high):
+        x = _x(tick, low, high)
+        anchor = "start" if x < 20 else "end" if x > _WIDTH - 20 else "middle"
+        parts.append(f'<line class="base" x1="{x}" x2="{x}" y1="0" y2="4"/>')
+        parts.append(f'<text x="{x}" y="16" text-anchor="{anchor}">{tick:.6g}</text>')
+    return _svg("".join(parts))
+
+
+def _svg(content: str) -> str:
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" aria-hidden="true">{content}</svg>'
+    )
+
+
+def nice_ticks(low: float, high: float, most: int = 4) -> list[float]:
+    """Round numbers between two others, at most ``most`` and a few."""
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= raw)
+    first = math.ceil(low / step)
+    return [i * step for i in range(first, math.floor(high / step) + 1)]
+
+
+def _between(run: RunData, label: str, value: float) -> str:
+    """A small bar from the lower to the upper bound."""
+    if label not in run.bounds:
+        return ""
+    low, high = run.bounds[label]
+    share = (value - low) / (high - low) if high > low else 0.5
+    css = " hit" if label in run.result.at_bound else ""
+    return (
+        f'<span class="range{css}"><small>{low:g}</small><span class="track">'
+        f'<i style="left:{100 * min(max(share, 0.0), 1.0):.1f}%"></i></span><small>{high:g}</small></span>'
+    )
+
+
+def _flags(run: RunData, label: str, value: float) -> str:
+    result, flags = run.result, []
+    if label in result.at_bound:
+        low, high = run.bounds.get(label, (value, value))
+        flags.append("at its lower bound" if value - low < high - value else "at its upper bound")
+    if label in result.no_influence:
+        flags.append("no influence")
+    for group in result.indistinguishable:
+        if label in group:
+            others = [in_words(other.split("/")[0]).lower() for other in group if other != label]
+            flags.append("cannot be told from " + " and ".join(dict.fromkeys(others)))
+    return "".join(f'<span class="flag">{esc(flag)}</span>' for flag in flags)

@@ -1,0 +1,59 @@
+"""How the score fell, by search and by refinement."""
+
+from __future__ import annotations
+
+from ..markup import Section, figure
+from ..run_data import RunData
+
+
+def scores(run: RunData) -> Section | None:
+    """The score over iterations, simulated steps or time."""
+    history = run.history
+    if history is None or not (history.search_best or history.refine_best):
+        return None
+    searched, refined = len(history.search_best), len(history.refine_best)
+    search, refine = list(range(1, searched + 1)), list(range(searched + 1, searched + refined + 1))
+    axes = {
+        "Iterations": (search, refine, "generations of the search, then iterations of the refinement"),
+        "Simulated steps": (history.search_steps, history.refine_steps, "simulated steps"),
+        "Time": (history.search_time_s, history.refine_time_s, "time [s]"),
+    }
+    curves = [
+        ("search, mean of the generation", history.search_mean, "var(--target)", True),
+        ("search, best so far", history.search_best, "var(--measured)", True),
+        ("refinement, best", history.refine_best, "var(--simulated)", False),
+    ]
+    curves = [curve for curve in curves if curve[1]]
+    mode = "lines+markers" if searched + refined < 80 else "lines"
+    data = [
+        {
+            "type": "scatter",
+            "mode": mode,
+            "name": name,
+            "x": search if is_search else refine,
+            "y": values,
+            "line": {"color": color, "width": 2},
+            "marker": {"size": 5},
+            "hovertemplate": "%{y:.3e} rad²",
+        }
+        for name, values, color, is_search in curves
+    ]
+    views = [
+        {
+            "label": label,
+            "trace": {"x": [xs if is_search else xr for *_, is_search in curves]},
+            "layout": {"xaxis.title.text": title, "xaxis.autorange": True},
+        }
+        for label, (xs, xr, title) in axes.items()
+    ]
+    layout = {
+        "xaxis": {"title": {"text": axes["Iterations"][2]}},
+        "yaxis": {"type": "log", "exponentformat": "power", "title": {"text": "score [rad²]"}},
+        "hovermode": "x unified",
+    }
+    return Section(
+        id="scores",
+        title="Score",
+        lead="Mean over the training samples of the squared error, summed over the joints.",
+        html=figure("score", data, layout, views=views),
+    )

@@ -1,0 +1,108 @@
+"""What was commanded, measured and simulated: one joint of one recording at a time, error underneath."""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+
+from pace_optim.trajectory_errors import angle_text, angle_unit, held_out_spans, rms
+
+from ..markup import Section, esc, json_script
+from ..run_data import RecordingData, RunData
+
+_SAMPLES_ON_PAGE = 160_000
+"""Of all joints and recordings together; each takes some 19 bytes of the page."""
+_FEWEST_PER_CURVE = 1200
+_MOST_PER_CURVE = 20_000
+
+
+def trajectories(run: RunData) -> Section | None:
+    """Curves to choose from."""
+    if not run.recordings:
+        return None
+    per_curve = _SAMPLES_ON_PAGE // (len(run.recordings) * len(run.joint_names))
+    per_curve = min(max(per_curve, _FEWEST_PER_CURVE), _MOST_PER_CURVE)
+    content = {
+        "joints": list(run.joint_names),
+        "recordings": [_encode(recording, per_curve) for recording in run.recordings],
+    }
+    return Section(
+        id="trajectories",
+        title="Trajectories",
+        lead="Drag to zoom, double click to see all. The zoom stays when the joint changes.",
+        html=(
+            f'<div class="explorer">{_choice("recording", [r.name for r in run.recordings])}'
+            f"{_choice('joint', run.joint_names)}"
+            f'<p class="errors-here"></p><div class="canvas" style="height:540px"></div>{json_script(content)}</div>'
+        ),
+    )
+
+
+def _choice(name: str, entries: list[str] | tuple[str, ...]) -> str:
+    """Radio buttons that look like pills: arrow keys go from one to the next."""
+    pills = "".join(
+        f'<label><input type="radio" name="{name}" value="{i}"{" checked" if i == 0 else ""}><span>{esc(entry)}</span>'
+        "</label>"
+        for i, entry in enumerate(entries)
+    )
+    hidden = " hidden" if len(entries) == 1 and name == "recording" else ""
+    return (
+        f'<fieldset class="pills" data-choice="{name}"{hidden}><legend>{name.capitalize()}</legend>{pills}</fieldset>'
+    )
+
+
+def _encode(recording: RecordingData, per_curve: int) -> dict:
+    """One recording for the page's script: numbers as base64 of little-endian arrays."""
+    time = recording.time - recording.time[0]
+    return {
+        "name": recording.name,
+        "time": _base64(time, "<f4"),
+        "held_out": held_out_spans(time, recording.train),
+        "joints": [_encode_joint(recording, j, per_curve) for j in range(recording.measured.shape[1])],
+    }
+
+
+def _encode_joint(recording: RecordingData, j: int, per_curve: int) -> dict:
+    target, measured, error = recording.target[:, j], recording.measured[:, j], recording.error[:, j]
+    kept = samples_to_draw((error, measured, target), per_curve)
+    factor, unit = angle_unit([float(np.abs(error).max(initial=0.0))])
+    train, held_out = rms(error[recording.train]), rms(error[~recording.train])
+    parts = [("training", train), ("validation", held_out)]
+    return {
+        "sample": None if len(kept) == len(error) else _base64(kept, "<u4"),
+        "target": _base64(target[kept].round(6), "<f4"),
+        "measured": _base64(measured[kept].round(6), "<f4"),
+        "error": _base64(error[kept], "<f4"),
+        "factor": factor,
+        "unit": unit,
+        "text": "Error: " + ", ".join(f"{angle_text(value)} in {name}" for name, value in parts if value is not None),
+    }
+
+
+def samples_to_draw(curves: tuple[np.ndarray, ...], most: int) -> np.ndarray:
+    """Which of K samples keep the look of curves: the lowest and highest of each in every stretch, and both ends.
+
+    Args:
+        curves: Each (K,).
+        most: About how many samples to keep.
+
+    Returns:
+        Sorted indices; all of them if there are no more than ``most``.
+    """
+    count = len(curves[0])
+    if count <= most:
+        return np.arange(count)
+    stretches = max(1, most // (2 * len(curves)))
+    width = -(-count // stretches)
+    grid = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
+    rows = np.arange(len(grid))
+    kept = [np.array([0, count - 1])]
+    for curve in curves:
+        values = np.nan_to_num(curve)[grid]
+        kept += [grid[rows, values.argmin(axis=1)], grid[rows, values.argmax(axis=1)]]
+    return np.unique(np.concatenate(kept))
+
+
+def _base64(values: np.ndarray, dtype: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode()
