@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,29 +21,57 @@ def assess(
     problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
 ) -> tuple[Uncertainty, Residuals]:
     """Error bars at x from the training samples, and x's residuals on all samples."""
-    neighbours, step = perturbed(x, colouring)
-    data, n = problem.dataset, len(problem.joint_names)
-    shaken = _initial_joints(problem)
-    vectors = torch.cat([x[None], neighbours, x.repeat(len(shaken), 1)])
-    offset = torch.zeros(len(vectors), n, dtype=torch.float64)
-    for row, joints in zip(offset[1 + len(neighbours) :], shaken, strict=True):
-        row[list(joints)] = _INITIAL_STEP
-    every = evaluator.residuals(problem.space.to_physical(vectors), data.sampled, offset)
+    data, probes = problem.dataset, make_probes(x, colouring, problem.trees, problem.joint_names)
+    every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
     train = data.train[every.step]
     steps = train.any(dim=1)
     trained = Residuals(
         error=every.error[:, steps] * train[steps][None, :, :, None], where=train[steps], step=every.step[steps]
     )
-    initial = (trained.error[1 + len(neighbours) :] - trained.error[:1]) / _INITIAL_STEP
-    uncertainty = estimate_uncertainty(jacobian(trained, step, colouring), problem.space, x, initial, shaken)
+    initial = probes.initial(trained.error)
+    there = jacobian(trained, probes.step, colouring)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints)
     return uncertainty, Residuals(error=every.error[:1], where=every.where, step=every.step)
 
 
-def _initial_joints(problem: Problem) -> list[tuple[int, ...]]:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Probes:
+    """The simulations that say how the residuals depend on the parameters and on the first positions."""
+
+    vectors: torch.Tensor
+    """Normalised: x, the colours' perturbed vectors, then x once per set of joints, (m, size)."""
+    offset: torch.Tensor
+    """Added to the first positions, (m, n) [rad]."""
+    step: torch.Tensor
+    """Signed step of every entry, (size,)."""
+    initial_joints: tuple[tuple[int, ...], ...]
     """Joints whose first position is moved together: the i-th of each tree."""
-    index = {name: i for i, name in enumerate(problem.joint_names)}
-    depth = max(len(tree) for tree in problem.trees)
-    return [tuple(index[tree[i]] for tree in problem.trees if i < len(tree)) for i in range(depth)]
+
+    def initial(self, error: torch.Tensor) -> torch.Tensor:
+        """Derivatives by the first positions of ``initial_joints``, (sets, …), of residuals (m, …)."""
+        return (error[-len(self.initial_joints) :] - error[:1]) / _INITIAL_STEP
+
+
+def make_probes(
+    x: torch.Tensor, colouring: Colouring, trees: Sequence[Sequence[str]], joint_names: Sequence[str]
+) -> Probes:
+    """What to simulate for the error bars at x.
+
+    Args:
+        x: Normalised vector, (size,).
+        colouring: Which entries are perturbed together.
+        trees: Groups of joints that do not influence each other.
+        joint_names: All joints, in order.
+    """
+    neighbours, step = perturbed(x, colouring)
+    index = {name: i for i, name in enumerate(joint_names)}
+    depth = max(len(tree) for tree in trees)
+    shaken = tuple(tuple(index[tree[i]] for tree in trees if i < len(tree)) for i in range(depth))
+    vectors = torch.cat([x[None], neighbours, x.repeat(len(shaken), 1)])
+    offset = torch.zeros(len(vectors), len(joint_names), dtype=torch.float64)
+    for row, joints in zip(offset[-len(shaken) :], shaken, strict=True):
+        row[list(joints)] = _INITIAL_STEP
+    return Probes(vectors=vectors, offset=offset, step=step, initial_joints=shaken)
 
 
 def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:

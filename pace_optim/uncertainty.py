@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim.jacobian import Jacobian
+from pace_optim.jacobian import Colouring, Jacobian
 from pace_optim.parameter_space import ParameterSpace
 
 AT_BOUND = 1e-3
@@ -61,10 +61,30 @@ def estimate_uncertainty(
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
     """
-    size = space.size
+    everything = np.arange(space.size)
     samples = int(jacobian.residuals.where.sum())
     hessian, _ = jacobian.normal_equations()
-    whole_range = 2 * hessian.diagonal().clamp(min=0).sqrt().numpy()
+    middle = _middle(jacobian, everything)
+    if initial is not None:
+        middle += _from_first_sample(jacobian, everything, initial, initial_joints)
+    return uncertainty_of(hessian.numpy() * samples, middle, samples, jacobian.colouring, space, x)
+
+
+def uncertainty_of(
+    hessian: np.ndarray, middle: np.ndarray, samples: int, colouring: Colouring, space: ParameterSpace, x: torch.Tensor
+) -> Uncertainty:
+    """Error bars from the two matrices of the sandwich C = H⁻¹ (Jᵀ Σ J) H⁻¹.
+
+    Args:
+        hessian: H = JᵀJ, normalised (size, size) [rad²].
+        middle: JᵀΣJ, normalised (size, size) [rad⁴].
+        samples: Number of samples.
+        colouring: Which joints each entry moves.
+        space: The parameters.
+        x: The optimum, normalised (size,).
+    """
+    size = space.size
+    whole_range = 2 * np.sqrt(np.clip(hessian.diagonal(), 0, None) / samples)
     position = x.numpy()
     fixed = (space.upper <= space.lower).numpy()
     bound = (np.abs(position) > 1 - AT_BOUND) & ~fixed
@@ -73,29 +93,26 @@ def estimate_uncertainty(
     std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
     groups: list[tuple[str, ...]] = []
     if len(free):
-        h = hessian.numpy()[np.ix_(free, free)] * samples
-        middle = _middle(jacobian, free)
-        if initial is not None:
-            middle += _from_first_sample(jacobian, free, initial, initial_joints)
+        h = hessian[np.ix_(free, free)]
         scale = 1 / np.sqrt(h.diagonal())
         values, vectors = _eigen(h * scale[:, None] * scale)
         kept = values > 1e-12
         inverse = (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
-        covariance = inverse @ middle @ inverse * samples / max(1, samples - len(free))
+        covariance = inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
         normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
         std[free] = normalised * space.slope(x).numpy()[free]
         outer = np.where(normalised > 0, normalised, 1.0)
         correlation[np.ix_(free, free)] = covariance / outer[:, None] / outer
-        for members in _trees(jacobian, free):
+        for members in _trees(colouring, free):
             for group in _weak_directions(h[np.ix_(members, members)], normalised[members], free[members], space):
                 if group not in groups:
                     groups.append(group)
-    labels = np.asarray(space.labels)
+    labels = space.labels
     return Uncertainty(
         std=std,
         correlation=correlation,
-        at_bound=tuple(labels[bound]),
-        no_influence=tuple(labels[silent]),
+        at_bound=tuple(labels[i] for i in np.flatnonzero(bound)),
+        no_influence=tuple(labels[i] for i in np.flatnonzero(silent)),
         indistinguishable=tuple(groups),
     )
 
@@ -168,9 +185,9 @@ def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return signal.fftconvolve(columns, kernel[None, :], mode="same", axes=1) if len(kernel) > 1 else columns * kernel
 
 
-def _trees(jacobian: Jacobian, free: np.ndarray) -> list[list[int]]:
+def _trees(colouring: Colouring, free: np.ndarray) -> list[list[int]]:
     """Positions in ``free`` of the entries that move the same joints, each with those that move all joints."""
-    joints = [jacobian.colouring.joints[entry] for entry in free.tolist()]
+    joints = [colouring.joints[entry] for entry in free.tolist()]
     widest = max(len(moved) for moved in joints)
     parts = sorted({moved for moved in joints if len(moved) < widest}) or [joints[0]]
     return [[i for i, moved in enumerate(joints) if moved == part or len(moved) == widest] for part in parts]
