@@ -126,6 +126,7 @@ class _Fit:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
+        self.assessor: Evaluator = problem.evaluator()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
         self.descents: list[Descent] = []
@@ -137,11 +138,12 @@ class _Fit:
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        return self._steps_before + self.evaluator.simulated_steps
+        return self._steps_before + self.evaluator.simulated_steps + self.assessor.simulated_steps
 
     def run(self) -> tuple[FitResult, Path]:
         """Search, refine, assess, write."""
         try:
+            self._write_checkpoint()  # so that a run can be resumed from its first moment
             outcome = self._optimize()
         except KeyboardInterrupt:  # keep the best so far; --resume goes on from the checkpoint
             outcome = Outcome(x=self._best_so_far(), stop_reasons=["interrupted"])
@@ -177,6 +179,9 @@ class _Fit:
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
 
+    def _write_mean(self, optimizer: CMAESOptimizer) -> None:
+        self.folder.write_mean(optimizer.generation, self.problem.space.to_physical(optimizer.mean))
+
     def _search(self, optimizer: CMAESOptimizer) -> list[torch.Tensor]:
         """Run CMA-ES; for the hybrid, until refining pays. Returns starts for the refinement, the best first."""
         probe = RefiningPays(self.evaluator, self.colouring) if self.settings.optimizer == "hybrid" else None
@@ -188,6 +193,7 @@ class _Fit:
 
         search(optimizer, self.evaluator.rollout(optimizer.population_size), after_generation)
         optimizer.close()
+        self._write_mean(optimizer)
         best = optimizer.best if probe is None or probe.refined is None else probe.refined
         return [best, *self._other_valleys(optimizer.best)]
 
@@ -211,7 +217,7 @@ class _Fit:
         return CMAESOptimizer(self.problem.space, population, cfg, trees=self.problem.trees, seed=self.settings.seed)
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
-        cfg, space, history = optimizer.cfg, self.problem.space, self.history
+        cfg, history = optimizer.cfg, self.history
         history.search_best.append(optimizer.best_score)
         history.search_mean.append(float(optimizer.scores.sum(axis=1).mean()))
         history.search_steps.append(self.steps)
@@ -223,7 +229,7 @@ class _Fit:
             self._saved["params"].append(optimizer.candidates)
             self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
         if optimizer.generation % cfg.save_interval == 0:
-            self.folder.write_mean(optimizer.generation, space.to_physical(optimizer.mean))
+            self._write_mean(optimizer)
             if cfg.save_optimization_process:
                 self.folder.write_tensors("progress.pt", {k: torch.stack(v) for k, v in self._saved.items()})
         self._write_checkpoint()
@@ -259,7 +265,7 @@ class _Fit:
     def _assess(self, outcome: Outcome) -> FitResult:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
-        uncertainty, every = assess(problem, problem.evaluator(), self.colouring, outcome.x)
+        uncertainty, every = assess(problem, self.assessor, self.colouring, outcome.x)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
         rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}

@@ -107,7 +107,7 @@ class RunFolder:
         """
         path = self.path / "checkpoint.npz"
         if not path.is_file():
-            raise ValueError(f"{self.path} has no checkpoint.npz: it was stopped before its first generation ended.")
+            raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. Start a new fit.")
         with np.load(path, allow_pickle=False) as content:
             return {key: content[key] for key in content.files}
 
