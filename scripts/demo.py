@@ -1,5 +1,6 @@
 """Record ANYmal D in simulation with known drives, identify them, and compare."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
+from pace_optim.history import History
+from pace_optim.plots import plot_scores, plot_trajectories
 
 TASK = "Pace-AnymalD-v0"
 RANGES = {
@@ -65,6 +68,16 @@ def verdict(result: FitResult, truth: dict[str, float]) -> str:
     )
 
 
+def draw(run: Path) -> list[Path]:
+    """Measured, simulated and target of every joint, and the score over the iterations, as PNG."""
+    figures = plot_trajectories(torch.load(run / "best_trajectory.pt", weights_only=True), title="ANYmal D")
+    figures["score"] = plot_scores(History(**json.loads((run / "history.json").read_text())), title="ANYmal D")
+    paths = [run / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        figure.savefig(path, dpi=100)
+    return paths
+
+
 def main() -> None:
     parser = make_parser(__doc__, example="scripts/demo.py --seed 1")
     parser.add_argument("--seed", type=int, default=0, help="of the true parameters, the noise and the search")
@@ -99,9 +112,10 @@ def main() -> None:
         f"{1e3 * result.rmse['validation']['all']:.3f} mrad."
     )
     print(f"{result.simulated_steps / 1e6:.1f} M simulated steps in {result.wall_time_s:.0f} s.\n")
-    print(f"recording: {collection.plots[0]}")
-    print(f"report:    {run / 'report.html'}")
-    print(f"run:       {run}")
+    for plot in (*collection.plots, *draw(run)):
+        print(f"plot:   {plot}")
+    print(f"report: {run / 'report.html'}")
+    print(f"run:    {run}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ MY_ARM_JOINTS = ("shoulder", "elbow")
 
 
 def servo_cfg(
-    duty_per_rad: float, volts: float, torque_per_amp: float, ohms: float, duty_limit: float = 1.0
+    duty_per_rad: float, volts: float, torque_per_amp: float, ohms: float, largest_amps: float | None = None
 ) -> PaceDCMotorCfg:
     """The drive of a servo that turns a position error into a duty cycle.
 
@@ -24,15 +24,16 @@ def servo_cfg(
         volts: Supply voltage V.
         torque_per_amp: kt at the output shaft, gear included [N m/A].
         ohms: Resistance of the winding R.
-        duty_limit: Largest duty.
+        largest_amps: Current limit of the driver [A]; ``None`` if there is none.
     """
+    stall = volts * torque_per_amp / ohms
     return PaceDCMotorCfg(
         joint_names_expr=".*",
         stiffness=duty_per_rad * volts * torque_per_amp / ohms,
         damping=torque_per_amp**2 / ohms,
-        saturation_effort=duty_limit * volts * torque_per_amp / ohms,
-        effort_limit=duty_limit * volts * torque_per_amp / ohms,
-        velocity_limit=duty_limit * volts / torque_per_amp,
+        saturation_effort=stall,
+        effort_limit=2 * stall if largest_amps is None else torque_per_amp * largest_amps,
+        velocity_limit=volts / torque_per_amp,
         max_delay=10.0,
     )
 
