@@ -2,8 +2,8 @@
 // Draws what the page holds: figures as plotly specifications, and the trajectories to choose from.
 (() => {
   const CONFIG = {
-    responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
-    doubleClick: "reset", toImageButtonOptions: { scale: 2 },
+    responsive: true, displaylogo: false, doubleClick: "reset", toImageButtonOptions: { scale: 2 },
+    modeBarButtons: [["toImage"], ["zoom2d", "pan2d"], ["resetScale2d"]],
   };
   const read = (element) => JSON.parse(element.querySelector('script[type="application/json"]').textContent);
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -31,8 +31,10 @@
       ...layout,
       margin: { l: 64, r: 16, t: 34, b: 44, ...layout.margin },
     };
-    for (const name of new Set(["xaxis", "yaxis", ...Object.keys(layout).filter((key) => /^[xy]axis\d*$/.test(key))]))
+    for (const name of new Set(["xaxis", "yaxis", ...Object.keys(layout).filter((key) => /^[xy]axis\d*$/.test(key))])) {
       result[name] = { ...axis, ...layout[name] };
+      if (result[name].title) result[name].title = { font: { size: 13 }, standoff: 8, ...result[name].title };
+    }
     return inColor(result);
   }
 
@@ -90,7 +92,7 @@
         data.push({
           type: "bar", x: [null], y: [null], name: "kept for validation", marker: { color: "var(--held)" }, hoverinfo: "skip",
         });
-      const title = (text) => ({ text, standoff: 8 });
+      const title = (text) => ({ text });
       const layout = {
         uirevision: `recording ${chosen("recording")}`,
         hovermode: "x unified", hoversubplots: "axis",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..markup import Section, bullets, figure
+from ..markup import Section, bullets, esc, figure
 from ..run_data import RunData
 from ..wording import in_words, pretty_unit
 
@@ -17,7 +17,11 @@ def consistency(run: RunData) -> Section | None:
         return None
     sentences = content.get("sentences", [])
     names = list(dict.fromkeys(label.split("/")[0] for label in content["values"]))
-    said = bullets(sentences) if sentences else "<p>All recordings agree within their error bars.</p>"
+    said = (
+        bullets([pretty_unit(text) for text in sentences])
+        if sentences
+        else "<p>All recordings agree within their error bars.</p>"
+    )
     return Section(
         id="consistency",
         title="Recordings compared",
@@ -54,14 +58,7 @@ def _plot(run: RunData, content: dict, number: int, name: str) -> str:
                 "hovertemplate": "%{text} %{y:.4g}",
             }
         )
-    layout = {
-        "title": {
-            "text": f"{in_words(name)} [{pretty_unit(run.result.units.get(name, ''))}]",
-            "x": 0,
-            "font": {"size": 14},
-        },
-        "xaxis": {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if k == "all" else k for k in keys]},
-        "showlegend": True,
-        "margin": {"t": 40},
-    }
-    return figure(f"consistency-{number}", data, layout, height=260)
+    ticks = {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if key == "all" else key for key in keys]}
+    layout = {"xaxis": {"range": [-0.5, len(keys) - 0.5], "zeroline": False} | ticks, "showlegend": True}
+    heading = f"<h3>{esc(in_words(name))} <small>{esc(pretty_unit(run.result.units.get(name, '')))}</small></h3>"
+    return heading + figure(f"consistency-{number}", data, layout, height=240)

@@ -7,7 +7,7 @@ from ..run_data import RunData
 from ..wording import in_words
 
 _STRONG = 0.9
-_MOST_PAIRS = 8
+_MOST_SENTENCES = 8
 _MOST_LABELS = 30
 """With more parameters the axes name the groups alone."""
 
@@ -18,10 +18,9 @@ def correlation(run: RunData) -> Section | None:
     matrix: list[list[float | None]] = run.result.correlation.get("matrix", [])
     if not any(value is not None for row in matrix for value in row):
         return None
-    strong = strong_pairs(labels, matrix)
-    words = [f"{_say(a)} and {_say(b)}: {value:+.2f}" for value, a, b in strong[:_MOST_PAIRS]]
-    if len(strong) > _MOST_PAIRS:
-        words.append(f"and {len(strong) - _MOST_PAIRS} more pairs")
+    words = _in_sentences(strong_pairs(labels, matrix), labels)
+    if len(words) > _MOST_SENTENCES:
+        words = [*words[:_MOST_SENTENCES], f"and {len(words) - _MOST_SENTENCES} more"]
     said = (
         f"<p>Beyond ±{_STRONG:g}, so that the recording hardly tells one from the other:</p>" + bullets(words)
         if words
@@ -47,6 +46,32 @@ def strong_pairs(labels: list[str], matrix: list[list[float | None]]) -> list[tu
     return sorted(pairs, key=lambda pair: -abs(pair[0]))
 
 
+def _in_sentences(pairs: list[tuple[float, str, str]], labels: list[str]) -> list[str]:
+    """Pairs in words; the same two parameters of one joint are said once for all joints."""
+    groups: dict[tuple[str, ...], list[tuple[float, str]]] = {}
+    for value, a, b in pairs:
+        (name_a, key_a), (name_b, key_b) = a.split("/", 1), b.split("/", 1)
+        same = key_a == key_b != "all"
+        groups.setdefault((name_a, name_b) if same else (a, b, "each its own"), []).append((value, key_a))
+    sentences = []
+    for names, found in groups.items():
+        values = [f"{value:+.2f}".replace("-", "−") for value, _ in found]
+        if len(names) == 3:
+            sentences.append(f"{_say(names[0])} and {_say(names[1])}: {values[0]}")
+            continue
+        said = " and ".join(in_words(name).lower() for name in names)
+        range_ = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
+        sentences.append(f"{said} of {_listed(found, labels)}: {range_}")
+    return [sentence[:1].upper() + sentence[1:] for sentence in sentences]
+
+
+def _listed(found: list[tuple[float, str]], labels: list[str]) -> str:
+    """Joints in their order, or that it is all of them."""
+    joints = [key for key in dict.fromkeys(label.split("/", 1)[1] for label in labels) if key != "all"]
+    named = {key for _, key in found}
+    return "every joint" if len(joints) == len(named) > 1 else ", ".join(key for key in joints if key in named)
+
+
 def _say(label: str) -> str:
     name, key = label.split("/", 1)
     return in_words(name).lower() + ("" if key == "all" else f" of {key}")
@@ -70,7 +95,7 @@ def _heat_map(labels: list[str], matrix: list[list[float | None]]) -> dict:
 
 def _layout(labels: list[str]) -> dict:
     """Axes that name every parameter, or the groups where there are many."""
-    axis: dict = {"type": "category", "showgrid": False, "zeroline": False}
+    axis: dict = {"type": "category", "showgrid": False, "zeroline": False, "constrain": "domain"}
     shapes = []
     groups: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
@@ -83,11 +108,12 @@ def _layout(labels: list[str]) -> dict:
     for where in list(groups.values())[1:]:
         edge = where[0] - 0.5
         line = {"type": "line", "line": {"color": "var(--muted)", "width": 1}}
-        shapes.append(line | {"xref": "x", "yref": "paper", "x0": edge, "x1": edge, "y0": 0, "y1": 1})
-        shapes.append(line | {"yref": "y", "xref": "paper", "y0": edge, "y1": edge, "x0": 0, "x1": 1})
+        shapes.append(line | {"y0": -0.5, "y1": len(labels) - 0.5, "x0": edge, "x1": edge})
+        shapes.append(line | {"x0": -0.5, "x1": len(labels) - 0.5, "y0": edge, "y1": edge})
     return {
         "xaxis": axis | {"tickangle": 0 if len(labels) > _MOST_LABELS else -45},
-        "yaxis": axis | {"autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
+        "yaxis": axis | {"autorange": "reversed", "scaleanchor": "x"},
         "shapes": shapes,
+        "plot_bgcolor": "var(--wash)",
         "margin": {"l": 110, "b": 60},
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pace_optim.fit_result import FitResult
@@ -9,7 +11,7 @@ from pace_optim.trajectory_errors import angle_text, angle_unit
 
 from ..markup import Section, bullets, esc
 from ..run_data import RunData
-from ..wording import duration
+from ..wording import duration, pretty_unit
 
 
 def overview(run: RunData) -> Section:
@@ -35,15 +37,15 @@ def _headline(result: FitResult) -> str:
 def _verdict(run: RunData) -> str:
     train = run.result.rmse["train"].get("all")
     held_out = run.result.rmse.get("validation", {}).get("all")
-    sentences = ["That is the root mean square error over all joints"]
-    if held_out is not None:
-        sentences[0] += f"; on the training data it is {angle_text(train)}"
-    share = _share_of_motion(run)
-    sentences[0] += "." if share is None else f", and {_percent(share)} of how far the joints move."
+    share = _share_of_motion(run, held_out is not None)
+    part = "" if share is None else f", {_percent(share)} of how far they move"
+    sentences = [f"That is the root mean square over all joints{part}."]
     if held_out is None:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
-    elif train and held_out > 1.5 * train and held_out > 1e-6:
-        sentences.append("The much larger error on unseen data says that the fit does not carry over.")
+    else:
+        sentences.append(f"On the data it was fitted to, it is {angle_text(train)}.")
+        if train and held_out > 1.5 * train and held_out > 1e-6:
+            sentences.append("So much more on unseen data says that the fit does not carry over.")
     worst, where = _worst_joint(run.result)
     sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
     if not run.result.warnings:
@@ -58,15 +60,17 @@ def _percent(share: float) -> str:
     return "less than 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %"
 
 
-def _share_of_motion(run: RunData) -> float | None:
-    """The error as a part of the joints' standard deviation, over all recordings."""
-    if not run.recordings:
-        return None
-    error = np.concatenate([r.error for r in run.recordings])
-    moved = np.concatenate([r.measured - r.measured.mean(axis=0) for r in run.recordings])
-    still = float(np.square(moved).mean())
-    share = float(np.square(error).mean() / still) ** 0.5 if still > 0 else np.nan
-    return share if np.isfinite(share) else None
+def _share_of_motion(run: RunData, held_out: bool) -> float | None:
+    """The error as a part of the joints' standard deviation, on what was held out or on what was trained on."""
+    error, moved = 0.0, 0.0
+    for recording in run.recordings:
+        where = recording.train != held_out
+        if where.any():
+            measured = recording.measured[where]
+            error += float(np.square(recording.error[where]).sum())
+            moved += float(np.square(measured - measured.mean(axis=0)).sum())
+    share = (error / moved) ** 0.5 if moved > 0 else math.nan
+    return share if math.isfinite(share) else None
 
 
 def _worst_joint(result: FitResult) -> tuple[str, float]:
@@ -97,7 +101,13 @@ def _warnings(result: FitResult) -> str:
     if not count:
         return '<div class="callout good"><h3>No warnings</h3></div>'
     title = "1 warning" if count == 1 else f"{count} warnings"
-    return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{bullets(result.warnings)}</div>'
+    said = bullets([_sentence(text) for text in result.warnings])
+    return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{said}</div>'
+
+
+def _sentence(text: str) -> str:
+    text = pretty_unit(text)
+    return text[:1].upper() + text[1:]
 
 
 def _errors_by_joint(result: FitResult) -> str:
@@ -110,7 +120,7 @@ def _errors_by_joint(result: FitResult) -> str:
     for joint in result.joint_names:
         bars = "".join(
             f'<div class="bar {name}"><i style="width:{100 * errors[joint] / largest:.1f}%"></i>'
-            f"<span>{factor * errors[joint]:.3g}</span></div>"
+            f"<span>{factor * errors[joint]:#.3g}</span></div>"
             for name, errors in parts
         )
         rows.append(

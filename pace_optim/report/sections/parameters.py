@@ -10,7 +10,7 @@ from ..wording import in_words, pretty_unit, value_and_error
 
 _CONFIDENCE = 1.96
 """Standard deviations on either side that hold the value with 95 % probability."""
-_WIDTH, _HEIGHT, _INSET = 240, 20, 6
+_WIDTH, _HEIGHT, _INSET = 360, 20, 6
 
 
 def parameters(run: RunData) -> Section:

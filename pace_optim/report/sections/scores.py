@@ -48,7 +48,7 @@ def scores(run: RunData) -> Section | None:
     ]
     layout = {
         "xaxis": {"title": {"text": axes["Iterations"][2]}},
-        "yaxis": {"type": "log", "exponentformat": "power", "title": {"text": "score [rad²]"}},
+        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": "score [rad²]"}},
         "hovermode": "x unified",
     }
     return Section(

@@ -48,7 +48,8 @@ def _choice(name: str, entries: list[str] | tuple[str, ...]) -> str:
     )
     hidden = " hidden" if len(entries) == 1 and name == "recording" else ""
     return (
-        f'<fieldset class="pills" data-choice="{name}"{hidden}><legend>{name.capitalize()}</legend>{pills}</fieldset>'
+        f'<div class="pills" role="radiogroup" aria-label="{name}" data-choice="{name}"{hidden}>'
+        f"<b>{name.capitalize()}</b><div>{pills}</div></div>"
     )
 
 
