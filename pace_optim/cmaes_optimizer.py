@@ -147,7 +147,16 @@ class CMAESOptimizer:
         return self.candidates
 
     def update_simulator(self, rollout: Rollout) -> None:
-        """Write the generation to the simulation and start its rollout."""
+        """Write the generation to the simulation and start its rollout.
+
+        Raises:
+            ValueError: If the rollout is of another number of candidates.
+        """
+        if rollout.num_candidates != self.population_size:
+            raise ValueError(
+                f"There are {self.population_size} candidates in a generation, but the rollout simulates "
+                f"{rollout.num_candidates}. Take evaluator.rollout(optimizer.population_size)."
+            )
         rollout.start(self.candidates, per_joint=self._per_joint_copies())
         self.sim_params = rollout.physical
         self.scores_buffer = torch.zeros(rollout.env.num_envs, len(self.joint_names), dtype=torch.float64)
@@ -170,10 +179,15 @@ class CMAESOptimizer:
                 joins all joints (with ``cfg.per_tree = False``, or a robot of one tree).
 
         Raises:
-            ValueError: If the error joins all joints but the search is split.
+            ValueError: If the error joins all joints but the search is split, or has another shape.
         """
         if self.scores_buffer is None:
             raise ValueError("There is no rollout to score. Call update_simulator first.")
+        if error.shape not in (self.scores_buffer.shape, self.scores_buffer.shape[:1]):
+            raise ValueError(
+                f"The error has shape {tuple(error.shape)}, expected {tuple(self.scores_buffer.shape)} (environments, "
+                f"joints) or {tuple(self.scores_buffer.shape[:1])}."
+            )
         if error.ndim == 1:
             if len(self.strategies) > 1:
                 raise ValueError(
@@ -191,6 +205,7 @@ class CMAESOptimizer:
         per_joint = self.scores_buffer.view(self.population_size, -1, len(self.joint_names)).sum(dim=1)
         scores = torch.zeros(self.population_size, len(self.strategies), dtype=torch.float64)
         scores.index_add_(1, self._joint_group, per_joint)
+        self.scores_buffer = None  # the next generation needs a rollout of its own
         self._learn(scores.nan_to_num(nan=DIVERGED_SCORE).clamp(max=DIVERGED_SCORE).numpy())
 
     def finished(self) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from pace_actuators import PaceDCMotorCfg
-from pace_envs import ArticulationCfg, ManagerBasedRLEnv, load_env_cfg
+from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_env_cfg
 from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.pace_cfg import make_bounds
 from pace_optim.dataset import make_dataset
@@ -20,6 +20,8 @@ from pace_optim.kinematic_trees import independent_trees
 from pace_optim.parameter_space import ParameterSpace
 from pace_optim.problem import Problem
 from pace_optim.recording import Drive, Load, Recording, conform_recording
+
+torch.set_num_threads(1)  # small tensors
 
 BENCH = "Pace-TestBench-v0"
 ANYMAL = "Pace-AnymalD-v0"
@@ -55,6 +57,7 @@ def env_cfg(task: str | Callable[[], PaceSim2realEnvCfg] = BENCH, **changes: Any
     cfg = load_env_cfg(task) if isinstance(task, str) else task()
     for name, value in changes.items():
         setattr(cfg.sim2real, name, value)
+    cfg.sim.num_threads = 1  # small batches
     return cfg
 
 
@@ -211,6 +214,7 @@ def pendulums_cfg(folder: Path, more: str = "", **cmaes: Any) -> PaceSim2realEnv
         max_delay=10.0,
     )
     return PaceSim2realEnvCfg(
+        sim=SimulationCfg(num_threads=1),
         scene=PaceSim2realSceneCfg(robot=ArticulationCfg(mjcf_path=path, actuators={"all": drive}, fix_base=True)),
         sim2real=PaceCfg(
             robot_name="pendulums",
