@@ -13,6 +13,8 @@ from ..markup import Section, bullets, esc
 from ..run_data import RunData
 from ..wording import duration, pretty_unit
 
+_STOPPED_EARLY = ("max_iteration", "interrupted")
+
 
 def overview(run: RunData) -> Section:
     """The head of the page."""
@@ -46,13 +48,12 @@ def _verdict(run: RunData) -> str:
         sentences.append(f"On the data it was fitted to, it is {angle_text(train)}.")
         if train and held_out > 1.5 * train and held_out > 1e-6:
             sentences.append("So much more on unseen data says that the fit does not carry over.")
-    worst, where = _worst_joint(run.result)
-    sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
-    if not run.result.warnings:
-        sentences.append(
-            "Nothing speaks against the result: no parameter is at a bound, without influence, or impossible to tell "
-            "from another."
-        )
+    if len(run.result.joint_names) > 1:
+        worst, where = _worst_joint(run.result)
+        sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
+    last = run.result.stop_reasons[-1] if run.result.stop_reasons else ""
+    if last.startswith(_STOPPED_EARLY):
+        sentences.append(f"The fit was stopped before it had converged ({last}): going on may lower the error.")
     return " ".join(sentences)
 
 
@@ -99,7 +100,8 @@ def _figures(result: FitResult) -> str:
 def _warnings(result: FitResult) -> str:
     count = len(result.warnings)
     if not count:
-        return '<div class="callout good"><h3>No warnings</h3></div>'
+        text = "No parameter is at a bound, without influence, or impossible to tell from another."
+        return f'<div class="callout good"><h3>No warnings</h3><p>{text}</p></div>'
     title = "1 warning" if count == 1 else f"{count} warnings"
     said = bullets([_sentence(text) for text in result.warnings])
     return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{said}</div>'
