@@ -1,0 +1,228 @@
+"""Error bars: closed forms for linear problems, coverage on the bench, and what cannot be known said in words."""
+
+import numpy as np
+import pytest
+import torch
+from problems import TRUTH, chirp, env_cfg, make_problem, normalised, physical, record
+
+from pace_envs.tasks.pace import Parameter
+from pace_optim.assessment import assess
+from pace_optim.evaluator import Residuals
+from pace_optim.jacobian import Colouring, Jacobian, colour
+from pace_optim.least_squares import least_squares
+from pace_optim.parameter_space import ParameterSpace
+from pace_optim.uncertainty import autocovariance, estimate_uncertainty
+
+
+def linear(columns, error, names=None):
+    """A linear problem of one joint: residuals' derivatives (entries, T), residuals (T,), bounds ±1."""
+    names = names or [f"p{i}" for i in range(len(columns))]
+    count = len(names)
+    space = ParameterSpace(
+        [
+            Parameter(name=n, unit="1", lower=(-1.0,), upper=(1.0,), apply=lambda env, v: None, keys=("j",))
+            for n in names
+        ]
+    )
+    shaped = torch.as_tensor(np.asarray(columns))[:, :, None, None]
+    where = torch.ones(len(error), 1, dtype=torch.bool)
+    residuals = Residuals(error=torch.as_tensor(error)[None, :, None, None], where=where, step=torch.arange(len(error)))
+    colouring = Colouring(colours=tuple((i,) for i in range(count)), joints=((0,),) * count)
+    return Jacobian(residuals=residuals, columns=shaped, colouring=colouring), space
+
+
+def ar1(phi, count, rng, sigma=1e-3):
+    white = sigma * rng.standard_normal(count + 500)
+    series = np.zeros_like(white)
+    for k in range(1, len(white)):
+        series[k] = phi * series[k - 1] + white[k]
+    return series[500:]
+
+
+# ---------------------------------------------------------------- closed forms
+
+
+def test_white_noise_gives_the_classic_covariance():
+    rng = np.random.default_rng(0)
+    columns, sigma = rng.standard_normal((3, 4000)), 2e-3
+    columns[1] += 0.8 * columns[0]
+    jacobian, space = linear(columns, sigma * rng.standard_normal(4000))
+    found = estimate_uncertainty(jacobian, space, torch.zeros(3, dtype=torch.float64))
+    covariance = sigma**2 * np.linalg.inv(columns @ columns.T)
+    std = np.sqrt(covariance.diagonal())
+    assert found.std == pytest.approx(std, rel=0.1)
+    assert found.correlation == pytest.approx(covariance / std[:, None] / std, abs=0.1)
+    assert (found.at_bound, found.no_influence, found.indistinguishable) == ((), (), ())
+
+
+def test_the_degrees_of_freedom_that_the_parameters_take_are_given_back():
+    rng, ratio = np.random.default_rng(1), []
+    for _ in range(200):
+        columns = rng.standard_normal((10, 40))
+        noise = rng.standard_normal(40)
+        left = noise - columns.T @ np.linalg.solve(columns @ columns.T, columns @ noise)  # residuals of the fit
+        jacobian, space = linear(columns, left)
+        found = estimate_uncertainty(jacobian, space, torch.zeros(10, dtype=torch.float64))
+        ratio.append((found.std**2 / np.linalg.inv(columns @ columns.T).diagonal()).mean())
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.9, -0.5])
+def test_autocorrelated_noise_widens_a_constants_error_bar_by_the_known_factor(phi):
+    rng, found, count = np.random.default_rng(2), [], 20000
+    for _ in range(10):
+        error = ar1(phi, count, rng)
+        jacobian, space = linear(np.ones((1, count)), error)
+        std = estimate_uncertainty(jacobian, space, torch.zeros(1, dtype=torch.float64)).std[0]
+        found.append(std / (error.std() / np.sqrt(count)))
+    assert np.mean(found) == pytest.approx(np.sqrt((1 + phi) / (1 - phi)), rel=0.1)
+
+
+@pytest.mark.parametrize("omega", [0.05, 0.5, 2.0])
+def test_a_sine_regressor_feels_the_noise_at_its_own_frequency(omega):
+    rng, found, count, phi = np.random.default_rng(3), [], 20000, 0.8
+    for _ in range(10):
+        error = ar1(phi, count, rng)
+        jacobian, space = linear(np.sin(omega * np.arange(count))[None], error)
+        std = estimate_uncertainty(jacobian, space, torch.zeros(1, dtype=torch.float64)).std[0]
+        found.append(std / np.sqrt(2 * error.var() / count))
+    power = (1 - phi**2) / (1 - 2 * phi * np.cos(omega) + phi**2)  # spectrum of AR(1) over its variance
+    assert np.mean(found) == pytest.approx(np.sqrt(power), rel=0.15)
+
+
+def test_the_autocovariance_is_that_of_the_process_and_vanishes_for_white_noise():
+    rng = np.random.default_rng(4)
+    found = autocovariance(ar1(0.8, 50000, rng))
+    variance = 1e-6 / (1 - 0.64)
+    assert found[:4] == pytest.approx(variance * 0.8 ** np.arange(4), rel=0.1)
+    white = autocovariance(rng.standard_normal(50000))
+    assert white[0] == pytest.approx(1.0, rel=0.05) and len(white) < 50
+    assert autocovariance(np.zeros(100)).tolist() == [0.0]
+
+
+def test_no_noise_no_error_bars():
+    rng = np.random.default_rng(5)
+    jacobian, space = linear(rng.standard_normal((2, 500)), np.zeros(500))
+    found = estimate_uncertainty(jacobian, space, torch.zeros(2, dtype=torch.float64))
+    assert found.std.tolist() == [0.0, 0.0] and not np.isnan(found.correlation).any()
+
+
+def test_error_bars_are_in_physical_units_on_both_scales():
+    rng = np.random.default_rng(6)
+    columns, error = rng.standard_normal((2, 4000)), 1e-3 * rng.standard_normal(4000)
+    jacobian, plain = linear(columns, error)
+    parameters = [
+        Parameter(name="a", unit="1", lower=(0.0,), upper=(10.0,), apply=lambda e, v: None, keys=("j",)),
+        Parameter(name="b", unit="1", lower=(0.1,), upper=(10.0,), apply=lambda e, v: None, keys=("j",), scale="log"),
+    ]
+    x = torch.tensor([0.3, 0.0], dtype=torch.float64)
+    normal = estimate_uncertainty(jacobian, plain, x).std
+    found = estimate_uncertainty(jacobian, ParameterSpace(parameters), x).std
+    # dp/dx is half the width, and on a logarithmic scale p times half the logarithm's width (p = 1 in the middle)
+    assert found == pytest.approx(normal * [5.0, np.log(10.0)], rel=1e-9)
+
+
+# ---------------------------------------------------------------- what cannot be known
+
+
+def test_parameters_that_do_the_same_are_named_together():
+    rng = np.random.default_rng(7)
+    base = rng.standard_normal((3, 800))
+    columns = np.stack([base[0], 2.0 * base[0], base[1], base[2]])
+    jacobian, space = linear(columns, 1e-3 * rng.standard_normal(800), ["bias", "friction", "armature", "delay"])
+    found = estimate_uncertainty(jacobian, space, torch.zeros(4, dtype=torch.float64))
+    assert found.indistinguishable == (("bias/j", "friction/j"),)
+
+
+def test_a_pair_that_is_nearly_alike_is_named_when_the_noise_hides_the_difference_and_only_then():
+    rng = np.random.default_rng(8)
+    base, other = rng.standard_normal((2, 800))
+    columns = np.stack([base, base + 0.01 * other])
+    for sigma, expected in ((0.3, (("bias/j", "friction/j"),)), (1e-4, ())):
+        jacobian, space = linear(columns, sigma * rng.standard_normal(800), ["bias", "friction"])
+        found = estimate_uncertainty(jacobian, space, torch.zeros(2, dtype=torch.float64))
+        assert found.indistinguishable == expected
+    assert found.correlation[0, 1] < -0.99
+
+
+def test_a_parameter_without_influence_is_named_and_has_no_error_bar():
+    rng = np.random.default_rng(9)
+    columns = rng.standard_normal((3, 500))
+    columns[1] = 1e-9
+    jacobian, space = linear(columns, 1e-3 * rng.standard_normal(500))
+    found = estimate_uncertainty(jacobian, space, torch.zeros(3, dtype=torch.float64))
+    assert found.no_influence == ("p1/j",)
+    assert np.isnan(found.std).tolist() == [False, True, False]
+    assert np.isnan(found.correlation[1]).all() and not np.isnan(found.correlation[0, 2])
+
+
+def test_a_parameter_at_its_bound_is_named_has_no_error_bar_and_narrows_the_others():
+    rng = np.random.default_rng(10)
+    columns = rng.standard_normal((2, 3000))
+    columns[1] += columns[0]
+    jacobian, space = linear(columns, 1e-3 * rng.standard_normal(3000))
+    inside = estimate_uncertainty(jacobian, space, torch.tensor([0.2, 0.3], dtype=torch.float64))
+    found = estimate_uncertainty(jacobian, space, torch.tensor([0.2, 1.0], dtype=torch.float64))
+    assert found.at_bound == ("p1/j",) and np.isnan(found.std[1])
+    assert found.std[0] == pytest.approx(1e-3 / np.linalg.norm(columns[0]), rel=0.1)
+    assert found.std[0] < 0.8 * inside.std[0]
+
+
+def test_everything_at_its_bound_is_survived():
+    rng = np.random.default_rng(11)
+    jacobian, space = linear(rng.standard_normal((2, 500)), rng.standard_normal(500))
+    found = estimate_uncertainty(jacobian, space, torch.tensor([1.0, -1.0], dtype=torch.float64))
+    assert found.at_bound == ("p0/j", "p1/j") and np.isnan(found.std).all()
+
+
+# ---------------------------------------------------------------- in the simulation
+
+
+def assessed(problem, x):
+    return assess(problem, problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names), x)
+
+
+def test_a_drive_that_is_off_hides_the_delay():
+    off = np.zeros(401, dtype=bool)
+    problem = make_problem(record(torque_enable=off, noise=1e-4))
+    uncertainty, _ = assessed(problem, normalised(problem))
+    assert "delay/all" in uncertainty.no_influence
+
+
+def test_a_slow_move_in_one_direction_cannot_tell_bias_from_friction():
+    ramp = (0.002 * np.minimum(np.arange(401), 400) / 400 + 0.3)[:, None]
+    problem = make_problem(record(ramp, noise=1e-4))
+    uncertainty, _ = assessed(problem, normalised(problem))
+    together = {label for group in uncertainty.indistinguishable for label in group}
+    assert {"friction/servo", "encoder_bias/servo"} <= together
+    moving = make_problem(record(noise=1e-4))
+    uncertainty, _ = assessed(moving, normalised(moving))
+    assert uncertainty.indistinguishable == ()
+
+
+def test_a_parameter_held_fixed_by_its_bounds_is_neither_at_a_bound_nor_without_influence():
+    bounds = env_cfg().sim2real.bounds_params.clone()
+    bounds[2] = 0.3
+    cfg = env_cfg(bounds_params=bounds)
+    problem = make_problem(record(noise=1e-4, cfg=cfg), cfg=cfg)
+    uncertainty, _ = assessed(problem, normalised(problem))
+    assert np.isnan(uncertainty.std).tolist() == [False, False, True, False, False]
+    assert uncertainty.at_bound == uncertainty.no_influence == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [1e-4])
+def test_the_truth_is_inside_the_95_percent_interval_in_90_to_99_percent_of_cases(noise):
+    clean = record(chirp(1.5))
+    inside = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        noisy = clean.dof_pos + noise * rng.standard_normal(clean.dof_pos.shape)
+        problem = make_problem([type(clean)(**{**vars(clean), "dof_pos": noisy})])
+        evaluator = problem.evaluator()
+        colouring = colour(problem.space, problem.trees, problem.joint_names)
+        best = least_squares(evaluator, colouring, [normalised(problem)])[0]
+        uncertainty, _ = assess(problem, evaluator, colouring, best.x)
+        error = (problem.space.to_physical(best.x) - physical(problem, TRUTH)).numpy()
+        inside += (np.abs(error) < 1.96 * uncertainty.std).tolist()
+    assert 0.90 <= np.mean(inside) <= 0.99
