@@ -96,28 +96,30 @@ def critical_delay(inertia: float, viscous_friction: float, stiffness: float, da
 
 
 def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
-    """Only a delay of the whole torque lies inside the loop."""
+    """Only a delay of the whole torque lies inside the loop, whose gains and load are each recording's own."""
     if problem.delay_mode != "effort":
         return []
-    env = problem.make_env(1)
-    robot, space = env.scene["robot"], problem.space
-    space.apply(env, physical[None])
-    env.sim.forward()
-    model = env.sim.batch.get_model(0)
-    inertia = torch.as_tensor(model.dof_M0)[robot.dof_columns].tolist()
+    rollout, space = problem.evaluator().rollout(1), problem.space
+    rollout.start(physical[None])
+    robot, sim = rollout.robot, rollout.env.sim
+    sim.forward()
     delay_s = float(physical[space["delay"]]) * problem.control_dt
-    result = []
-    for actuator in robot.actuators.values():
-        for column, name in enumerate(actuator.joint_names):
-            j = robot.joint_names.index(name)
-            viscous = float(physical[space["viscous_friction"]][j])
-            kp, kd = float(actuator.stiffness[0, column]), float(actuator.damping[0, column])
-            limit = critical_delay(inertia[j], viscous, kp, kd)
-            if delay_s > limit:
-                result.append(
-                    f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of {name}'s control loop "
-                    f"({1e3 * limit:.1f} ms): the simulation oscillates by itself. Lower the delay's bound, or use "
-                    "--delay_mode command."
-                )
-    env.close()
-    return result
+    viscous = physical[space["viscous_friction"]].tolist()
+    shortest: dict[str, float] = {}
+    for r in range(problem.dataset.num_recordings):
+        inertia = torch.as_tensor(sim.batch.get_model(r).dof_M0)[robot.dof_columns].tolist()
+        for actuator in robot.actuators.values():
+            for column, name in enumerate(actuator.joint_names):
+                j = robot.joint_names.index(name)
+                kp, kd = float(actuator.stiffness[r, column]), float(actuator.damping[r, column])
+                limit = critical_delay(inertia[j], viscous[j], kp, kd)
+                shortest[name] = min(limit, shortest.get(name, math.inf))
+    rollout.env.close()
+    beyond = [f"{name} ({1e3 * limit:.1f} ms)" for name, limit in shortest.items() if delay_s > limit]
+    if not beyond:
+        return []
+    return [
+        f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of the control loop of "
+        f"{_listed(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
+        "--delay_mode command."
+    ]
