@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -252,12 +252,18 @@ class CMAESOptimizer:
         """Make :meth:`finished` true."""
         self._stopped = [reason]
 
-    def restore(self, history: Sequence[np.ndarray], line_generation: int = -1) -> None:
+    def restore(
+        self,
+        history: Sequence[np.ndarray],
+        line_generation: int = -1,
+        after_generation: Callable[[CMAESOptimizer], None] | None = None,
+    ) -> None:
         """Bring a fresh optimizer to where another one, of the same seed and settings, was.
 
         Args:
             history: The other one's ``history``: scores of each generation, (population_size, trees).
             line_generation: The other one's ``line_generation``.
+            after_generation: Called after each generation.
 
         Raises:
             ValueError: If the history does not fit.
@@ -272,6 +278,8 @@ class CMAESOptimizer:
                 )
             self.ask()
             self._learn(np.asarray(scores))
+            if after_generation is not None:
+                after_generation(self)
 
     # ------------------------------------------------------------------ inside
 

@@ -18,9 +18,10 @@ from pace_optim.fit_settings import FitSettings
 from pace_optim.fit_warnings import fit_warnings
 from pace_optim.history import History
 from pace_optim.jacobian import colour
-from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.least_squares import Descent, LeastSquaresCfg
 from pace_optim.problem import Problem, file_digest, load_problem
 from pace_optim.progress import ProgressLine
+from pace_optim.refine import refine
 from pace_optim.report import write_report
 from pace_optim.run_folder import RunFolder
 from pace_optim.search import RefiningPays, search
@@ -159,7 +160,7 @@ class _Fit:
         self._steps_before = int(checkpoint["simulated_steps"])
         self.history = self.folder.read_history()
         if self.optimizer is not None and checkpoint["history"].size:
-            self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]))
+            self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process)
             self._search_stop = checkpoint["search_stop"].tolist()
         self.descents = Descent.restore(checkpoint)
 
@@ -173,7 +174,7 @@ class _Fit:
                     return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
             self.descents = [Descent(x=start) for start in starts]
             self._write_checkpoint()
-        self.descents = least_squares(self.evaluator, self.colouring, self.descents, on_iteration=self._after_iteration)
+        self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
 
     def _write_checkpoint(self) -> None:
@@ -191,6 +192,8 @@ class _Fit:
                 probe(optimizer)
             self._after_generation(optimizer)
 
+        if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
+            probe(optimizer)
         search(optimizer, self.evaluator.rollout(optimizer.population_size), after_generation)
         optimizer.close()
         self._write_mean(optimizer)
@@ -225,14 +228,17 @@ class _Fit:
         self.log.log_generation(optimizer)
         spread = float(optimizer.spread.max())
         self.progress.show("search", optimizer.generation, cfg.max_iteration, optimizer.best_score, spread, self.steps)
-        if cfg.save_optimization_process:
-            self._saved["params"].append(optimizer.candidates)
-            self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
+        self._keep_process(optimizer)
         if optimizer.generation % cfg.save_interval == 0:
             self._write_mean(optimizer)
             if cfg.save_optimization_process:
                 self.folder.write_tensors("progress.pt", {k: torch.stack(v) for k, v in self._saved.items()})
         self._write_checkpoint()
+
+    def _keep_process(self, optimizer: CMAESOptimizer) -> None:
+        if optimizer.cfg.save_optimization_process:
+            self._saved["params"].append(optimizer.candidates)
+            self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         best = min(d.score for d in descents)
