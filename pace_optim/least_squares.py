@@ -13,7 +13,8 @@ import torch
 from pace_optim.evaluator import Evaluator, Residuals
 from pace_optim.jacobian import Colouring, Jacobian, jacobian, perturbed
 
-_DAMPING_TRIALS = (1.0, 10.0, 100.0, 1e3, 1e5)
+_DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
+_STALLED = 3
 _SMALLEST_DAMPING = 1e-9
 
 
@@ -54,6 +55,8 @@ class Descent:
     """At x; ``None`` until it is known."""
     stop_reason: str | None = None
     iteration: int = 0
+    stalled: int = 0
+    """Iterations in a row that gained next to nothing."""
     scores: list[float] = field(default_factory=list)
 
     @classmethod
@@ -83,6 +86,14 @@ class Descent:
         return torch.stack(
             [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in _DAMPING_TRIALS]
         )
+
+    def expected_gain(self, x: torch.Tensor) -> float:
+        """How much lower the linear model has the score at x, -(2 gᵀd + dᵀHd) with d the step to x [rad²]."""
+        if self.jacobian is None:
+            return np.inf
+        hessian, gradient = self.jacobian.normal_equations()
+        move = x - self.x
+        return -float(2 * gradient @ move + move @ hessian @ move)
 
 
 def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor, damping: float) -> torch.Tensor:
@@ -123,6 +134,7 @@ def least_squares(
     starts: Sequence[torch.Tensor | Descent],
     cfg: LeastSquaresCfg | None = None,
     on_iteration: Callable[[list[Descent]], None] | None = None,
+    where: torch.Tensor | None = None,
 ) -> list[Descent]:
     """Refine starts to the nearest minimum of the score.
 
@@ -135,6 +147,7 @@ def least_squares(
         starts: Normalised vectors, (size,), or descents to go on with.
         cfg: Settings.
         on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
+        where: Which samples count, (T, R) bool; ``None`` means those to train on.
 
     Returns:
         The descents, the best first.
@@ -148,7 +161,7 @@ def least_squares(
             neighbours, step = perturbed(trials[0], colouring)
             batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
             steps.append(step)
-        every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)))
+        every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)), where)
         start = 0
         for descent, batch, step in zip(running, batches, steps, strict=True):
             part = Residuals(error=every.error[start : start + len(batch)], where=every.where, step=every.step)
@@ -168,38 +181,47 @@ def _advance(
     colouring: Colouring,
     cfg: LeastSquaresCfg,
 ) -> None:
-    """Take the best trial, or raise the damping; say when it is time to stop."""
-    scores = residuals.score
-    columns = len(colouring.colours)
-    rows = [0, *range(1 + columns, len(batch))]
-    trial = int(torch.stack([scores[row] for row in rows]).argmin())
-    score, x = float(scores[rows[trial]]), batch[rows[trial]]
+    """Look around where the descent is, or take the best trial; say when it is time to stop.
+
+    Args:
+        descent: Changed in place.
+        batch: Normalised vectors: the favoured trial, its neighbours, the other trials.
+        residuals: Theirs.
+        step: The neighbours' signed steps.
+        colouring: Which entries were perturbed together.
+        cfg: Settings.
+    """
     descent.iteration += 1
-    first = descent.jacobian is None and not np.isfinite(descent.score)
-    improved = score < descent.score
-    if improved:
-        moved, gain = float((x - descent.x).abs().max()), descent.score - score
-        before = descent.score
-        descent.x, descent.score = x.clone(), score
-        descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[trial] / 10.0)
-    # rows of the favoured trial hold its Jacobian; it serves when that trial is where we are
-    if torch.equal(descent.x, batch[0]) and (improved or descent.jacobian is None):
+    scores = residuals.score
+    if descent.jacobian is None:  # the only trial is x itself
+        if not np.isfinite(descent.score):
+            descent.score = float(scores[0])
         descent.jacobian = jacobian(residuals, step, colouring)
-    elif improved:
-        descent.jacobian = None
     else:
-        descent.damping *= 1e3
+        rows = [0, *range(1 + len(colouring.colours), len(batch))]
+        best = int(scores[rows].argmin())
+        gain = descent.score - float(scores[rows[best]])
+        expected = descent.expected_gain(batch[0])
+        descent.stalled = 0 if gain > cfg.score_tolerance * descent.score else descent.stalled + 1
+        if gain > 0:
+            moved = float((batch[rows[best]] - descent.x).abs().max())
+            descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
+            descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[best] / 10.0)
+            # the favoured trial's neighbours were simulated beside it
+            descent.jacobian = jacobian(residuals, step, colouring) if best == 0 else None
+            if moved < cfg.step_tolerance:
+                descent.stop_reason = "converged"
+        else:
+            descent.damping *= 1e3
+        if expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED:
+            descent.stop_reason = "converged"
     descent.scores.append(descent.score)
     if descent.score <= cfg.target_score:
         descent.stop_reason = f"score below {cfg.target_score:g}"
-    elif descent.iteration >= cfg.max_iteration:
-        descent.stop_reason = f"max_iteration {cfg.max_iteration}"
     elif not np.isfinite(descent.score):
         descent.stop_reason = "diverged at its start"
-    elif improved and not first and (gain < cfg.score_tolerance * before or moved < cfg.step_tolerance):
-        descent.stop_reason = "converged"
-    elif not improved and descent.jacobian is not None and descent.damping > 1e6:
-        descent.stop_reason = "converged (no step lowers the score)"
+    elif descent.stop_reason is None and descent.iteration >= cfg.max_iteration:
+        descent.stop_reason = f"max_iteration {cfg.max_iteration}"
 
 
 def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
