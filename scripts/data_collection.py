@@ -2,12 +2,21 @@
 
 import sys
 
+import torch
+
 from pace_optim.cli import run_cli
 from pace_optim.data_collection import cfg_from_args, collect, make_collection_parser
+from pace_optim.experiment_design import design_table
+from pace_optim.progress import ProgressLine
 
 
 def main() -> None:
-    collection = collect(cfg_from_args(make_collection_parser().parse_args()))
+    torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
+    progress = ProgressLine()
+    collection = collect(cfg_from_args(make_collection_parser().parse_args()), progress.say)
+    if collection.design is not None:
+        progress.close()
+        print(design_table(collection.design))
     for warning in collection.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for kind in ("recordings", "commands", "plots"):

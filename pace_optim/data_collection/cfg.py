@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pace_optim.recording import Load
+from pace_optim.recording import Drive, Load
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +25,10 @@ class CollectionCfg:
     """Lower end of the band [Hz]."""
     max_frequency: float = 10.0
     """Upper end of the band [Hz]."""
+    optimize: bool = False
+    """Whether amplitudes, centres and bands are chosen so that the expected error bars are smallest."""
+    reach: float = 1.0
+    """With ``optimize``: width of the range of targets, as a multiple of what the robot's excitation states."""
     seed: int = 0
     """Seed of the motion and of the noise."""
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -78,3 +82,8 @@ class CollectionCfg:
                 "Nothing is recorded with --command_only, so --output has no use. Name the file of the commands with "
                 "--export_command."
             )
+
+    def drive(self, num_joints: int) -> Drive:
+        """Gains in place of the robot's, for all joints."""
+        gains = {"stiffness": self.stiffness, "damping": self.damping}
+        return Drive(**{key: np.full(num_joints, value) for key, value in gains.items() if value is not None})

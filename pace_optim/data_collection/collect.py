@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from pace_envs import load_env_cfg, registered_tasks
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.excitation import Trajectory, make_excitation, write_command_csv
+from pace_optim.experiment_design import Design
 from pace_optim.motion_check import (
     MotionFinding,
     MotionLimits,
@@ -23,9 +24,10 @@ from pace_optim.motion_check import (
     summarise,
 )
 from pace_optim.parameter_space import ParameterSpace
-from pace_optim.recording import Drive, save_recording
+from pace_optim.recording import save_recording
 
 from .cfg import CollectionCfg
+from .design import design_motion
 from .encoder import Encoder
 from .files import Files, plan_files
 from .plot import plot_motion
@@ -45,10 +47,16 @@ class Collection:
     """PNG files."""
     warnings: tuple[str, ...]
     """What the check of the motion found, in plain sentences."""
+    design: Design | None = None
+    """What the chosen motion is expected to tell; None if none was asked for."""
 
 
-def collect(cfg: CollectionCfg) -> Collection:
+def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: None) -> Collection:
     """Make the motion, check it, simulate it and write everything; nothing is written if something is wrong.
+
+    Args:
+        cfg: What is asked for.
+        report: Gets lines of progress.
 
     Raises:
         ValueError: If the request cannot be met, or the motion must not be sent to the robot.
@@ -66,6 +74,11 @@ def collect(cfg: CollectionCfg) -> Collection:
         seed=cfg.seed,
     )
     files = plan_files(cfg, sim2real.robot_name, [trajectory.name for trajectory in trajectories])
+    if cfg.optimize and len(trajectories) > 1:
+        raise ValueError(
+            f"--optimize chooses one trajectory, and {cfg.excitation} makes {len(trajectories)}. Choose another "
+            "--excitation, such as chirp or multisine."
+        )
     space = ParameterSpace.of(sim2real)
     truth = None if cfg.command_only else true_parameters(sim2real, space, cfg.parameters)
 
@@ -75,6 +88,8 @@ def collect(cfg: CollectionCfg) -> Collection:
     ).unwrapped
     try:
         limits = _limits_of(env)
+        design = design_motion(cfg, env, trajectories[0], limits, report) if cfg.optimize else None
+        trajectories = trajectories if design is None else [design.trajectory]
         findings = [check_command(trajectory, limits) for trajectory in trajectories]
         for trajectory, found in zip(trajectories, findings, strict=True):
             refuse_errors(found, trajectory.name)
@@ -86,7 +101,7 @@ def collect(cfg: CollectionCfg) -> Collection:
                 space=space,
                 truth=truth,
                 encoder=Encoder(noise=cfg.noise, bits=cfg.encoder_bits, rng=np.random.default_rng([cfg.seed, 1])),
-                drive=_drive_of(cfg, env.scene["robot"].num_joints),
+                drive=cfg.drive(env.scene["robot"].num_joints),
                 load=cfg.load,
             )
             for trajectory, result, found in zip(trajectories, simulated, findings, strict=True):
@@ -94,7 +109,8 @@ def collect(cfg: CollectionCfg) -> Collection:
                 refuse_errors(found, trajectory.name)
     finally:
         env.close()
-    return _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
+    written = _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
+    return replace(written, design=design)
 
 
 def _write(
@@ -144,11 +160,6 @@ def _sim2real(env_cfg: Any, task: str) -> PaceCfg:
             f"{', '.join(suited)}."
         )
     return sim2real
-
-
-def _drive_of(cfg: CollectionCfg, num_joints: int) -> Drive:
-    gains = {"stiffness": cfg.stiffness, "damping": cfg.damping}
-    return Drive(**{key: np.full(num_joints, value) for key, value in gains.items() if value is not None})
 
 
 def _limits_of(env: Any) -> MotionLimits:

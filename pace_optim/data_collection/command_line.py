@@ -40,6 +40,19 @@ def make_collection_parser() -> Parser:
     motion.add_argument("--min_frequency", type=float, default=0.1, metavar="HZ", help="of the band (default 0.1)")
     motion.add_argument("--max_frequency", type=float, default=10.0, metavar="HZ", help="of the band (default 10)")
     motion.add_argument("--seed", type=int, default=0, metavar="N", help="of the motion and the noise (default 0)")
+    motion.add_argument(
+        "--optimize",
+        action="store_true",
+        help="choose each joint's amplitude, centre, band and phases within the joint, speed and effort limits so that "
+        "the expected error bars for --noise (1e-4 if not given) are smallest; prints them before and after",
+    )
+    motion.add_argument(
+        "--reach",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="with --optimize, width of the range of targets as a multiple of PaceCfg.excitation's (default 1)",
+    )
     robot = parser.add_argument_group("simulated robot")
     robot.add_argument(
         "--parameter",

@@ -38,10 +38,11 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     _check("--export_command", cfg.export_command, (".csv",))
     _check("--plot", cfg.plot, (".png",))
     folder = Path("data") / robot_name
-    recording = None if cfg.command_only else cfg.output or folder / f"{cfg.excitation}.npz"
+    stem = f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
+    recording = None if cfg.command_only else cfg.output or folder / f"{stem}.npz"
     command = cfg.export_command
     if command is None and cfg.command_only:
-        command = folder / f"{cfg.excitation}_command.csv"
+        command = folder / f"{stem}_command.csv"
     plot = cfg.plot or (recording or command or folder).with_suffix(".png")
     files = [
         Files(

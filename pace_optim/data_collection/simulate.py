@@ -62,17 +62,7 @@ def simulate(
         ValueError: If the simulation diverges, or the load does not fit the robot.
     """
     robot = env.scene["robot"]
-    accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
-    drafts = [
-        conform_recording(
-            _draft(trajectory, drive, load),
-            joint_order=robot.joint_names,
-            control_dt=env.step_dt,
-            load_bodies=robot.body_names,
-            accepts_load=accepts_load,
-        )
-        for trajectory in trajectories
-    ]
+    drafts = draft_recordings(env, trajectories, drive, load)
     dataset = make_dataset(drafts, train_fraction=1)
     rollout = Rollout(env, dataset, space)
     rollout.start(truth[None], dataset.sampled)
@@ -102,6 +92,28 @@ def simulate(
             torque=torque[:-1, r],
         )
         for r in range(len(trajectories))
+    ]
+
+
+def draft_recordings(
+    env: ManagerBasedEnv, trajectories: Sequence[Trajectory], drive: Drive, load: Load
+) -> list[Recording]:
+    """Recordings before they are made, on the control grid: the encoder stays at the first target.
+
+    Raises:
+        ValueError: If the load does not fit the robot.
+    """
+    robot = env.scene["robot"]
+    accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
+    return [
+        conform_recording(
+            _draft(trajectory, drive, load),
+            joint_order=robot.joint_names,
+            control_dt=env.step_dt,
+            load_bodies=robot.body_names,
+            accepts_load=accepts_load,
+        )
+        for trajectory in trajectories
     ]
 
 
