@@ -87,17 +87,8 @@ def drive_problem(steps: int = 8000) -> DriveProblem:
     )
     env.close()
     fitted = torch.cat([torch.arange(space.size)[space[name]] for name in FITTED])
-    every = colour(space, trees, problem.joint_names)
-    return DriveProblem(problem=problem, truth=truth, fitted=fitted, colouring=without_fixed(every, space))
-
-
-def without_fixed(colouring: Colouring, space: ParameterSpace) -> Colouring:
-    """The colouring of those entries whose bounds leave them free; the others move nothing."""
-    free = (space.upper > space.lower).tolist()
-    return Colouring(
-        colours=tuple(kept for c in colouring.colours if (kept := tuple(entry for entry in c if free[entry]))),
-        joints=tuple(joints if free[entry] else () for entry, joints in enumerate(colouring.joints)),
-    )
+    colouring = colour(space, trees, problem.joint_names)
+    return DriveProblem(problem=problem, truth=truth, fitted=fitted, colouring=colouring)
 
 
 def _simulated(

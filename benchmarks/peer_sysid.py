@@ -24,7 +24,8 @@ from sysid_peer import Peer
 
 from pace_optim.cli import run_cli
 from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.least_squares import least_squares
+from pace_optim.least_squares import Descent
+from pace_optim.refine import refine
 from pace_optim.search import RefiningPays, search
 
 OURS = "pace least_squares"
@@ -64,7 +65,7 @@ def run_ours(case: DriveProblem, hybrid: bool = False) -> Trace:
 
         search(optimizer, evaluator.rollout(HYBRID_POPULATION), after_generation)
         starts.insert(0, optimizer.best if probe.refined is None else probe.refined)
-    least_squares(evaluator, case.colouring, starts, on_iteration=after_iteration)
+    refine(evaluator, case.colouring, [Descent(x=start) for start in starts], after_iteration)
     trace.end(iterations, evaluator.simulated_steps)
     return trace
 

@@ -4,7 +4,7 @@ Needs torch alone.
 """
 
 from pace_actuators.actions import ActuatorActions
-from pace_actuators.dc_motor import effort_bounds, pd_effort
+from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.joint_values import JointValue, match_names, resolve_joint_values
 from pace_actuators.pace_dc_motor import PaceDCMotor
@@ -16,7 +16,7 @@ __all__ = [
     "JointValue",
     "PaceDCMotor",
     "PaceDCMotorCfg",
-    "effort_bounds",
+    "clip_effort",
     "match_names",
     "pd_effort",
     "resolve_joint_values",

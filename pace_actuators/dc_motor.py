@@ -20,30 +20,31 @@ def pd_effort(
     return (stiffness * position_error).addcmul_(damping, velocity_error)
 
 
-def effort_bounds(
+def clip_effort(
+    effort: torch.Tensor,
     joint_vel: torch.Tensor,
     saturation_effort: torch.Tensor,
     effort_limit: torch.Tensor,
     velocity_limit: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lowest and highest effort of a DC motor at a speed: the four-quadrant torque-speed curve.
+) -> torch.Tensor:
+    """What a DC motor gives of a torque asked of it: the four-quadrant torque-speed curve.
 
     With stall torque τ_s, no-load speed v_0 and continuous limit τ_c (Isaac Lab's ``DCMotor``):
 
-        τ_max(v) = min(τ_s (1 - v / v_0), τ_c),   τ_min(v) = max(τ_s (-1 - v / v_0), -τ_c)
+        τ = clip(clip(τ_cmd, -τ_s (1 + v / v_0), τ_s (1 - v / v_0)), -τ_c, τ_c)
 
-    with v limited to ±v_0 (1 + τ_c / τ_s), so that a motor driven faster than that brakes with τ_c.
+    A motor that is driven faster than v_0 (1 + τ_c / τ_s) brakes with τ_c.
 
     Args:
-        joint_vel: v [rad/s], shape (num_envs, num_joints).
+        effort: τ_cmd [N m], shape (num_envs, num_joints).
+        joint_vel: v [rad/s], same shape.
         saturation_effort: τ_s [N m].
         effort_limit: τ_c [N m].
         velocity_limit: v_0 [rad/s]; infinite means no dependence on speed.
 
     Returns:
-        (τ_min, τ_max) [N m], each of the shape of ``joint_vel``.
+        τ [N m], shape (num_envs, num_joints).
     """
     drop = saturation_effort / velocity_limit * joint_vel
-    highest = (saturation_effort - drop).clamp_(max=effort_limit).clamp_(min=-effort_limit)
-    lowest = (-saturation_effort - drop).clamp_(min=-effort_limit).clamp_(max=effort_limit)
-    return lowest, highest
+    within_curve = torch.clamp(effort, (saturation_effort + drop).neg_(), saturation_effort - drop)
+    return torch.clamp(within_curve, -effort_limit, effort_limit)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from pace_actuators.dc_motor import effort_bounds, pd_effort
+from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -224,8 +224,7 @@ class PaceDCMotor:
         Returns:
             The torque at the joint [N m], (num_envs, num_joints).
         """
-        lowest, highest = effort_bounds(joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
-        effort = torch.clamp(effort_command, lowest, highest)
+        effort = clip_effort(effort_command, joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
         return effort if self.torque_enable is None else effort * self.torque_enable
 
     def reset(self, env_ids: EnvIds = None) -> None:

@@ -37,6 +37,7 @@ class CMAESOptimizer:
     Attributes:
         armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
         sim_params: Physical parameters of every environment, (num_envs, size); set by :meth:`update_simulator`.
+        rollout: The rollout that is being scored; it has the velocities.
         generation: Generations so far.
         history: Scores of each generation, (population_size, trees) [rad²].
         best_scores: Best score so far after each generation [rad²].
@@ -112,6 +113,7 @@ class CMAESOptimizer:
         self.line_generation = self._planned_line = -1
         self.sim_params = torch.empty(0)
         self.scores_buffer: torch.Tensor | None = None
+        self.rollout: Rollout | None = None
         self._stopped: list[str] = []
 
     # ------------------------------------------------------------------ the loop
@@ -160,7 +162,7 @@ class CMAESOptimizer:
         rollout.start(self.candidates, per_joint=self._per_joint_copies())
         self.sim_params = rollout.physical
         self.scores_buffer = torch.zeros(rollout.env.num_envs, len(self.joint_names), dtype=torch.float64)
-        self._rollout = rollout
+        self.rollout = rollout
 
     def tell(self, sim_dof_pos: torch.Tensor, real_dof_pos: torch.Tensor) -> None:
         """Add one sample to the scores.
@@ -181,7 +183,7 @@ class CMAESOptimizer:
         Raises:
             ValueError: If the error joins all joints but the search is split, or has another shape.
         """
-        if self.scores_buffer is None:
+        if self.scores_buffer is None or self.rollout is None:
             raise ValueError("There is no rollout to score. Call update_simulator first.")
         if error.shape not in (self.scores_buffer.shape, self.scores_buffer.shape[:1]):
             raise ValueError(
@@ -196,7 +198,7 @@ class CMAESOptimizer:
                     "CMAESOptimizerCfg(per_tree=False)."
                 )
             error = (error / len(self.joint_names))[:, None]
-        self.scores_buffer.add_(error * self._rollout.weight)
+        self.scores_buffer.add_(error * self.rollout.weight)
 
     def evolve(self) -> None:
         """End the generation: strategies learn from the scores."""
@@ -219,7 +221,7 @@ class CMAESOptimizer:
     def close(self) -> None:
         """Forget the rollout; results stay readable."""
         self.scores_buffer = None
-        self._rollout = None  # type: ignore[assignment]
+        self.rollout = None
 
     # ------------------------------------------------------------------ results
 

@@ -37,6 +37,8 @@ class Consistency:
     """Physical value of each parameter by recording, {label: [per recording]}."""
     std: dict[str, list[float | None]] = field(default_factory=dict)
     """Standard deviations, shaped as ``values``; ``None`` at a bound or without influence."""
+    simulated_steps: int = 0
+    """What the comparison cost."""
     sentences: tuple[str, ...] = ()
     """What disagrees, in words; empty when all recordings agree."""
 
@@ -59,31 +61,43 @@ def check_consistency(
     fits = []
     for r in range(len(trained)):
         report(f"fitting {problem.dataset.recordings[r].name} alone")
-        fits.append(_fit_from(replace(problem, dataset=problem.dataset.select([r])), x)[1:])
+        fits.append(_fit_from(replace(problem, dataset=problem.dataset.select([r])), x))
     names = tuple(recording.name for recording in problem.dataset.recordings)
-    values = torch.stack([problem.space.to_physical(alone) for alone, _ in fits]).numpy()
-    std = np.stack([uncertainty.std for _, uncertainty in fits])
+    values = torch.stack([problem.space.to_physical(fit.x) for fit in fits]).numpy()
+    std = np.stack([fit.uncertainty.std for fit in fits])
     sentences = _disagreements(problem.space, names, values, std)
+    steps = 0
     if sentences:
         report("trying misreported gains")
-        gains = _misreported_gains(problem, x, score)
+        gains, steps = _misreported_gains(problem, x, score)
         sentences = [*gains, *sentences]
     labels = problem.space.labels
     return Consistency(
         recordings=names,
         values={label: values[:, i].tolist() for i, label in enumerate(labels)},
         std={label: [None if np.isnan(v) else float(v) for v in std[:, i]] for i, label in enumerate(labels)},
+        simulated_steps=steps + sum(fit.simulated_steps for fit in fits),
         sentences=tuple(sentences),
     )
 
 
-def _fit_from(problem: Problem, x: torch.Tensor) -> tuple[float, torch.Tensor, Uncertainty]:
-    """Least squares from x: score, normalised result, uncertainty."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fit:
+    """A refinement with its error bars."""
+
+    score: float
+    x: torch.Tensor
+    uncertainty: Uncertainty
+    simulated_steps: int
+
+
+def _fit_from(problem: Problem, x: torch.Tensor) -> _Fit:
+    """Least squares from x."""
     evaluator = problem.training_evaluator()
     colouring = colour(problem.space, problem.trees, problem.joint_names)
     best = least_squares(evaluator, colouring, [x], _REFINE)[0]
     uncertainty, _ = assess(problem, evaluator, colouring, best.x)
-    return best.score, best.x, uncertainty
+    return _Fit(score=best.score, x=best.x, uncertainty=uncertainty, simulated_steps=evaluator.simulated_steps)
 
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
@@ -127,20 +141,26 @@ def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[
     return result
 
 
-def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> list[str]:
-    """The recording whose gains, were they other than stated, would explain most; none if that does not pay."""
+def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple[list[str], int]:
+    """The recording whose gains, were they other than stated, would explain most; none if that does not pay.
+
+    Returns:
+        Sentences, and the simulated steps that it took.
+    """
     best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
+    steps = 0
     for r in range(problem.dataset.num_recordings):
         extra = [_gain_parameter(problem, r, name) for name in ("stiffness", "damping")]
         space = ParameterSpace((*problem.space.parameters, *extra))
         start = torch.cat([x, torch.zeros(len(extra), dtype=torch.float64)])
-        tried, end, uncertainty = _fit_from(replace(problem, space=space), start)
-        physical = space.to_physical(end)
-        found = {p.name: (float(physical[space[p.name]]), float(uncertainty.std[space[p.name]][0])) for p in extra}
-        if best is None or tried < best[0]:
-            best = (tried, r, found)
+        fit = _fit_from(replace(problem, space=space), start)
+        steps += fit.simulated_steps
+        physical = space.to_physical(fit.x)
+        found = {p.name: (float(physical[space[p.name]]), float(fit.uncertainty.std[space[p.name]][0])) for p in extra}
+        if best is None or fit.score < best[0]:
+            best = (fit.score, r, found)
     if best is None or score < _GAIN_PAYS**2 * best[0]:
-        return []
+        return [], steps
     _, r, found = best
     name = problem.dataset.recordings[r].name
     sentences = []
@@ -154,7 +174,7 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> list[
                 f"({nominal * (1 + value):.3g} instead of {nominal:.3g}, ± {abs(nominal) * error:.1g}): check the "
                 f"{field_name} that was in force."
             )
-    return sentences
+    return sentences, steps
 
 
 def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:

@@ -287,7 +287,7 @@ class _Fit:
             optimizer=self.settings.optimizer,
             seed=self.settings.seed,
             generations=self.optimizer.generation if self.optimizer else 0,
-            simulated_steps=self.steps,
+            simulated_steps=self.steps + consistency.simulated_steps,
             wall_time_s=self.progress.elapsed,
             stop_reasons=outcome.stop_reasons,
             warnings=[*fit_warnings(problem, physical, uncertainty, rmse), *consistency.sentences],

@@ -26,6 +26,8 @@ class Colouring:
 def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
     """Group entries that move different joints: the i-th of each tree together, shared ones alone.
 
+    Entries whose bounds are equal are fixed: they belong to no colour and move no joint.
+
     Args:
         space: The parameters.
         trees: Groups of joints that do not influence each other.
@@ -35,13 +37,15 @@ def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: S
     owners = space.owners(trees)
     by_tree: list[list[int]] = [[] for _ in trees]
     alone: list[int] = []
+    free = (space.upper > space.lower).tolist()
     for entry, owner in enumerate(owners):
-        (alone if owner is None else by_tree[owner]).append(entry)
+        if free[entry]:
+            (alone if owner is None else by_tree[owner]).append(entry)
     depth = max((len(entries) for entries in by_tree), default=0)
     colours = [tuple(entries[i] for entries in by_tree if i < len(entries)) for i in range(depth)]
     joints = tuple(
-        tuple(range(len(joint_names))) if owner is None else tuple(index[name] for name in trees[owner])
-        for owner in owners
+        tuple(index[name] for name in (joint_names if owner is None else trees[owner])) if free[entry] else ()
+        for entry, owner in enumerate(owners)
     )
     return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints)
 
@@ -74,7 +78,7 @@ class Jacobian:
     colouring: Colouring
 
     def column(self, entry: int) -> torch.Tensor:
-        """D error / d x_entry, (K, R, n); zero for joints that the entry does not move."""
+        """Derivative of the error by an entry, (K, R, n); zero for joints that the entry does not move."""
         row = next(c for c, entries in enumerate(self.colouring.colours) if entry in entries)
         result = torch.zeros_like(self.columns[row])
         joints = list(self.colouring.joints[entry])

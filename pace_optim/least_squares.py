@@ -58,6 +58,8 @@ class Descent:
     stalled: int = 0
     """Iterations in a row that gained next to nothing."""
     scores: list[float] = field(default_factory=list)
+    lost_jacobian: bool = False
+    """Whether the Jacobian was known when the descent was written down."""
 
     @classmethod
     def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
@@ -68,12 +70,13 @@ class Descent:
                 x=torch.as_tensor(x),
                 score=float(score),
                 damping=float(damping),
-                # the Jacobian, computed again, takes an iteration that was counted already
-                iteration=int(iteration) - (iteration > 0 and not stop),
                 stop_reason=str(stop) or None,
+                iteration=int(iteration),
+                stalled=int(stalled),
                 scores=history,
+                lost_jacobian=bool(known) and not stop,
             )
-            for x, (score, damping, iteration), stop, history in zip(
+            for x, (score, damping, iteration, stalled, known), stop, history in zip(
                 checkpoint["descent_x"], checkpoint["descent_state"], checkpoint["descent_stop"], scores, strict=True
             )
         ]
@@ -154,6 +157,9 @@ def least_squares(
     """
     cfg = cfg or LeastSquaresCfg()
     descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
+    for descent in descents:
+        if descent.lost_jacobian:
+            _find_jacobian(descent, evaluator, colouring, where)
     while running := [d for d in descents if d.stop_reason is None]:
         batches, steps = [], []
         for descent in running:
@@ -171,6 +177,13 @@ def least_squares(
         if on_iteration is not None:
             on_iteration(descents)
     return sorted(descents, key=lambda d: d.score)
+
+
+def _find_jacobian(descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None) -> None:
+    """Compute the Jacobian at x again, beside the descent's iterations."""
+    neighbours, step = perturbed(descent.x, colouring)
+    residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([descent.x[None], neighbours])), where)
+    descent.jacobian, descent.lost_jacobian = jacobian(residuals, step, colouring), False
 
 
 def _advance(

@@ -91,6 +91,13 @@ def load_problem(
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
+        drive_dt = cfg.sim.dt * drive.control_decimation
+        if abs(drive_dt - control_dt) > 1e-9:
+            raise ValueError(
+                f"The drive's controller runs every {1e3 * drive_dt:g} ms, the environment steps every "
+                f"{1e3 * control_dt:g} ms: identification needs both alike, so that a delay has one unit. Set the "
+                "drive's control_decimation to the environment's decimation."
+            )
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.max_delay < longest:
             raise ValueError(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -93,7 +94,9 @@ class RunFolder:
             "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),
             "descent_x": np.stack([d.x.numpy() for d in descents]) if descents else np.zeros((0, 0)),
-            "descent_state": np.array([[d.score, d.damping, d.iteration] for d in descents]).reshape(-1, 3),
+            "descent_state": np.array(
+                [[d.score, d.damping, d.iteration, d.stalled, d.jacobian is not None] for d in descents]
+            ).reshape(-1, 5),
             "descent_stop": np.array([d.stop_reason or "" for d in descents], dtype=str),
             "descent_scores": np.array(json.dumps([d.scores for d in descents])),
         }
@@ -103,17 +106,28 @@ class RunFolder:
         """What :meth:`write_checkpoint` wrote.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If there is none, or it is damaged.
         """
         path = self.path / "checkpoint.npz"
         if not path.is_file():
             raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. Start a new fit.")
-        with np.load(path, allow_pickle=False) as content:
-            return {key: content[key] for key in content.files}
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                return {key: content[key] for key in content.files}
+        except (OSError, ValueError, EOFError, AttributeError, BadZipFile) as error:
+            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None
 
     def read_history(self) -> History:
-        """The scores so far, as :meth:`write_checkpoint` wrote them."""
-        return History(**json.loads((self.path / "history.json").read_text()))
+        """The scores so far, as :meth:`write_checkpoint` wrote them.
+
+        Raises:
+            ValueError: If the file is missing or damaged.
+        """
+        path = self.path / "history.json"
+        try:
+            return History(**json.loads(path.read_text()))
+        except (OSError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None
 
     def write_mean(self, generation: int, physical: torch.Tensor) -> None:
         """The mean of the search after a generation."""

@@ -78,9 +78,7 @@ def test_body_tree_frames_and_inertials_are_the_published_ones(robot):
         np.testing.assert_allclose(body.mass, figure["mass"], rtol=1e-6)
         np.testing.assert_allclose(body.ipos, figure["com"], atol=1e-6)
         published = inertia_tensor(figure["inertia_quat"], figure["principal_inertia"])
-        np.testing.assert_allclose(
-            inertia_tensor(body.iquat, body.inertia), published, atol=1e-6 * np.trace(published)
-        )
+        np.testing.assert_allclose(inertia_tensor(body.iquat, body.inertia), published, atol=1e-6 * np.trace(published))
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

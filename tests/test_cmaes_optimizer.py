@@ -235,13 +235,13 @@ def test_the_global_random_state_is_left_alone(bench):
 class PositionAndVelocity(CMAESOptimizer):
     def tell(self, sim_dof_pos, real_dof_pos):
         position = sim_dof_pos - self.sim_params[:, self.bias_idx] - real_dof_pos
-        velocity = self._rollout.sim_dof_vel - self._rollout.real_dof_vel
+        velocity = self.rollout.sim_dof_vel - self.rollout.real_dof_vel
         self.add_score(position.square() + 1e-4 * velocity.square())
 
 
 class VelocityOnly(CMAESOptimizer):
     def tell(self, sim_dof_pos, real_dof_pos):
-        self.add_score((self._rollout.sim_dof_vel - self._rollout.real_dof_vel).square())
+        self.add_score((self.rollout.sim_dof_vel - self.rollout.real_dof_vel).square())
 
 
 class EndEffector(CMAESOptimizer):

@@ -68,9 +68,7 @@ def test_no_file_imports_what_lies_downstream(path):
 def test_actuators_need_torch_alone(path):
     allowed = ACTUATORS_MAY_IMPORT | {ADAPTERS.get(path, "torch")}
     foreign = imported_roots((ROOT / path).read_text(encoding="utf-8")) - allowed
-    assert not foreign, (
-        f"{path} imports {sorted(foreign)}; whoever trains a policy installs torch and nothing else"
-    )
+    assert not foreign, f"{path} imports {sorted(foreign)}; whoever trains a policy installs torch and nothing else"
 
 
 def test_importing_the_actuators_loads_no_simulator():

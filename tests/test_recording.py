@@ -71,9 +71,7 @@ def fields_of(**changes) -> dict:
 def written(tmp_path, **changes) -> Path:
     """A .pt file with the given fields changed (None: left out)."""
     path = tmp_path / "leg.pt"
-    tensors = {
-        k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in fields_of(**changes).items()
-    }
+    tensors = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in fields_of(**changes).items()}
     torch.save(tensors, path)
     return path
 
@@ -490,9 +488,7 @@ def test_a_smooth_interpolation_is_exact_for_parabolas_and_does_not_amplify_nois
     at = rng.uniform(time[1], time[-2], 1000)
     parabola = interpolate_smooth(time, (time**2 - 7.0 * time)[:, None], at)
     assert np.allclose(parabola[:, 0], at**2 - 7.0 * at, atol=1e-9)
-    pairs = np.sort(
-        np.concatenate([np.arange(100.0), np.arange(100.0) + 1e-4])
-    )  # samples that nearly coincide
+    pairs = np.sort(np.concatenate([np.arange(100.0), np.arange(100.0) + 1e-4]))  # samples that nearly coincide
     noise = rng.uniform(-1.0, 1.0, (200, 1))
     assert np.abs(interpolate_smooth(pairs, noise, rng.uniform(0.0, 99.0, 5000))).max() < 1.5
 
@@ -576,12 +572,8 @@ def test_validation_starts_at_the_given_share_of_the_samples():
 
 # Real recordings --------------------------------------------------------------------------------------------
 
-needs_measurements = pytest.mark.skipif(
-    not (SHARED / "measurements").is_dir(), reason="shared/measurements is absent"
-)
-GO2_JOINTS = [
-    f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")
-]
+needs_measurements = pytest.mark.skipif(not (SHARED / "measurements").is_dir(), reason="shared/measurements is absent")
+GO2_JOINTS = [f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")]
 
 
 @needs_measurements

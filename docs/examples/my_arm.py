@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, InitialStateCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.pace_cfg import make_bounds
+from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, make_bounds
 
 HERE = Path(__file__).parent
 MY_ARM_JOINTS = ("shoulder", "elbow")

@@ -46,8 +46,7 @@ def check_recording(
         _check_finite(key, array, joint_names, source)
     if len(time) < MIN_SAMPLES:
         raise ValueError(
-            f"{source}: found {len(time)} samples; expected at least {MIN_SAMPLES}. Record for longer (20 s "
-            "is usual)."
+            f"{source}: found {len(time)} samples; expected at least {MIN_SAMPLES}. Record for longer (20 s is usual)."
         )
     _check_time(time, source)
     name = fields.get("name", default_name)
@@ -94,8 +93,7 @@ def _numeric(key: str, value: Any, source: str) -> np.ndarray:
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
         raise ValueError(
-            f"{source}: {key} holds {array.dtype}, not numbers; expected floats. Store {key} as an array of "
-            "floats."
+            f"{source}: {key} holds {array.dtype}, not numbers; expected floats. Store {key} as an array of floats."
         )
     return array.astype(np.float64)
 
@@ -154,9 +152,7 @@ def _check_time(time: np.ndarray, source: str) -> None:
         first = int(np.argmax(step <= 0.0)) + 1
         precision = ""
         if abs(time[0]) > 1e5 and np.all(time == time.astype(np.float32)):
-            precision = (
-                " Time stamps this large do not fit in float32: subtract the first before storing them."
-            )
+            precision = " Time stamps this large do not fit in float32: subtract the first before storing them."
         raise ValueError(
             f"{source}: time does not increase at sample {first} ({time[first - 1]:.9g} s, then "
             f"{time[first]:.9g} s); expected strictly increasing time. Sort the samples and drop repeated "

@@ -113,9 +113,7 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
         if (values := getattr(recording, key)) is not None:
             result[key] = interpolate(stamps, values, at)
     if recording.torque_enable is not None:
-        share_on = hold_on_grid(
-            stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count
-        )
+        share_on = hold_on_grid(stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count)
         result["command_torque_enable"] = share_on[:, 0] >= 0.5
         result["torque_enable"] = result["command_torque_enable"][::stride]
     return result

@@ -33,9 +33,7 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
             fields[series] = values[:, 0] if len(indices) == 1 else values
         elif series in JOINT_SERIES and joints:
             _check_joints(path, series, list(index_of), joints, header)
-            fields[series] = np.stack(
-                [_numbers(path, f"{series}/{j}", rows, index_of[j]) for j in joints], axis=1
-            )
+            fields[series] = np.stack([_numbers(path, f"{series}/{j}", rows, index_of[j]) for j in joints], axis=1)
         else:
             fields[series] = ()  # the check of the keys says what becomes of it
     if joints:
@@ -69,9 +67,7 @@ def _read_cells(path: Path) -> tuple[list[str], list[list[str]]]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8."
-        ) from error
+        raise ValueError(f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8.") from error
     if not rows:
         raise ValueError(f"{path}: is empty; expected a line of column names, then one line per sample.")
     header = [column.strip() for column in rows[0]]

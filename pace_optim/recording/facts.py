@@ -27,11 +27,7 @@ def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     if value is None:
         return ()
     names = value.tolist() if isinstance(value, np.ndarray) else value
-    if (
-        isinstance(names, str)
-        or not isinstance(names, Sequence)
-        or not all(isinstance(n, str) for n in names)
-    ):
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(n, str) for n in names):
         raise ValueError(
             f"{source}: joint_names is {value!r}; expected a list of text, one name per column of dof_pos. "
             "Write joint_names as a list of names."
@@ -58,9 +54,7 @@ def load_of(fields: Mapping[str, Any], source: str) -> Load:
     return Load(added_mass=_added_mass(fields.get("added_mass"), source), **bench)
 
 
-def _per_joint(
-    key: str, value: Any, joint_names: tuple[str, ...], num_joints: int, source: str
-) -> np.ndarray:
+def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], num_joints: int, source: str) -> np.ndarray:
     if isinstance(value, Mapping):
         value = _in_column_order(key, value, joint_names, source)
     try:
@@ -112,9 +106,7 @@ def _added_mass(value: Any, source: str) -> dict[str, float]:
             f"{source}: added_mass is {value!r}; expected {{body: kg}} (in an .npz as JSON text). "
             'Write it as {"body_name": 0.5}.'
         )
-    return {
-        body: _number("added_mass", mass, source, f"added_mass of {body}") for body, mass in value.items()
-    }
+    return {body: _number("added_mass", mass, source, f"added_mass of {body}") for body, mass in value.items()}
 
 
 def _number(key: str, value: Any, source: str, label: str = "") -> float:

@@ -136,8 +136,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
             problem, cure = f"cannot be read ({_first_line(error)})", "Copy or record it again."
         raise ValueError(f"{path}: {problem}; expected arrays saved by numpy.savez. {cure}") from error
     return {
-        key: array.item() if array.dtype.kind == "U" and array.ndim == 0 else array
-        for key, array in fields.items()
+        key: array.item() if array.dtype.kind == "U" and array.ndim == 0 else array for key, array in fields.items()
     }
 
 
@@ -153,9 +152,7 @@ def _add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
             f"{facts_path}: is not JSON ({error}). Correct it, or move it away from {path.name}."
         ) from error
     if not isinstance(facts, dict):
-        raise ValueError(
-            f"{facts_path}: holds a {type(facts).__name__}; expected {{fact: value}}. Correct it."
-        )
+        raise ValueError(f"{facts_path}: holds a {type(facts).__name__}; expected {{fact: value}}. Correct it.")
     for key, value in facts.items():
         if key not in FACTS:
             raise ValueError(

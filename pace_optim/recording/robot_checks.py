@@ -65,9 +65,7 @@ def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: 
     names = recording.joint_names
     position, target = recording.dof_pos, recording.des_dof_pos
     if turning := _those(names, np.abs(position).max(axis=0) > 8.0 * np.pi):
-        notes.append(
-            f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}"
-        )
+        notes.append(f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}")
     if still := _those(names, np.ptp(position, axis=0) < _STILL):
         notes.append(
             f"{listed(still)}: moves less than {_STILL * 1e3:g} mrad, so its parameters cannot be found from "
@@ -77,8 +75,7 @@ def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: 
         notes.append(f"{listed(uncommanded)}: moves although its command never changes.")
     if far := _those(names, np.abs(position[0] - target[0]) > _FAR):
         notes.append(
-            f"{listed(far)}: starts more than {_FAR:g} rad from its target; the first instants are a "
-            "transient."
+            f"{listed(far)}: starts more than {_FAR:g} rad from its target; the first instants are a transient."
         )
     if recording.torque_enable is not None and not recording.torque_enable.all():
         notes.append(f"The drive is off in {np.mean(~recording.torque_enable):.0%} of the samples.")
@@ -121,9 +118,7 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> li
                 f"most {allowed:.3g} beyond). {cure}"
             )
     if beyond := _those(names, excess["des_dof_pos"] > 0.0):
-        return [
-            f"{listed(beyond)}: commanded beyond the joint limits, by {excess['des_dof_pos'].max():.3f} rad."
-        ]
+        return [f"{listed(beyond)}: commanded beyond the joint limits, by {excess['des_dof_pos'].max():.3f} rad."]
     return []
 
 

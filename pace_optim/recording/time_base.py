@@ -89,9 +89,7 @@ def _check_usable(time: np.ndarray, step: np.ndarray, median: float, source: str
         )
 
 
-def _on_grid(
-    time: np.ndarray, step: np.ndarray, mean: float, spacing: float, resolution: float
-) -> tuple[bool, bool]:
+def _on_grid(time: np.ndarray, step: np.ndarray, mean: float, spacing: float, resolution: float) -> tuple[bool, bool]:
     """Return whether the stamps are those of the grid, and whether only after a fencepost error is mended."""
     count = len(time)
     deviation = time - spacing * np.arange(count)

@@ -1,6 +1,6 @@
 """Identification: a robot held in the air follows a recording's commands."""
 
-from pace_envs.tasks.pace.pace_cfg import CMAESOptimizerCfg, ExcitationCfg, PaceCfg
+from pace_envs.tasks.pace.pace_cfg import CMAESOptimizerCfg, ExcitationCfg, PaceCfg, make_bounds
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters
 
@@ -13,4 +13,5 @@ __all__ = [
     "PaceSim2realSceneCfg",
     "Parameter",
     "base_parameters",
+    "make_bounds",
 ]
