@@ -78,6 +78,9 @@ def resume(
 
 
 def _load(settings: FitSettings) -> Problem:
+    both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
+    if both:
+        raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
     problem = load_problem(
         settings.task,
         data=settings.data,
@@ -100,7 +103,15 @@ def _load(settings: FitSettings) -> Problem:
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
             f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
         )
+    _try_out(problem)
     return problem
+
+
+def _try_out(problem: Problem) -> None:
+    """Write one candidate to one simulation of each recording: what cannot be applied fails before anything is kept."""
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(problem.space.to_physical(torch.zeros(1, problem.space.size, dtype=torch.float64)))
+    rollout.env.close()
 
 
 def _digests(settings: FitSettings, problem: Problem) -> dict[str, str]:

@@ -170,8 +170,9 @@ class Fake:
     def to_physical(self, x):
         return x
 
-    def residuals(self, x):
+    def residuals(self, x, where=None):
         self.batches.append(x)
+        assert where is None
         error = torch.stack([self.function(row) for row in x])[:, :, None, None]
         where = torch.ones(error.shape[1], 1, dtype=torch.bool)
         return Residuals(error=error, where=where, step=torch.arange(error.shape[1]))

@@ -1,0 +1,256 @@
+"""Bad input to scripts/fit.py: one line that names the fault and its cure, exit status 2, nothing half-written."""
+
+import json
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from problems import ANYMAL, BENCH, env_cfg
+
+from pace_optim.cli import run_cli
+
+ROOT = Path(__file__).parents[1]
+JOINTS = env_cfg(ANYMAL).sim2real.joint_order
+
+
+def fields(joints=1, samples=200, **changes):
+    """A recording's fields, good unless changed; ``None`` leaves one out."""
+    time = 0.0025 * np.arange(samples)
+    target = 0.3 * np.sin(4 * time)[:, None] * np.ones(joints)
+    content = {"time": time, "dof_pos": target, "des_dof_pos": target, **changes}
+    return {key: value for key, value in content.items() if value is not None}
+
+
+def changed(array, index, value):
+    result = np.array(array)
+    result[index] = value
+    return result
+
+
+def npz(**changes):
+    return lambda path: np.savez(path, **fields(**changes))
+
+
+def text(content):
+    return lambda path: path.write_text(content)
+
+
+GOOD = fields()
+TIME, POSITION = GOOD["time"], GOOD["dof_pos"]
+
+RECORDINGS = {
+    # what is wrong: (file name, writer, task, what the message says)
+    "no such file": ("none.npz", None, BENCH, r"none\.npz: no such file"),
+    "a folder": ("folder.npz", lambda path: path.mkdir(), BENCH, r"folder\.npz.*(folder|directory)"),
+    "not an archive": ("torn.npz", text("PK nonsense"), BENCH, r"torn\.npz.*(cannot be read|damaged|no .*npz)"),
+    "an empty file": ("void.npz", text(""), BENCH, r"void\.npz.*(cannot be read|empty|no .*npz)"),
+    "another format": ("leg.mat", text("x"), BENCH, r"leg\.mat.*\.csv"),
+    "no tensors": ("torn.pt", text("nonsense"), BENCH, r"torn\.pt.*torch\.save"),
+    "pickled objects": ("own.pt", lambda path: torch.save({"time": Path}, path), BENCH, r"own\.pt.*"),
+    "a csv without a header": ("bare.csv", text("0.0,0.1,0.2\n0.1,0.1,0.2\n"), BENCH, r"bare\.csv.*dof_pos/<joint>"),
+    "a missing series": ("r.npz", npz(des_dof_pos=None), BENCH, "des_dof_pos missing; expected"),
+    "a misspelt key": ("r.npz", npz(des_dof_pos=None, des_dofpos=POSITION), BENCH, "did you mean 'des_dof_pos'"),
+    "not a number": (
+        "r.npz",
+        npz(dof_pos=changed(POSITION, 7, np.nan)),
+        BENCH,
+        "NaN or infinite, the first at sample 7",
+    ),
+    "infinity": ("r.npz", npz(des_dof_pos=changed(POSITION, 3, np.inf)), BENCH, "des_dof_pos has 1 values"),
+    "time that jumps back": ("r.npz", npz(time=changed(TIME, 50, 0.0)), BENCH, "does not increase at sample 50"),
+    "time in milliseconds": ("r.npz", npz(time=1e3 * TIME), BENCH, "looks like milliseconds.*Divide time by 1000"),
+    "time with a hole": ("r.npz", npz(time=TIME + 0.5 * (np.arange(200) > 90)), BENCH, r"gap|hole|missing"),
+    "no samples": ("r.npz", npz(samples=0), BENCH, "0 samples|expected at least"),
+    "few samples": ("r.npz", npz(samples=5), BENCH, "found 5 samples; expected at least 20"),
+    "series of other lengths": ("r.npz", npz(des_dof_pos=POSITION[:-1]), BENCH, r"\(199, 1\) but time has 200"),
+    "text for numbers": ("r.npz", npz(dof_pos=np.full((200, 1), "x")), BENCH, "dof_pos holds .*not numbers"),
+    "too many joints": ("r.npz", npz(joints=2), BENCH, "has 2 joints .* but the robot has 1"),
+    "too few joints": ("r.npz", npz(joints=11), ANYMAL, "has 11 joints .* but the robot has 12"),
+    "unknown joints": ("r.npz", npz(joint_names=["servos"]), BENCH, "unknown joint 'servos', did you mean 'servo'"),
+    "a joint twice": ("r.npz", npz(joints=2, joint_names=["a", "a"]), BENCH, "joint_names repeats a"),
+    "degrees": ("r.npz", npz(joints=12, joint_names=JOINTS, dof_pos=np.full((200, 12), 40.0)), ANYMAL, "degrees"),
+    "negative gains": ("r.npz", npz(stiffness=-5.0), BENCH, "stiffness .*is -5; expected a number of zero or more"),
+    "gains of other joints": ("r.npz", npz(stiffness=[1.0, 2.0]), BENCH, r"stiffness.*(2|two)"),
+    "an unknown load": ("r.npz", npz(added_mass='{"lode": 1.0}'), BENCH, "unknown body 'lode', did you mean 'load'"),
+    "another robot's load": ("r.npz", npz(joints=12, load_mass=1.0), ANYMAL, "load_mass.*belong to the test bench"),
+    "a negative mass": ("r.npz", npz(load_mass=-1.0), BENCH, "load_mass is -1; expected"),
+    "a load without a lever": ("r.npz", npz(load_length=0.0), BENCH, "load_length is 0; expected"),
+    "a drive half on": ("r.npz", npz(torque_enable=np.full(200, 0.5)), BENCH, "torque_enable holds values other"),
+}
+
+OPTIONS = {
+    "no task": (["--data", "GOOD"], "--task is missing"),
+    "an unknown task": (["--task", "Pace-TestBensh-v0"], "Did you mean 'Pace-TestBench-v0'"),
+    "a task that is no robot's": (["--task", "CartPole-v1"], "no environment 'CartPole-v1'"),
+    "a task of an unknown module": (["--task", "nowhere:Pace-X-v0"], "module 'nowhere' cannot be imported"),
+    "a misspelt option": (["--task", BENCH, "--optimiser", "cmaes"], "did you mean --optimizer instead of"),
+    "a shortened option": (["--task", BENCH, "--num", "8"], "unrecognized arguments: --num"),
+    "a word that belongs nowhere": (["--task", BENCH, "fast"], "unrecognized arguments: fast"),
+    "an option without its value": (["--task", BENCH, "--sigma"], "--sigma: expected one argument"),
+    "an unknown optimizer": (["--task", BENCH, "--optimizer", "adam"], "invalid choice: 'adam'.*hybrid"),
+    "an unknown delay mode": (["--task", BENCH, "--delay_mode", "torque"], "invalid choice: 'torque'.*effort"),
+    "no environments": (["--task", BENCH, "--num_envs", "0"], "num_envs is 0, expected at least 1"),
+    "half an environment": (["--task", BENCH, "--num_envs", "1.5"], "--num_envs: invalid int value: '1.5'"),
+    "no generations": (["--task", BENCH, "--max_iteration", "0"], "max_iteration is 0, expected at least 1"),
+    "a negative sigma": (["--task", BENCH, "--sigma", "-0.5"], r"sigma is -0\.5, expected a number > 0"),
+    "a sigma that is no number": (["--task", BENCH, "--sigma", "nan"], "sigma is nan, expected a number > 0"),
+    "an epsilon of zero": (["--task", BENCH, "--epsilon", "0"], "epsilon is 0.0, expected a number > 0"),
+    "a negative seed": (["--task", BENCH, "--seed", "-1"], "seed is -1, expected at least 0"),
+    "a physics step that is no fraction": (
+        ["--task", BENCH, "--physics_dt", "0.001"],
+        "whole fraction of the time step",
+    ),
+    "a coarser physics step": (["--task", BENCH, "--physics_dt", "0.01"], "whole fraction of the time step"),
+    "too few environments": (
+        ["--task", BENCH, "--data", "GOOD", "GOOD", "--optimizer", "cmaes", "--num_envs", "7"],
+        "7 is too few for 2 recordings: expected at least 8",
+    ),
+    "a validation file that is missing": (
+        ["--task", BENCH, "--data", "GOOD", "--validation", "none.npz"],
+        r"none\.npz: no such file",
+    ),
+    "a validation file that is trained on": (
+        ["--task", BENCH, "--data", "GOOD", "--validation", "GOOD"],
+        r"good\.npz.*--data and --validation",
+    ),
+    "logs under a file": (
+        ["--task", BENCH, "--data", "GOOD", "--log_dir", "GOOD"],
+        r"good\.npz.*(ot a directory|exists)",
+    ),
+    "nothing to resume": (["--resume", "nowhere"], "nowhere is no run that can be resumed"),
+    "a folder that is no run": (["--resume", "EMPTY"], "is no run that can be resumed: it has no settings.json"),
+}
+
+
+@pytest.fixture(scope="module")
+def main():
+    return runpy.run_path(str(ROOT / "scripts" / "fit.py"))["main"]
+
+
+@pytest.fixture
+def fails(main, tmp_path, monkeypatch, capfd):
+    """Runs fit.py with arguments, which must fail as they should; returns the message."""
+    monkeypatch.chdir(tmp_path)
+    np.savez(tmp_path / "good.npz", **GOOD)
+    (tmp_path / "empty").mkdir()
+
+    def run(*args, left=()):
+        places = {"GOOD": "good.npz", "EMPTY": "empty"}
+        before = snapshot(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["fit.py", *(places.get(a, a) for a in args)])
+        try:
+            status = run_cli(main)
+        except SystemExit as end:
+            status = end.code
+        out, err = capfd.readouterr()
+        assert status == 2, (status, out, err)
+        assert err.startswith("error: ") and err.count("\n") == 1 and err.endswith("\n"), err
+        assert len(err) > 30 and "Traceback" not in err and out == ""
+        assert snapshot(tmp_path) == before  # no half-written run folder
+        return err
+
+    return run
+
+
+def snapshot(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file() or path.is_dir()}
+
+
+@pytest.mark.parametrize("fault", RECORDINGS)
+def test_a_recording_that_cannot_be_fitted(fault, fails, tmp_path):
+    name, write, task, expected = RECORDINGS[fault]
+    if write is not None:
+        write(tmp_path / name)
+    message = fails("--task", task, "--data", name)
+    assert re.search(expected, message), message
+    assert name in message
+
+
+@pytest.mark.parametrize("fault", OPTIONS)
+def test_options_that_do_not_fit(fault, fails):
+    args, expected = OPTIONS[fault]
+    message = fails(*args)
+    assert re.search(expected, message), message
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that was made."""
+    from problems import record
+
+    from pace_optim.fit import fit
+    from pace_optim.fit_settings import FitSettings
+    from pace_optim.recording import save_recording
+
+    folder = tmp_path_factory.mktemp("run")
+    path = save_recording(folder / "r.npz", record())
+    return fit(
+        FitSettings(task=BENCH, data=[str(path)], optimizer="cmaes", num_envs=4, max_iteration=1, log_dir=str(folder))
+    )[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("settings.json", "{", "settings.json cannot be read"),
+        ("settings.json", "{}", "settings.json cannot be read"),
+        ("settings.json", '{"settings": {"tusk": 1}, "digests": {}}', "settings.json cannot be read"),
+        ("settings.json", '{"settings": {"task": "Pace-X-v0"}, "digests": {}}', "no environment 'Pace-X-v0'"),
+        ("checkpoint.npz", None, "has no checkpoint.npz: it cannot be resumed. Start a new fit."),
+        ("checkpoint.npz", "nonsense", "checkpoint.npz cannot be read"),
+        ("checkpoint.npz", "", "checkpoint.npz cannot be read"),
+        ("history.json", "{", "history.json cannot be read"),
+        ("history.json", None, "history.json cannot be read"),
+    ],
+)
+def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    if content is None:
+        (run / name).unlink()
+    else:
+        (run / name).write_text(content)
+    assert expected in fails("--resume", "run")
+
+
+def test_a_robots_sample_that_is_missing_is_named(fails, monkeypatch):
+    from pace_envs.tasks.pace import test_bench
+
+    cfg = env_cfg(BENCH, data_dir="gone/chirp.npz")
+    monkeypatch.setattr(test_bench, "test_bench_pace_env_cfg", lambda: cfg)
+    assert "gone/chirp.npz" in fails("--task", BENCH)
+
+
+def test_a_parameter_that_cannot_be_applied_leaves_no_run_folder(fails, monkeypatch):
+    from pace_envs.tasks.pace import Parameter, test_bench
+
+    def apply(env, values):
+        raise ValueError("the gear ratio of servo is not known.")
+
+    extra = Parameter(name="gear", unit="1", lower=(1.0,), upper=(2.0,), apply=apply, keys=("servo",))
+    cfg = env_cfg(BENCH, extra_parameters=(extra,))
+    monkeypatch.setattr(test_bench, "test_bench_pace_env_cfg", lambda: cfg)
+    assert "gear ratio of servo" in fails("--task", BENCH, "--data", "GOOD", "--optimizer", "least_squares")
+
+
+def test_the_script_itself_exits_with_2_and_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "fit.py", "--task", BENCH, "--data", "none.npz"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: none.npz") and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_there_are_more_than_twenty_kinds():
+    assert len(RECORDINGS) + len(OPTIONS) > 50
+    assert json.dumps(sorted([*RECORDINGS, *OPTIONS]))
