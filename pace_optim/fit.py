@@ -19,6 +19,7 @@ from pace_optim.fit_warnings import fit_warnings
 from pace_optim.history import History
 from pace_optim.jacobian import colour
 from pace_optim.least_squares import Descent, LeastSquaresCfg
+from pace_optim.other_solutions import with_other_solutions
 from pace_optim.problem import Problem, file_digest, load_problem
 from pace_optim.progress import ProgressLine
 from pace_optim.refine import refine
@@ -283,6 +284,7 @@ class _Fit:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
         uncertainty, every = assess(problem, self.assessor, self.colouring, outcome.x)
+        uncertainty = with_other_solutions(uncertainty, self.descents, space)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
         rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}

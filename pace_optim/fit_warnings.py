@@ -11,6 +11,8 @@ from pace_optim.problem import Problem
 from pace_optim.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
+_UNKNOWN = 0.5
+"""A standard deviation above this part of the bound range leaves a parameter open."""
 
 
 def fit_warnings(
@@ -28,6 +30,19 @@ def fit_warnings(
     if uncertainty.no_influence:
         listed = ", ".join(uncertainty.no_influence)
         warnings.append(f"No influence on these recordings, so the value means nothing: {listed}.")
+    unknown = [
+        label
+        for label, std, low, high in zip(
+            problem.space.labels,
+            uncertainty.std.tolist(),
+            problem.space.lower.tolist(),
+            problem.space.upper.tolist(),
+            strict=True,
+        )
+        if std > _UNKNOWN * (high - low)
+    ]
+    if unknown:
+        warnings.append(f"Hardly known, the error bar is as wide as the bounds: {', '.join(unknown)}.")
     for group in uncertainty.indistinguishable:
         warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
     warnings += _critical_delays(problem, physical)

@@ -37,8 +37,8 @@ class LeastSquaresCfg:
     give_up_ratio: float = 100.0
     """A start whose score is this many times the best one's after a few iterations is dropped."""
 
-    same_valley: float = 1e-2
-    """A start whose score is within this part of the best one's, without being better, is dropped."""
+    same_valley: float = 2e-2
+    """A start that has come this near to the best one, in every normalised parameter, is dropped."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -245,5 +245,5 @@ def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
             continue
         if descent.score > cfg.give_up_ratio * best.score:
             descent.stop_reason = "another start is far better"
-        elif descent.score < (1 + cfg.same_valley) * best.score:
+        elif float((descent.x - best.x).abs().max()) < cfg.same_valley:
             descent.stop_reason = "another start is in the same valley"
