@@ -79,8 +79,10 @@ class Jacobian:
 
     def column(self, entry: int) -> torch.Tensor:
         """Derivative of the error by an entry, (K, R, n); zero for joints that the entry does not move."""
-        row = next(c for c, entries in enumerate(self.colouring.colours) if entry in entries)
-        result = torch.zeros_like(self.columns[row])
+        result = torch.zeros_like(self.residuals.error[0])
+        row = next((c for c, entries in enumerate(self.colouring.colours) if entry in entries), None)
+        if row is None:  # its bounds are equal
+            return result
         joints = list(self.colouring.joints[entry])
         result[..., joints] = self.columns[row][..., joints]
         return result
