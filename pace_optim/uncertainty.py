@@ -142,11 +142,11 @@ def _from_first_sample(
     total = np.zeros((len(free), len(free)))
     residuals, colouring = jacobian.residuals, jacobian.colouring
     row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
-    rows = [row[entry] for entry in free.tolist()]
+    rows = [row.get(entry, 0) for entry in free.tolist()]  # fixed entries have none, and influence nothing
     for moved, joints in zip(initial, initial_joints, strict=True):
         for joint in joints:
             # what a joint moves is its tree: the joints of the entries that move it and not all joints
-            tree = min((set(j) for j in colouring.joints if joint in j), key=len)
+            tree = min((set(j) for j in colouring.joints if joint in j), key=len, default=set())
             influenced = np.array([bool(tree & set(colouring.joints[entry])) for entry in free.tolist()])
             for r in range(residuals.where.shape[1]):
                 at = residuals.where[:, r]
