@@ -61,12 +61,11 @@ def estimate_uncertainty(
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
     """
-    everything = np.arange(space.size)
     samples = int(jacobian.residuals.where.sum())
     hessian, _ = jacobian.normal_equations()
-    middle = _middle(jacobian, everything)
+    middle = _middle(jacobian)
     if initial is not None:
-        middle += _from_first_sample(jacobian, everything, initial, initial_joints)
+        middle += _from_first_sample(jacobian, initial, initial_joints)
     return uncertainty_of(hessian.numpy() * samples, middle, samples, jacobian.colouring, space, x)
 
 
@@ -117,47 +116,49 @@ def uncertainty_of(
     )
 
 
-def _middle(jacobian: Jacobian, free: np.ndarray) -> np.ndarray:
-    """JᵀΣJ over the free entries."""
-    total = np.zeros((len(free), len(free)))
-    residuals = jacobian.residuals
-    moved = {entry: set(jacobian.colouring.joints[entry]) for entry in free.tolist()}
-    row = {entry: c for c, entries in enumerate(jacobian.colouring.colours) for entry in entries}
+def _middle(jacobian: Jacobian) -> np.ndarray:
+    """JᵀΣJ, (size, size)."""
+    residuals, colouring = jacobian.residuals, jacobian.colouring
+    size, row = len(colouring.joints), _row_of(colouring)
+    total = np.zeros((size, size))
     for r in range(residuals.where.shape[1]):
         at = residuals.where[:, r]
         if not bool(at.any()):
             continue
         for joint in range(residuals.error.shape[-1]):
-            own = [i for i, entry in enumerate(free.tolist()) if joint in moved[entry]]
-            columns = jacobian.columns[[row[int(free[i])] for i in own]][:, at, r, joint].numpy()
+            own = [entry for entry in row if joint in colouring.joints[entry]]
+            columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
             total[np.ix_(own, own)] += columns @ _filtered(columns, autocovariance(error)).T
     return total
 
 
 def _from_first_sample(
-    jacobian: Jacobian, free: np.ndarray, initial: torch.Tensor, initial_joints: Sequence[tuple[int, ...]]
+    jacobian: Jacobian, initial: torch.Tensor, initial_joints: Sequence[tuple[int, ...]]
 ) -> np.ndarray:
     """JᵀSSᵀJ σ², S the derivative by a joint's first position and σ² the variance of its samples' white noise."""
-    total = np.zeros((len(free), len(free)))
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
-    rows = [row.get(entry, 0) for entry in free.tolist()]  # fixed entries have none, and influence nothing
+    size, row = len(colouring.joints), _row_of(colouring)
+    total = np.zeros((size, size))
     for moved, joints in zip(initial, initial_joints, strict=True):
         for joint in joints:
             # what a joint moves is its tree: the joints of the entries that move it and not all joints
             tree = min((set(j) for j in colouring.joints if joint in j), key=len, default=set())
-            influenced = np.array([bool(tree & set(colouring.joints[entry])) for entry in free.tolist()])
+            own = [entry for entry in row if tree & set(colouring.joints[entry])]
             for r in range(residuals.where.shape[1]):
                 at = residuals.where[:, r]
                 if int(at.sum()) < 2:
                     continue
-                error = residuals.error[0, at, r, joint]
-                noise = 0.5 * float(error.diff().square().mean())
-                columns = jacobian.columns[rows][:, :, r, sorted(tree)]
-                effect = (columns * moved[None, :, r, sorted(tree)]).sum(dim=(1, 2)).numpy() * influenced
-                total += noise * np.outer(effect, effect)
+                noise = 0.5 * float(residuals.error[0, at, r, joint].diff().square().mean())
+                columns = jacobian.columns[[row[entry] for entry in own]][:, :, r, sorted(tree)]
+                effect = (columns * moved[None, :, r, sorted(tree)]).sum(dim=(1, 2)).numpy()
+                total[np.ix_(own, own)] += noise * np.outer(effect, effect)
     return total
+
+
+def _row_of(colouring: Colouring) -> dict[int, int]:
+    """The Jacobian's row of each entry that is not fixed."""
+    return {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
 
 
 def autocovariance(error: np.ndarray) -> np.ndarray:
