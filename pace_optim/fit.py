@@ -104,6 +104,8 @@ def _load(settings: FitSettings) -> Problem:
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
             f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
         )
+    if not bool((problem.space.upper > problem.space.lower).any()):
+        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
     _try_out(problem)
     return problem
 

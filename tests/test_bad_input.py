@@ -1,6 +1,5 @@
 """Bad input to scripts/fit.py: one line that names the fault and its cure, exit status 2, nothing half-written."""
 
-import json
 import re
 import runpy
 import shutil
@@ -11,9 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import ANYMAL, BENCH, env_cfg
+from problems import ANYMAL, BENCH, env_cfg, record
 
+from pace_envs.tasks.pace import Parameter, test_bench
 from pace_optim.cli import run_cli
+from pace_optim.fit import fit
+from pace_optim.fit_settings import FitSettings
+from pace_optim.recording import save_recording
 
 ROOT = Path(__file__).parents[1]
 JOINTS = env_cfg(ANYMAL).sim2real.joint_order
@@ -182,11 +185,6 @@ def test_options_that_do_not_fit(fault, fails):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A run that was made."""
-    from problems import record
-
-    from pace_optim.fit import fit
-    from pace_optim.fit_settings import FitSettings
-    from pace_optim.recording import save_recording
 
     folder = tmp_path_factory.mktemp("run")
     path = save_recording(folder / "r.npz", record())
@@ -220,16 +218,20 @@ def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, 
 
 
 def test_a_robots_sample_that_is_missing_is_named(fails, monkeypatch):
-    from pace_envs.tasks.pace import test_bench
-
     cfg = env_cfg(BENCH, data_dir="gone/chirp.npz")
     monkeypatch.setattr(test_bench, "test_bench_pace_env_cfg", lambda: cfg)
     assert "gone/chirp.npz" in fails("--task", BENCH)
 
 
-def test_a_parameter_that_cannot_be_applied_leaves_no_run_folder(fails, monkeypatch):
-    from pace_envs.tasks.pace import Parameter, test_bench
+def test_bounds_that_leave_nothing_to_identify_are_told(fails, monkeypatch):
+    bounds = env_cfg(BENCH).sim2real.bounds_params.clone()
+    bounds[:, 1] = bounds[:, 0]
+    cfg = env_cfg(BENCH, bounds_params=bounds)
+    monkeypatch.setattr(test_bench, "test_bench_pace_env_cfg", lambda: cfg)
+    assert "there is nothing to identify" in fails("--task", BENCH, "--data", "GOOD")
 
+
+def test_a_parameter_that_cannot_be_applied_leaves_no_run_folder(fails, monkeypatch):
     def apply(env, values):
         raise ValueError("the gear ratio of servo is not known.")
 
@@ -249,8 +251,3 @@ def test_the_script_itself_exits_with_2_and_one_line(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("error: none.npz") and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_there_are_more_than_twenty_kinds():
-    assert len(RECORDINGS) + len(OPTIONS) > 50
-    assert json.dumps(sorted([*RECORDINGS, *OPTIONS]))
