@@ -256,6 +256,7 @@ class _Fit:
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         best = min(d.score for d in descents)
+        self._refuse_divergence(best)
         self.descents = list(descents)
         self.history.refine_best.append(best)
         self.history.refine_steps.append(self.steps)
@@ -264,6 +265,13 @@ class _Fit:
         self.log.log_refinement(iteration, best)
         self.progress.show("refine", iteration, LeastSquaresCfg().max_iteration, best, None, self.steps)
         self._write_checkpoint()
+
+    def _refuse_divergence(self, score: float) -> None:
+        if not np.isfinite(score):
+            raise ValueError(
+                f"The best candidate's simulation diverges, so there is no result; {self.folder.path} holds the "
+                "settings only. Lower the bounds of the delay, or check the gains that were in force."
+            )
 
     def _best_so_far(self) -> torch.Tensor:
         known = [d for d in self.descents if np.isfinite(d.score)]
@@ -286,6 +294,7 @@ class _Fit:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
         uncertainty, every = assess(problem, self.assessor, self.colouring, outcome.x)
+        self._refuse_divergence(float(every.score[0]))
         uncertainty = with_other_solutions(uncertainty, self.descents, space)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}

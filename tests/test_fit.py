@@ -15,7 +15,7 @@ from pace_optim.fit import fit, resume
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
 from pace_optim.progress import ProgressLine
-from pace_optim.recording import Load, save_recording
+from pace_optim.recording import Drive, Load, load_recording, save_recording
 from pace_optim.summary import summary
 
 DESIGN_KEYS = {
@@ -330,3 +330,11 @@ def test_a_recording_that_has_changed_is_not_resumed(recordings, tmp_path, no_re
     copy.unlink()
     with pytest.raises(ValueError, match=r"copy\.npz has changed or gone"):
         resume(folder)
+
+
+def test_a_fit_in_which_everything_diverges_says_so(recordings, tmp_path):
+    wild = Drive(damping=np.array([1e8]), effort_limit=np.array([1e300]), saturation_effort=np.array([1e300]))
+    recording = dataclasses.replace(load_recording(recordings["clean"]), drive=wild)
+    path = save_recording(tmp_path / "wild.npz", recording)
+    with pytest.raises(ValueError, match=r"simulation diverges.*Lower the bounds"):
+        run(tmp_path, str(path), optimizer="least_squares")
