@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
 from pace_optim.dataset import Dataset
 from pace_optim.evaluator import Evaluator
-from pace_optim.jacobian import Colouring
+from pace_optim.jacobian import Colouring, jacobian, perturbed
 from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
 
 _COARSE_PART = 0.25
@@ -38,6 +39,8 @@ def refine(
     descents = list(starts)
     if all(descent.iteration == 0 for descent in descents):
         descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents])
+        if on_iteration is not None:
+            on_iteration(descents)
     return least_squares(evaluator, colouring, descents, on_iteration=on_iteration)
 
 
@@ -48,14 +51,20 @@ def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequ
     """
     ends = [d.x for d in least_squares(evaluator, colouring, starts, _COARSE, where=beginning(evaluator.dataset))]
     candidates = torch.stack([*ends, *starts])
-    scores = evaluator.residuals(evaluator.space.to_physical(candidates)).score
+    neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
+    residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))
+    scores = residuals.score[: len(candidates)]
     kept: list[Descent] = []
     for i in scores.argsort().tolist():
         x = candidates[i]
         if kept and not scores[i] < _MUCH_WORSE * scores.min():
             break
         if all(float((x - other.x).abs().max()) > _ANOTHER_VALLEY for other in kept):
-            kept.append(Descent(x=x, damping=_DAMPING_AFTER_COARSE))
+            kept.append(Descent(x=x, score=float(scores[i]), damping=_DAMPING_AFTER_COARSE, iteration=1))
+    for descent in kept:
+        if torch.equal(descent.x, ends[0]):
+            around = torch.cat([residuals.error[:1], residuals.error[len(candidates) :]])
+            descent.jacobian = jacobian(replace(residuals, error=around), step, colouring)
     return kept[: len(starts)]
 
 
