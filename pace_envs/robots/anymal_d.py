@@ -1,8 +1,8 @@
 """ANYmal D (ANYbotics), twelve series-elastic drives treated as DC motors."""
 
 from pace_actuators import PaceDCMotorCfg
-from pace_assets import ASSETS_DIR
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
+from pace_envs.assets_dir import ASSETS_DIR
 
 ANYMAL_D_JOINTS = tuple(f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE"))
 

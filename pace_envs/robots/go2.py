@@ -1,8 +1,8 @@
 """Unitree Go2, twelve quasi-direct drives."""
 
 from pace_actuators import PaceDCMotorCfg
-from pace_assets import ASSETS_DIR
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
+from pace_envs.assets_dir import ASSETS_DIR
 
 GO2_JOINTS = tuple(f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf"))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from pace_assets import ASSETS_DIR
 from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots.anymal_d import anymal_d_drive_cfg
 from pace_envs.simulation import EnvIds
 

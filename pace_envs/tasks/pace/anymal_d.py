@@ -1,6 +1,6 @@
 """Identification of ANYmal D: PACE's reference case."""
 
-from pace_assets import ASSETS_DIR
+from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import ANYMAL_D_JOINTS, anymal_d_cfg
 from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, make_bounds
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg

@@ -1,6 +1,6 @@
 """Identification of the Unitree Go2."""
 
-from pace_assets import ASSETS_DIR
+from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import GO2_JOINTS, go2_cfg
 from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, make_bounds
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg

@@ -1,6 +1,6 @@
 """Identification of one drive on a bench."""
 
-from pace_assets import ASSETS_DIR
+from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import TEST_BENCH_JOINTS, apply_test_bench_load, test_bench_cfg
 from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, make_bounds
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
