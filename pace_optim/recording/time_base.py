@@ -113,10 +113,10 @@ def _resolution(time: np.ndarray) -> float:
 
 
 def _rate_note(step: np.ndarray, mean: float) -> str:
-    return (
-        f"{len(step) + 1} samples at {1 / mean:.4g} Hz over {mean * len(step):.4g} s; steps of "
-        f"{mean * 1e3:.4g} ms, std {step.std() * 1e3:.2g} ms, longest {step.max() * 1e3:.4g} ms."
-    )
+    rate = f"{len(step) + 1} samples at {1 / mean:.4g} Hz over {mean * len(step):.4g} s; steps of {mean * 1e3:.4g} ms"
+    if float(np.ptp(step)) < 1e-6 * mean:
+        return f"{rate}, even."
+    return f"{rate}, std {step.std() * 1e3:.2g} ms, longest {step.max() * 1e3:.4g} ms."
 
 
 def _gap_notes(time: np.ndarray, step: np.ndarray, median: float) -> list[str]:
