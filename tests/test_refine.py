@@ -1,0 +1,65 @@
+"""Refining goes from the beginning of a recording to all of it, and must end where least squares alone ends."""
+
+import pytest
+import torch
+from problems import make_problem, normalised
+
+from pace_optim.dataset import make_dataset
+from pace_optim.jacobian import colour, jacobian, perturbed
+from pace_optim.least_squares import Descent, least_squares
+from pace_optim.refine import beginning, refine
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return make_problem()
+
+
+@pytest.fixture
+def colouring(problem):
+    return colour(problem.space, problem.trees, problem.joint_names)
+
+
+def centre(problem):
+    return torch.zeros(problem.space.size, dtype=torch.float64)
+
+
+def test_the_beginning_is_the_first_quarter_of_the_training_samples(problem):
+    dataset = make_dataset(problem.dataset.recordings, train_fraction=0.7)
+    chosen, count = beginning(dataset), int(dataset.train.sum())
+    assert not bool((chosen & ~dataset.train).any())
+    assert int(chosen.sum()) == -(-count // 4)
+    assert bool(chosen[: int(chosen.sum())].all())
+
+
+def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem, colouring):
+    plain, refined = problem.training_evaluator(), problem.training_evaluator()
+    least_squares(plain, colouring, [centre(problem)])
+    best = refine(refined, colouring, [Descent(x=centre(problem))])[0]
+    assert best.score < 1e-14
+    torch.testing.assert_close(best.x, normalised(problem), atol=1e-4, rtol=0)
+    assert refined.simulated_steps < plain.simulated_steps
+
+
+def test_the_derivatives_that_it_starts_with_are_those_of_where_it_starts(problem, colouring):
+    seen = []
+    refine(
+        problem.training_evaluator(),
+        colouring,
+        [Descent(x=centre(problem))],
+        lambda descents: seen.append((descents[0].x.clone(), descents[0].jacobian)),
+    )
+    x, given = seen[0]
+    assert given is not None
+    neighbours, step = perturbed(x, colouring)
+    physical = problem.space.to_physical(torch.cat([x[None], neighbours]))
+    fresh = jacobian(problem.training_evaluator().residuals(physical), step, colouring)
+    torch.testing.assert_close(given.columns, fresh.columns, atol=1e-8, rtol=1e-5)
+    torch.testing.assert_close(given.residuals.error, fresh.residuals.error, atol=1e-14, rtol=0)
+
+
+def test_a_start_that_is_better_than_its_coarse_end_is_kept(problem, colouring):
+    truth = normalised(problem)
+    seen = []
+    refine(problem.training_evaluator(), colouring, [Descent(x=truth)], lambda d: seen.append(d[0].score))
+    assert seen[0] < 1e-14
