@@ -55,6 +55,21 @@ def test_white_noise_gives_the_classic_covariance():
     assert (found.at_bound, found.no_influence, found.indistinguishable) == ((), (), ())
 
 
+def test_the_first_samples_noise_adds_its_own_variance():
+    # one parameter, residual e = J dx + S dq0: Var(x) = σ²/JᵀJ + σ² (JᵀS / JᵀJ)²
+    rng, count, sigma = np.random.default_rng(3), 4000, 1e-3
+    column, moved = np.full(count, 0.7), np.exp(-np.arange(count) / 500.0)
+    problem, space = linear([column], sigma * rng.standard_normal(count))
+    x = torch.zeros(1, dtype=torch.float64)
+    initial = torch.as_tensor(moved)[None, :, None, None]
+    without = estimate_uncertainty(problem, space, x).std[0]
+    found = estimate_uncertainty(problem, space, x, initial, ((0,),)).std[0]
+    information = column @ column
+    added = sigma * (column @ moved) / information
+    assert added > 5 * without
+    assert found == pytest.approx(np.hypot(sigma / np.sqrt(information), added), rel=0.05)
+
+
 def test_the_degrees_of_freedom_that_the_parameters_take_are_given_back():
     rng, ratio = np.random.default_rng(1), []
     for _ in range(200):

@@ -1,0 +1,69 @@
+"""Recordings that disagree are named, with the gain that would explain it; those that agree are left in peace."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from problems import chirp, env_cfg, make_problem, record
+
+from pace_envs import ManagerBasedRLEnv
+from pace_optim.consistency import check_consistency
+from pace_optim.jacobian import colour
+from pace_optim.least_squares import least_squares
+from pace_optim.problem import load_problem
+from pace_optim.recording import Drive
+
+GAINS = {"soft": (60.0, 1.0), "middle": (85.0, 2.0), "stiff": (120.0, 4.0)}
+
+
+def checked(recordings):
+    problem = make_problem(recordings)
+    start = torch.zeros(problem.space.size, dtype=torch.float64)
+    evaluator = problem.training_evaluator()
+    best = least_squares(evaluator, colour(problem.space, problem.trees, problem.joint_names), [start])[0]
+    return check_consistency(problem, best.x, best.score)
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return [
+        record(chirp(2.0), drive={"stiffness": kp, "damping": kd}, name=name, noise=1e-4, seed=seed)
+        for seed, (name, (kp, kd)) in enumerate(GAINS.items())
+    ]
+
+
+def test_recordings_at_three_gains_agree(recordings):
+    found = checked(recordings)
+    assert found.recordings == ("soft", "middle", "stiff")
+    assert found.sentences == ()
+    assert all(len(values) == 3 for values in found.values.values())
+    assert found.simulated_steps > 0
+
+
+def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording_and_its_size(recordings):
+    wrong = dataclasses.replace(
+        recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([4.0 / 1.3])), name="wrong"
+    )
+    sentences = checked([*recordings[:2], wrong]).sentences
+    assert any("viscous friction" in s and "another in wrong" in s for s in sentences)
+    gain = [s for s in sentences if "behaves as if" in s]
+    assert len(gain) == 1
+    assert gain[0].startswith("wrong behaves as if its damping were 30% higher than stated (4 instead of 3.08")
+
+
+def test_one_recording_has_nothing_to_disagree_with(recordings):
+    problem = make_problem(recordings[:1])
+    assert check_consistency(problem, torch.zeros(problem.space.size, dtype=torch.float64), 1.0).recordings == ()
+
+
+def test_a_controller_of_another_rate_than_the_environment_is_refused(monkeypatch):
+    def cfg(task):
+        other = env_cfg()
+        other.decimation = 4
+        return other
+
+    monkeypatch.setattr("pace_optim.problem.load_env_cfg", cfg)
+    monkeypatch.setattr(ManagerBasedRLEnv, "__init__", lambda *args: pytest.fail("checked too late"))
+    with pytest.raises(ValueError, match=r"controller runs every 2\.5 ms, the environment steps every 10 ms"):
+        load_problem("Pace-TestBench-v0")
