@@ -17,6 +17,7 @@ from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvC
 _TASKS = {
     "Pace-AnymalD-v0": "pace_envs.tasks.pace.anymal_d:anymal_d_pace_env_cfg",
     "Pace-Go2-v0": "pace_envs.tasks.pace.go2:go2_pace_env_cfg",
+    "Pace-SO101-v0": "pace_envs.tasks.pace.so101:so101_pace_env_cfg",
     "Pace-TestBench-v0": "pace_envs.tasks.pace.test_bench:test_bench_pace_env_cfg",
 }
 

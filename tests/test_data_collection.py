@@ -69,7 +69,7 @@ def replay_score(recording, task: str, *, parameters=None, physics_dt=None, dela
 # --- replay
 
 
-@pytest.mark.parametrize("task", ["Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-TestBench-v0"])
+@pytest.mark.parametrize("task", ["Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0"])
 def test_the_sample_recording_replays_exactly_with_the_true_parameters(task):
     cfg = pace_envs.load_env_cfg(task).sim2real
     recording = load_recording(cfg.data_dir)
@@ -92,7 +92,7 @@ def test_the_sample_recording_of_anymal_is_the_reference_case():
 
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 @pytest.mark.parametrize("delay", [0.0, 2.4])
-@pytest.mark.parametrize("task", ["Pace-Go2-v0", "Pace-TestBench-v0"])
+@pytest.mark.parametrize("task", ["Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0"])
 def test_recordings_replay_exactly_in_both_delay_modes(task, delay, delay_mode, tmp_path):
     options = ("--task", task, *SHORT, "--delay_mode", delay_mode, "--parameter", f"delay={delay}")
     recording = record(tmp_path, *options)

@@ -15,7 +15,7 @@ from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, InitialStateCfg, ManagerBasedRLEnv, load_env_cfg
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 
-TASKS = {"Pace-AnymalD-v0": 12, "Pace-Go2-v0": 12, "Pace-TestBench-v0": 1}
+TASKS = {"Pace-AnymalD-v0": 12, "Pace-Go2-v0": 12, "Pace-SO101-v0": 6, "Pace-TestBench-v0": 1}
 
 
 @pytest.mark.parametrize(("task", "joints"), TASKS.items())

@@ -12,7 +12,7 @@ from pace_optim.excitation import Trajectory, excitations, make_excitation, regi
 from pace_optim.motion_check import MotionLimits, check_command, check_simulated, refuse_errors, summarise
 
 DT = 0.0025
-TASKS = ("Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-TestBench-v0")
+TASKS = ("Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0")
 NAMES = ("battery", "chirp", "multisine", "ramp", "steps")
 
 

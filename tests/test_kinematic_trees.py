@@ -25,6 +25,10 @@ def test_the_legs_of_a_robot_whose_base_is_fixed_are_four_trees_of_three_joints(
     assert sorted(name for tree in found for name in tree) == sorted(cfg.sim2real.joint_order)
 
 
+def test_an_arm_is_one_tree():
+    assert trees(env_cfg("Pace-SO101-v0")) == [list(env_cfg("Pace-SO101-v0").sim2real.joint_order)]
+
+
 def test_trees_follow_the_joint_order_and_not_the_model():
     cfg = env_cfg("Pace-AnymalD-v0")
     order = tuple(reversed(cfg.sim2real.joint_order))
