@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import torch
 
+from pace_envs.quaternions import down, rotate_inverse
+
 
 @dataclass(kw_only=True)
 class ArticulationData:
@@ -42,3 +44,24 @@ class ArticulationData:
     """Linear velocity of a floating base in the world [m/s], (num_envs, 3)."""
     root_ang_vel_b: torch.Tensor | None = None
     """Angular velocity of a floating base in its frame [rad/s], (num_envs, 3)."""
+
+    @property
+    def root_lin_vel_b(self) -> torch.Tensor:
+        """Linear velocity of a floating base in its frame [m/s], (num_envs, 3)."""
+        return rotate_inverse(of_floating_base(self.root_quat_w), of_floating_base(self.root_lin_vel_w))
+
+    @property
+    def projected_gravity_b(self) -> torch.Tensor:
+        """Direction of gravity in a floating base's frame, (num_envs, 3)."""
+        return down(of_floating_base(self.root_quat_w))
+
+
+def of_floating_base(state: torch.Tensor | None) -> torch.Tensor:
+    """A part of the root's state.
+
+    Raises:
+        ValueError: If the base is fixed.
+    """
+    if state is None:
+        raise ValueError("This robot's base is fixed: it has no root state. Set fix_base=False.")
+    return state

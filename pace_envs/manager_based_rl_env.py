@@ -13,6 +13,8 @@ from pace_envs.manager_based_env import ManagerBasedEnv, ManagerBasedEnvCfg
 from pace_envs.managers import (
     CommandManager,
     CommandTermCfg,
+    CurriculumManager,
+    CurriculumTermCfg,
     RewardManager,
     RewardTermCfg,
     TerminationManager,
@@ -36,14 +38,17 @@ class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
     terminations: Mapping[str, TerminationTermCfg] = field(default_factory=dict)
     """Terminations by name."""
 
+    curriculum: Mapping[str, CurriculumTermCfg] = field(default_factory=dict)
+    """Curriculum terms by name."""
+
 
 class ManagerBasedRLEnv(ManagerBasedEnv):
     """A :class:`ManagerBasedEnv` with an episode.
 
-    A step: (1) action and physics; (2) terminations; (3) rewards; (4) environments that are done are reset;
-    (5) commands; (6) interval events; (7) observations. The observation of an environment that was reset is
-    the first of its new episode (Gymnasium's "same step" autoreset); ``extras["final_obs"]`` holds the last
-    one of the old episode where ``extras["_final_obs"]`` is true.
+    A step: (1) action, physics, contacts; (2) terminations; (3) rewards; (4) the curriculum judges environments that
+    are done, and they are reset; (5) commands; (6) interval events; (7) observations. The observation of an
+    environment that was reset is the first of its new episode (Gymnasium's "same step" autoreset);
+    ``extras["final_obs"]`` holds the last one of the old episode where ``extras["_final_obs"]`` is true.
     """
 
     cfg: ManagerBasedRLEnvCfg
@@ -71,6 +76,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         super().load_managers()
         self.termination_manager = TerminationManager(self.cfg.terminations, self)
         self.reward_manager = RewardManager(self.cfg.rewards, self)
+        self.curriculum_manager = CurriculumManager(self.cfg.curriculum, self)
 
     def step(  # type: ignore[override]  # gym.Env knows one reward, this is one per environment
         self, action: torch.Tensor
@@ -85,6 +91,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """
         self.extras = {}
         self.simulate(action)
+        self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()
         reward = self.reward_manager.compute(self.step_dt)
@@ -101,7 +108,9 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         return self.observation_manager.compute(), reward, terminated, truncated, self.extras
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
+        self.curriculum_manager.compute(env_ids)
         log = self.reward_manager.reset(env_ids) | self.termination_manager.reset(env_ids)
+        log |= self.curriculum_manager.reset(env_ids)
         super()._reset_idx(env_ids)
         self.command_manager.reset(env_ids)
         self.episode_length_buf[env_ids] = 0

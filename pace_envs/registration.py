@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from pace_actuators.effects import effect_cfgs
 from pace_envs.gym_vector import PaceVectorEnv
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
@@ -19,6 +20,8 @@ _TASKS = {
     "Pace-Go2-v0": "pace_envs.tasks.pace.go2:go2_pace_env_cfg",
     "Pace-SO101-v0": "pace_envs.tasks.pace.so101:so101_pace_env_cfg",
     "Pace-TestBench-v0": "pace_envs.tasks.pace.test_bench:test_bench_pace_env_cfg",
+    "Pace-AnymalD-Velocity-v0": "pace_envs.tasks.velocity.anymal_d:anymal_d_velocity_env_cfg",
+    "Pace-Go2-Velocity-v0": "pace_envs.tasks.velocity.go2:go2_velocity_env_cfg",
 }
 
 
@@ -113,6 +116,9 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
+    The drives are called as before, their torques held over the finer steps, unless they have an effect with fast
+    dynamics of its own: then they are called at every physics step.
+
     Raises:
         ValueError: If the present time step is no multiple of the finer one.
     """
@@ -122,10 +128,13 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
             f"physics_dt is {physics_dt:g} s, expected a whole fraction of the time step {cfg.sim.dt:g} s, "
             f"such as {cfg.sim.dt / 5:g}."
         )
-    cfg.sim.dt = cfg.sim.dt / ratio
-    cfg.decimation *= ratio
-    for drive in cfg.scene.robot.actuators.values():
-        drive.control_decimation *= ratio
+    cfg.sim.substeps = ratio
+    drives = cfg.scene.robot.actuators.values()
+    if any(effect.effect_class.every_physics_step for drive in drives for effect in effect_cfgs(drive.effects)):
+        cfg.sim.dt, cfg.sim.substeps = cfg.sim.dt / ratio, 1
+        cfg.decimation *= ratio
+        for drive in drives:
+            drive.control_decimation *= ratio
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

@@ -1,11 +1,15 @@
-"""The scene: a robot and, where it walks, the ground."""
+"""The scene: a robot and, where it walks, the ground and what feels it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import mujoco
+import torch
 
+from pace_actuators import match_names
 from pace_envs.articulation import Articulation, load_robot_spec
 from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
 from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
 
 
@@ -14,7 +18,17 @@ class TerrainCfg:
     """Flat ground."""
 
     friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
-    """Sliding, torsional [m] and rolling [m] friction coefficient."""
+    """Sliding, torsional [m] and rolling [m] friction coefficient, where the robot's geoms do not take precedence."""
+
+    collision_geoms: str | tuple[str, ...] | None = None
+    """Expressions of the robot's geoms that may touch the ground; ``None`` means all that the model lets touch it."""
+
+    impratio: float | None = None
+    """Stiffness of friction over that of normal forces; ``None`` means the model's.
+
+    The higher, the less a stance foot creeps, and the slower the solver: a standing ANYmal is stepped twice as fast
+    with 1 as with 100.
+    """
 
 
 @dataclass(kw_only=True)
@@ -30,24 +44,24 @@ class InteractiveSceneCfg:
     terrain: TerrainCfg | None = None
     """The ground, or ``None`` for a robot in the air."""
 
+    contact_sensors: Mapping[str, ContactSensorCfg] = field(default_factory=dict)
+    """What feels contacts, by name: ``scene.sensors["feet"]``."""
+
 
 class InteractiveScene:
-    """The entities of all environments, by name: ``scene["robot"]``."""
+    """The entities of all environments, by name: ``scene["robot"]``, and sensors: ``scene.sensors["feet"]``."""
 
     def __init__(self, cfg: InteractiveSceneCfg, sim_cfg: SimulationCfg):
         """Build the model, start its simulations and find the robot in them."""
         self.cfg = cfg
         spec = load_robot_spec(cfg.robot)
         if cfg.terrain is not None:
-            spec.worldbody.add_geom(
-                name="terrain",
-                type=mujoco.mjtGeom.mjGEOM_PLANE,
-                size=[0, 0, 0.05],
-                friction=cfg.terrain.friction,
-                rgba=[0.42, 0.45, 0.48, 1.0],
-            )
+            _add_terrain(spec, cfg.terrain)
+        for name, sensor in cfg.contact_sensors.items():
+            add_contact_sensor(spec, name, sensor)
         self.sim = Simulation(sim_cfg, spec, cfg.num_envs)
         self.articulations = {"robot": Articulation(cfg.robot, self.sim)}
+        self.sensors = {name: ContactSensor(c, name, self.sim) for name, c in cfg.contact_sensors.items()}
 
     @property
     def num_envs(self) -> int:
@@ -65,6 +79,9 @@ class InteractiveScene:
         self.sim.reset(env_ids)
         for articulation in self.articulations.values():
             articulation.reset(env_ids)
+        rows = slice(None) if env_ids is None else torch.as_tensor(self.sim.resolve_env_ids(env_ids)).long()
+        for sensor in self.sensors.values():
+            sensor.reset(rows)
 
     def write_data_to_sim(self) -> None:
         """Run the drives and apply their torques."""
@@ -75,3 +92,29 @@ class InteractiveScene:
         """Read the state after a physics step."""
         for articulation in self.articulations.values():
             articulation.update()
+
+    def update_sensors(self, dt: float) -> None:
+        """Read the contacts after an environment step of ``dt`` seconds."""
+        for sensor in self.sensors.values():
+            sensor.update(dt)
+
+
+def _add_terrain(spec: mujoco.MjSpec, cfg: TerrainCfg) -> None:
+    colliding = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
+    if cfg.collision_geoms is not None:
+        matched = match_names(cfg.collision_geoms, [geom.name for geom in colliding], what="collision geom")
+        kept = {i for group in matched for i in group}
+        for i, geom in enumerate(colliding):
+            if i not in kept:
+                geom.contype = geom.conaffinity = 0
+    if cfg.impratio is not None:
+        spec.option.impratio = cfg.impratio
+    ground = spec.worldbody.add_geom(
+        name="terrain",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        friction=cfg.friction,
+        rgba=[0.42, 0.45, 0.48, 1.0],
+    )
+    if any(material.name == "ground" for material in spec.materials):
+        ground.material, ground.rgba = "ground", [1.0, 1.0, 1.0, 1.0]

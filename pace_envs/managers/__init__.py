@@ -2,6 +2,7 @@
 
 from pace_envs.managers.action_manager import ActionManager, ActionTerm, ActionTermCfg
 from pace_envs.managers.command_manager import CommandManager, CommandTerm, CommandTermCfg
+from pace_envs.managers.curriculum_manager import CurriculumManager, CurriculumTermCfg
 from pace_envs.managers.event_manager import EventManager, EventTermCfg
 from pace_envs.managers.manager_base import ManagerTermBase, ManagerTermBaseCfg, SceneEntityCfg, Term
 from pace_envs.managers.observation_manager import (
@@ -20,6 +21,8 @@ __all__ = [
     "CommandManager",
     "CommandTerm",
     "CommandTermCfg",
+    "CurriculumManager",
+    "CurriculumTermCfg",
     "EventManager",
     "EventTermCfg",
     "ManagerTermBase",

@@ -36,6 +36,11 @@ class RewardManager:
         """Names of the terms."""
         return list(self._sums)
 
+    @property
+    def episode_sums(self) -> dict[str, torch.Tensor]:
+        """What each term has earned in the present episodes, weighted, (num_envs,)."""
+        return self._sums
+
     def get_term_cfg(self, name: str) -> RewardTermCfg:
         """The configuration of a term; its weight can be changed."""
         if name not in self._sums:

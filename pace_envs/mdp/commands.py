@@ -14,13 +14,18 @@ if TYPE_CHECKING:
 
 
 class UniformVelocityCommand(CommandTerm):
-    """Velocity of the base in its own frame: forward [m/s], left [m/s], yaw rate [rad/s]."""
+    """Velocity of the base in its own frame: forward [m/s], left [m/s], yaw rate [rad/s].
+
+    Attributes:
+        scale: Part of the ranges that is drawn from, 0 to 1; a curriculum can change it.
+    """
 
     cfg: UniformVelocityCommandCfg
 
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedEnv):
         """Start with zero commands."""
         super().__init__(cfg, env)
+        self.scale = 1.0
         self._command = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)
         ranges = torch.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z], dtype=torch.float64)
         self._low, self._high = ranges[:, 0], ranges[:, 1]
@@ -31,7 +36,7 @@ class UniformVelocityCommand(CommandTerm):
         return self._command
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
-        drawn = self._env.uniform((len(env_ids), 3), self._low, self._high)
+        drawn = self._env.uniform((len(env_ids), 3), self._low, self._high) * self.scale
         standing = self._env.uniform((len(env_ids), 1)) < self.cfg.rel_standing_envs
         self._command[env_ids] = drawn.masked_fill(standing, 0.0)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from pace_envs.managers import SceneEntityCfg
+from pace_envs.quaternions import from_euler, multiply
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -48,7 +49,7 @@ def reset_root_state_uniform(
     default = torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64)
     state = default.repeat(len(env_ids), 1)
     state[:, :3] += pose[:, :3]
-    state[:, 3:7] = _multiply(state[:, 3:7], _quat_from_euler(pose[:, 3:]))
+    state[:, 3:7] = multiply(state[:, 3:7], from_euler(pose[:, 3:]))
     state[:, 7:] += velocity
     asset.write_root_state_to_sim(state, env_ids)
 
@@ -74,24 +75,3 @@ def _draw(env: ManagerBasedEnv, count: int, ranges: Mapping[str, tuple[float, fl
         raise ValueError(f"Unknown axes {', '.join(sorted(unknown))}. Available: {', '.join(_AXES)}.")
     bounds = torch.tensor([ranges.get(axis, (0.0, 0.0)) for axis in _AXES], dtype=torch.float64)
     return env.uniform((count, 6), bounds[:, 0], bounds[:, 1])
-
-
-def _quat_from_euler(angles: torch.Tensor) -> torch.Tensor:
-    """Quaternion w x y z of roll, pitch, yaw about fixed x, y, z."""
-    (cr, cp, cy), (sr, sp, sy) = (angles / 2).cos().T, (angles / 2).sin().T
-    return torch.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        dim=1,
-    )
-
-
-def _multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Product of quaternions w x y z."""
-    aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    w = aw * bw - (av * bv).sum(dim=1, keepdim=True)
-    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=1)

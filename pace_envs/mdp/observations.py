@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_envs.articulation_data import of_floating_base
 from pace_envs.managers import SceneEntityCfg
 
 if TYPE_CHECKING:
@@ -26,6 +27,15 @@ def joint_pos_rel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> t
     return (data.joint_pos - data.default_joint_pos)[:, asset_cfg.joint_ids]
 
 
+def encoder_pos_rel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """What the drives' encoders show relative to the defaults, q - bias - q_default [rad]."""
+    robot = env.scene[asset_cfg.name]
+    position = robot.data.joint_pos - robot.data.default_joint_pos
+    for actuator in robot.actuators.values():
+        position[:, actuator.joint_indices] -= actuator.encoder_bias
+    return position[:, asset_cfg.joint_ids]
+
+
 def joint_vel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
     """Joint velocities [rad/s]."""
     return env.scene[asset_cfg.name].data.joint_vel[:, asset_cfg.joint_ids]
@@ -39,3 +49,18 @@ def last_action(env: ManagerBasedEnv) -> torch.Tensor:
 def generated_commands(env: ManagerBasedRLEnv, command_name: str) -> torch.Tensor:
     """The present command of a command term."""
     return env.command_manager.get_command(command_name)
+
+
+def base_lin_vel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Linear velocity of the base in its frame [m/s]."""
+    return env.scene[asset_cfg.name].data.root_lin_vel_b
+
+
+def base_ang_vel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Angular velocity of the base in its frame [rad/s]."""
+    return of_floating_base(env.scene[asset_cfg.name].data.root_ang_vel_b)
+
+
+def projected_gravity(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Direction of gravity in the base's frame."""
+    return env.scene[asset_cfg.name].data.projected_gravity_b

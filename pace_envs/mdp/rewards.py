@@ -1,4 +1,4 @@
-"""Reward terms: functions returning (num_envs,)."""
+"""Reward terms on joints, actions and the base's motion, as in Isaac Lab: functions returning (num_envs,)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.managers import SceneEntityCfg
+from pace_envs.articulation_data import of_floating_base
+from pace_envs.managers import ManagerTermBase, ManagerTermBaseCfg, SceneEntityCfg
 
 if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
     from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 
 _ROBOT = SceneEntityCfg()
@@ -27,3 +29,57 @@ def joint_torques_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT)
 def action_rate_l2(env: ManagerBasedRLEnv) -> torch.Tensor:
     """Sum of squared changes of the action."""
     return (env.action_manager.action - env.action_manager.prev_action).square().sum(dim=1)
+
+
+class joint_acc_l2(ManagerTermBase):
+    """Sum of squared joint accelerations at the last physics step [rad^2/s^4]."""
+
+    def __init__(self, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv):
+        """Bind the simulation's accelerations."""
+        super().__init__(cfg, env)
+        self._qacc = env.sim.bind("qacc")
+
+    def __call__(  # type: ignore[override]
+        self, env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT
+    ) -> torch.Tensor:
+        """The sum, (num_envs,)."""
+        columns = env.scene[asset_cfg.name].dof_columns[asset_cfg.joint_ids]
+        return self._qacc.index_select(1, columns).square().sum(dim=1)
+
+
+def track_lin_vel_xy_exp(
+    env: ManagerBasedRLEnv, std: float, command_name: str, asset_cfg: SceneEntityCfg = _ROBOT
+) -> torch.Tensor:
+    """exp(-|v_xy - v*_xy|^2 / std^2) of the base's velocity in its frame; ``std`` in m/s."""
+    velocity = env.scene[asset_cfg.name].data.root_lin_vel_b[:, :2]
+    error = (velocity - env.command_manager.get_command(command_name)[:, :2]).square().sum(dim=1)
+    return torch.exp(-error / std**2)
+
+
+def track_ang_vel_z_exp(
+    env: ManagerBasedRLEnv, std: float, command_name: str, asset_cfg: SceneEntityCfg = _ROBOT
+) -> torch.Tensor:
+    """exp(-(w_z - w*_z)^2 / std^2) of the yaw rate; ``std`` in rad/s."""
+    rate = of_floating_base(env.scene[asset_cfg.name].data.root_ang_vel_b)[:, 2]
+    return torch.exp(-(rate - env.command_manager.get_command(command_name)[:, 2]).square() / std**2)
+
+
+def lin_vel_z_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Squared velocity of the base along its z axis [m^2/s^2]."""
+    return env.scene[asset_cfg.name].data.root_lin_vel_b[:, 2].square()
+
+
+def ang_vel_xy_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Squared roll and pitch rates of the base [rad^2/s^2]."""
+    return of_floating_base(env.scene[asset_cfg.name].data.root_ang_vel_b)[:, :2].square().sum(dim=1)
+
+
+def flat_orientation_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
+    """Squared sine of the base's tilt."""
+    return env.scene[asset_cfg.name].data.projected_gravity_b[:, :2].square().sum(dim=1)
+
+
+def track_velocity_exp(env: ManagerBasedRLEnv, std: float, command_name: str) -> torch.Tensor:
+    """Both tracking terms as one, 2/3 of the planar and 1/3 of the yaw term; at most 1."""
+    planar = track_lin_vel_xy_exp(env, std, command_name)
+    return (2.0 * planar + track_ang_vel_z_exp(env, std, command_name)) / 3.0

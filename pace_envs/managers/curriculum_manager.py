@@ -1,0 +1,50 @@
+"""Curriculum: the task grows with what the policy can do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+
+@dataclass(kw_only=True)
+class CurriculumTermCfg(ManagerTermBaseCfg):
+    """A curriculum ``func(env, env_ids, **params) -> number | dict of numbers | None``, which is logged."""
+
+
+class CurriculumManager:
+    """Runs its terms for the environments whose episode ended, before they are reset."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv):
+        """Resolve the terms."""
+        self._terms: list[Term[CurriculumTermCfg]] = [
+            Term(name, term, env, num_args=2) for name, term in term_items(cfg).items()
+        ]
+        self._state: dict[str, Any] = {term.name: None for term in self._terms}
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._state)
+
+    def compute(self, env_ids: torch.Tensor) -> None:
+        """Let the terms judge the episodes of these environments."""
+        for term in self._terms:
+            self._state[term.name] = term(env_ids)
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Reset class terms; returns what the terms said last, as ``Curriculum/<term>``."""
+        log: dict[str, float] = {}
+        for name, state in self._state.items():
+            items = state.items() if isinstance(state, Mapping) else [] if state is None else [("", state)]
+            log |= {f"Curriculum/{name}{key and '/' + key}": float(value) for key, value in items}
+        for term in self._terms:
+            term.reset(env_ids)
+        return log

@@ -1,0 +1,55 @@
+"""Curriculum terms: ``(env, env_ids, **params)``, called for environments whose episode ended."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_envs.managers import ManagerTermBase, ManagerTermBaseCfg
+from pace_envs.mdp.commands import UniformVelocityCommand
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+    from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
+
+
+class command_range_by_tracking(ManagerTermBase):
+    """Widens the ranges of a velocity command as it is tracked.
+
+    Episodes are judged together, a quarter of ``num_envs`` at a time: if a reward term earned on average more than
+    ``threshold`` of what it can earn in a full episode, the command's scale grows by ``growth``, up to 1.
+    """
+
+    def __init__(self, cfg: ManagerTermBaseCfg, env: ManagerBasedEnv):
+        """Start at ``start`` of the command's ranges."""
+        super().__init__(cfg, env)
+        command = env.command_manager.get_term(cfg.params["command_name"])  # type: ignore[attr-defined]
+        if not isinstance(command, UniformVelocityCommand):
+            raise ValueError(f"The command {cfg.params['command_name']!r} is no UniformVelocityCommand.")
+        self._command = command
+        self._command.scale = float(cfg.params.get("start", 0.5))
+        self._window = max(env.num_envs // 4, 1)
+        self._earned = torch.zeros((), dtype=torch.float64, device=env.device)
+        self._episodes = 0
+
+    def __call__(  # type: ignore[override]
+        self,
+        env: ManagerBasedRLEnv,
+        env_ids: torch.Tensor,
+        command_name: str,
+        reward_name: str,
+        start: float = 0.5,
+        growth: float = 0.1,
+        threshold: float = 0.7,
+    ) -> float:
+        """Judge the episodes that ended; returns the part of the ranges that is drawn from."""
+        full = env.reward_manager.get_term_cfg(reward_name).weight * env.max_episode_length_s
+        self._earned += env.reward_manager.episode_sums[reward_name][env_ids].sum() / full
+        self._episodes += len(env_ids)
+        if self._episodes >= self._window:
+            if self._earned / self._episodes > threshold:
+                self._command.scale = min(self._command.scale + growth, 1.0)
+            self._earned.zero_()
+            self._episodes = 0
+        return self._command.scale

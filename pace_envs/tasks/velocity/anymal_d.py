@@ -1,0 +1,25 @@
+"""ANYmal D walks."""
+
+from dataclasses import replace
+
+from pace_envs.robots import anymal_d_cfg
+from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
+from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
+from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
+
+COPPER_LOSS = 0.008
+"""R / (r² k²) [W/(N m)²]: R 0.2 ohm, r 50, k 0.1 N m/A. Assumed, of the right size; put in your motor's."""
+
+
+def anymal_d_velocity_env_cfg() -> VelocityEnvCfg:
+    """The task."""
+    robot = anymal_d_cfg()
+    robot.actuators = {name: replace(drive, damping=4.0) for name, drive in robot.actuators.items()}
+    cfg = velocity_env_cfg(
+        robot, feet=".._foot", base="base_trunk", knees=".._shank_knee", action_scale=0.5, minimum_height=0.3
+    )
+    cfg.copper_loss = COPPER_LOSS
+    cfg.reward_sets = {"velocity": velocity_rewards(), "energy": energy_rewards(COPPER_LOSS)}
+    cfg.rewards = cfg.reward_sets["velocity"]
+    cfg.runner = RslRlOnPolicyRunnerCfg(experiment_name="anymal_d_velocity")
+    return cfg

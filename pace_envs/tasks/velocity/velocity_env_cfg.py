@@ -1,0 +1,125 @@
+"""What the velocity tasks of all robots share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pace_actuators import JointValue
+from pace_envs import mdp
+from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.contact_sensor import ContactSensorCfg
+from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
+from pace_envs.managers import (
+    CurriculumTermCfg,
+    EventTermCfg,
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    TerminationTermCfg,
+    UniformNoiseCfg,
+)
+from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
+from pace_envs.scene import InteractiveSceneCfg, TerrainCfg
+from pace_envs.simulation import SimulationCfg
+
+COMMAND = "base_velocity"
+"""Name of the velocity command."""
+
+
+@dataclass(kw_only=True)
+class VelocityEnvCfg(ManagerBasedRLEnvCfg):
+    """Configuration of a velocity task."""
+
+    reward_sets: Mapping[str, Mapping[str, RewardTermCfg]] = field(default_factory=dict)
+    """Sets of reward terms by name; ``rewards`` is the one in use."""
+
+    copper_loss: JointValue = 0.0
+    """Winding losses over squared torque, R / (r² k²) of each drive [W/(N m)²]: for the cost of transport."""
+
+    base_body: str = "base"
+    """Name of the body whose mass is randomised."""
+
+    runner: RslRlOnPolicyRunnerCfg = field(default_factory=RslRlOnPolicyRunnerCfg)
+    """How rsl-rl trains it."""
+
+
+def velocity_env_cfg(
+    robot: ArticulationCfg, *, feet: str, base: str, knees: str, action_scale: float, minimum_height: float
+) -> VelocityEnvCfg:
+    """A velocity task without rewards: 50 Hz policy over 200 Hz physics and control.
+
+    Args:
+        robot: The robot; its initial state is the stance, its drives run at 200 Hz.
+        feet: Expression of the foot geoms.
+        base: Expression of the base's geoms, whose touching the ground ends an episode.
+        knees: Expression of the geoms at the knees, whose touching the ground is undesired.
+        action_scale: Change of a target per unit of action [rad].
+        minimum_height: Height of the base below which it has fallen [m].
+    """
+    return VelocityEnvCfg(
+        scene=InteractiveSceneCfg(
+            num_envs=1024,
+            robot=robot,
+            terrain=TerrainCfg(collision_geoms=(feet, base, knees), impratio=1.0),
+            contact_sensors={
+                "feet": ContactSensorCfg(geom_names=feet, track_velocity=True),
+                "base": ContactSensorCfg(geom_names=base),
+                "knees": ContactSensorCfg(geom_names=knees),
+            },
+        ),
+        sim=SimulationCfg(dt=0.005, contacts=True),
+        decimation=4,
+        episode_length_s=20.0,
+        actions={"joint_pos": mdp.JointPositionActionCfg(scale=action_scale)},
+        commands={COMMAND: mdp.UniformVelocityCommandCfg(rel_standing_envs=0.05)},
+        observations={"policy": ObservationGroupCfg(terms=_observations(), enable_corruption=True)},
+        events=_resets(),
+        terminations={
+            "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+            "base_contact": TerminationTermCfg(func=mdp.illegal_contact, params={"sensor_name": "base"}),
+            "bad_orientation": TerminationTermCfg(func=mdp.bad_orientation, params={"limit_angle": 1.0}),
+            "base_height": TerminationTermCfg(
+                func=mdp.root_height_below_minimum, params={"minimum_height": minimum_height}
+            ),
+            "diverged": TerminationTermCfg(func=mdp.diverged),
+        },
+        curriculum={
+            "command_range": CurriculumTermCfg(
+                func=mdp.command_range_by_tracking,
+                params={"command_name": COMMAND, "reward_name": "track_velocity", "start": 0.5},
+            )
+        },
+    )
+
+
+def _observations() -> dict[str, ObservationTermCfg]:
+    def noisy(func: object, amplitude: float) -> ObservationTermCfg:
+        return ObservationTermCfg(func=func, noise=UniformNoiseCfg(n_min=-amplitude, n_max=amplitude))  # type: ignore[arg-type]
+
+    return {
+        "base_lin_vel": noisy(mdp.base_lin_vel, 0.1),
+        "base_ang_vel": noisy(mdp.base_ang_vel, 0.2),
+        "projected_gravity": noisy(mdp.projected_gravity, 0.05),
+        "velocity_commands": ObservationTermCfg(func=mdp.generated_commands, params={"command_name": COMMAND}),
+        "joint_pos": noisy(mdp.encoder_pos_rel, 0.01),
+        "joint_vel": noisy(mdp.joint_vel, 1.5),
+        "actions": ObservationTermCfg(func=mdp.last_action),
+    }
+
+
+def _resets() -> dict[str, EventTermCfg]:
+    small = (-0.3, 0.3)
+    return {
+        "reset_base": EventTermCfg(
+            func=mdp.reset_root_state_uniform,
+            mode="reset",
+            params={
+                "pose_range": {"x": (-0.5, 0.5), "y": (-0.5, 0.5), "yaw": (-3.14159, 3.14159)},
+                "velocity_range": {axis: small for axis in ("x", "y", "z", "roll", "pitch", "yaw")},
+            },
+        ),
+        "reset_joints": EventTermCfg(
+            func=mdp.reset_joints_by_offset, mode="reset", params={"position_range": (-0.1, 0.1)}
+        ),
+    }
