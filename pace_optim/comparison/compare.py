@@ -1,0 +1,152 @@
+"""Comparing runs with their recordings: analyse, write comparison.json and report.html."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pace_optim.atomic import write_atomically
+from pace_optim.report import write_report
+from pace_optim.trajectory_errors import held_out_spans
+
+from .joint import JointComparison, compare_joint, place_content, rmse_by_part
+from .ladder import check_alike, make_ladder
+from .places import AT_THE_FLOOR, NEGLIGIBLE, worst_places
+from .tracks import RunTracks, load_tracks
+
+VERSION = 1
+FILE = "comparison.json"
+_DIGITS = 5
+
+
+def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt: float | None = None) -> dict[str, Any]:
+    """Say where each run's model fails, and put several side by side.
+
+    Every run's folder gets a comparison.json and its report anew; the last one's also hold the ladder of the error.
+
+    Args:
+        folders: Runs' folders; several must share task and recordings.
+        data: Recordings to simulate in place of the runs' own.
+        physics_dt: Simulate at this physics step in place of the runs' [s].
+
+    Returns:
+        The content of the last run's comparison.json.
+
+    Raises:
+        ValueError: If a run cannot be read, or several cannot be compared.
+    """
+    paths = [run_folder(folder) for folder in folders]
+    if repeated := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
+        raise ValueError(f"{repeated[0]} is named twice. Name each run once, the base model first.")
+    runs = [load_tracks(path, data, physics_dt) for path in paths]
+    check_alike(runs)
+    content: dict[str, Any] = {}
+    for i, run in enumerate(runs):
+        content = compare_run(run)
+        if len(runs) > 1 and i == len(runs) - 1:
+            content["ladder"] = make_ladder(runs)
+        content = plain(content)
+        write_atomically(run.folder / FILE, lambda file, c=content: file.write(_dump(c).encode()))  # type: ignore[misc]
+        write_report(run.folder)
+    return content
+
+
+def run_folder(folder: str | Path) -> Path:
+    """The folder of a run, named by itself or by a file in it.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    path = Path(folder)
+    if path.name == "result.json" and path.is_file():
+        path = path.parent
+    if not path.is_dir():
+        raise ValueError(f"There is no run {folder}. Name the folder that scripts/fit.py printed as its last line.")
+    return path
+
+
+def compare_run(run: RunTracks) -> dict[str, Any]:
+    """Everything about one run, for comparison.json."""
+    joints = run.result.joint_names
+    compared = [compare_joint(joint, j, run.tracks) for j, joint in enumerate(joints)]
+    worst = worst_places([joint.places for joint in compared])
+    floors = [joint.content["noise_floor"] for joint in compared]
+    return {
+        "version": VERSION,
+        "run": str(run.folder),
+        "task": run.result.task,
+        "robot_name": run.result.robot_name,
+        "effects": list(run.result.effects),
+        "physics_dt": run.physics_dt,
+        "data": list(run.data),
+        "joint_names": list(joints),
+        "summary": _summary(compared),
+        "worst_places": [place_content(place) for place in worst],
+        "rmse": rmse_by_part(run.tracks),
+        "noise_floor": float(np.sqrt(np.mean(np.square(floors)))),
+        "recordings": [
+            {
+                "name": track.name,
+                "samples": len(track.time),
+                "duration": float(track.time[-1] - track.time[0]),
+                "trained_share": float(track.train.mean()),
+                "repetitions": [o.name for o in run.tracks if o.group == track.group and o is not track],
+                "held_out": held_out_spans(track.time - track.time[0], track.train),
+            }
+            for track in run.tracks
+        ],
+        "joints": {joint: one.content for joint, one in zip(joints, compared, strict=True)},
+        "notes": list(run.notes),
+    }
+
+
+def _summary(compared: Sequence[JointComparison]) -> str:
+    """How many joints are explained, in a sentence."""
+    count = len(compared)
+    done = sum(_explained(joint.content) for joint in compared)
+    spread = sum(not _explained(joint.content) and not joint.places for joint in compared)
+    if done == count:
+        return (
+            "The joint is at the noise floor: no model could explain more of this data."
+            if count == 1
+            else f"All {count} joints are at the noise floor: no model could explain more of this data."
+        )
+    rest = count - done
+    if count == 1:
+        text = "There is error above the noise floor that a better model could explain."
+    else:
+        text = f"{rest} of {count} joints have error above the noise floor that a better model could explain."
+    if spread == rest:
+        text += " It is spread evenly: no speed, position, load or frequency holds much more than its share."
+    elif spread:
+        text += f" In {spread} of them it is spread evenly."
+    return text
+
+
+def _explained(content: dict[str, Any]) -> bool:
+    rmse = content["noise_floor"] / max(1 - content["share_above_floor"], 1e-12) ** 0.5
+    return rmse <= AT_THE_FLOOR * content["noise_floor"] or max(content["rmse"].values()) < NEGLIGIBLE
+
+
+def plain(content: Any) -> Any:
+    """As JSON holds it: lists, numbers of five digits, ``null`` for what is not finite."""
+    if isinstance(content, dict):
+        return {key: plain(value) for key, value in content.items()}
+    if isinstance(content, list | tuple | np.ndarray):
+        return [plain(value) for value in content]
+    if isinstance(content, np.bool_):
+        return bool(content)
+    if isinstance(content, float | np.floating):
+        return float(f"{float(content):.{_DIGITS}g}") if np.isfinite(content) else None
+    return int(content) if isinstance(content, np.integer) else content
+
+
+def _dump(content: Any) -> str:
+    """JSON to read by eye: a list of numbers stays on one line."""
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    return re.sub(r"\[[^\[\]{}\"]*\]", lambda m: "[" + " ".join(m.group()[1:-1].split()) + "]", text) + "\n"

@@ -1,0 +1,135 @@
+"""What the error is laid out against: speed, direction, reversals, position, load, acceleration, time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .motion import Motion
+
+_REVERSAL_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
+_POSITION_BINS = 8
+_TIME_BINS = 10
+_LEAST_PER_BIN = 0.005
+"""A bin with less of the time than this says nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dimension:
+    """One quantity at every sample, cut into bins."""
+
+    name: str
+    """Its key in comparison.json."""
+    title: str
+    """Its axis."""
+    unit: str
+    edges: tuple[float, ...]
+    """B + 1, rising; the outermost may be infinite. Of ``recording``: −½, ½, …"""
+    bin: np.ndarray
+    """Which bin each sample is in, (K,) int."""
+    neighbours: bool = True
+    """Whether bins that touch may be named as one."""
+
+    @property
+    def num_bins(self) -> int:
+        """Number of bins B."""
+        return len(self.edges) - 1
+
+
+def dimensions_of(motions: Sequence[Motion], times: Sequence[np.ndarray], loads: Sequence[np.ndarray] | None) -> list:
+    """Every dimension of one joint over all its recordings, whose samples follow each other.
+
+    Args:
+        motions: Of each recording.
+        times: Of each recording, (K_r,) [s].
+        loads: Load torque in each recording, (K_r,) [N m], if known.
+    """
+    speed = np.concatenate([motion.speed for motion in motions])
+    acceleration = np.concatenate([motion.acceleration for motion in motions])
+    position = np.concatenate([motion.position for motion in motions])
+    direction = np.concatenate([motion.direction for motion in motions])
+    since = np.concatenate([motion.since_reversal for motion in motions])
+    time = np.concatenate([np.asarray(t) - t[0] for t in times])
+    still = _round(max(motion.standstill for motion in motions))
+    sizes = _size_edges(np.abs(speed), still)
+    result = [
+        _cut("speed", "speed", "rad/s", np.abs(speed), sizes),
+        _cut("velocity", "velocity", "rad/s", speed, _mirrored(sizes)),
+        _cut("direction", "direction of motion", "", direction, (-np.inf, 0.0, np.inf)),
+        _cut("since_reversal", "time since the last reversal", "s", since, _REVERSAL_EDGES),
+        _cut("position", "position", "rad", position, _even_edges(position)),
+        *_sized("acceleration", "acceleration", "rad/s²", acceleration),
+        _cut("time", "time", "s", time, _time_edges(time)),
+    ]
+    if loads is not None:
+        result += _sized("load", "load torque", "N m", np.concatenate(loads))
+    if len(motions) > 1:
+        which = np.concatenate([np.full(len(t), r) for r, t in enumerate(times)])
+        edges = tuple(np.arange(len(times) + 1) - 0.5)
+        result.append(Dimension(name="recording", title="recording", unit="", edges=edges, bin=which, neighbours=False))
+    return [dimension for dimension in result if dimension.num_bins > 1]
+
+
+def _sized(name: str, title: str, unit: str, values: np.ndarray) -> list[Dimension]:
+    """A signed quantity, and its size."""
+    size = np.abs(values)
+    edges = _distinct([0.0, *(_round(float(np.quantile(size, q))) for q in (0.25, 0.5, 0.75, 0.9)), np.inf])
+    return [
+        _cut(name, title, unit, values, _mirrored(edges)),
+        _cut(f"{name}_size", f"size of the {title}", unit, size, edges),
+    ]
+
+
+def _cut(name: str, title: str, unit: str, values: np.ndarray, edges: Sequence[float]) -> Dimension:
+    """Bins from edges; those with next to no samples are joined to a neighbour."""
+    kept = list(edges)
+    while len(kept) > 2:
+        count = np.bincount(_index(values, kept), minlength=len(kept) - 1)
+        scarce = np.flatnonzero(count < _LEAST_PER_BIN * len(values))
+        if not len(scarce):
+            break
+        b = int(scarce[0])
+        kept.pop(b if b == len(kept) - 2 else b + 1)
+    return Dimension(name=name, title=title, unit=unit, edges=tuple(kept), bin=_index(values, kept))
+
+
+def _index(values: np.ndarray, edges: Sequence[float]) -> np.ndarray:
+    return np.searchsorted(np.asarray(edges[1:-1]), values, side="right")
+
+
+def _size_edges(size: np.ndarray, still: float) -> tuple[float, ...]:
+    """Standing, then the moving samples in quarters and the fastest tenth."""
+    moving = size[size > still]
+    if not len(moving):
+        return (0.0, np.inf)
+    return _distinct([0.0, still, *(_round(float(np.quantile(moving, q))) for q in (0.2, 0.4, 0.6, 0.8, 0.95)), np.inf])
+
+
+def _mirrored(edges: Sequence[float]) -> tuple[float, ...]:
+    inner = [edge for edge in edges if edge > 0]
+    return (*(-edge for edge in reversed(inner)), *inner) if inner[0] < np.inf else (-np.inf, 0.0, np.inf)
+
+
+def _even_edges(values: np.ndarray) -> tuple[float, ...]:
+    low, high = (float(q) for q in np.quantile(values, (0.01, 0.99)))
+    inner = [_round(edge, high - low) for edge in np.linspace(low, high, _POSITION_BINS + 1)[1:-1]]
+    return _distinct([-np.inf, *inner, np.inf])
+
+
+def _time_edges(time: np.ndarray) -> tuple[float, ...]:
+    end = float(time.max())
+    return _distinct([0.0, *(_round(end * i / _TIME_BINS, end) for i in range(1, _TIME_BINS)), np.inf])
+
+
+def _distinct(edges: Sequence[float]) -> tuple[float, ...]:
+    return tuple(dict.fromkeys(edges))
+
+
+def _round(value: float, scale: float | None = None) -> float:
+    """To two digits, or to a hundredth of a scale, as one would say it."""
+    scale = abs(value) if scale is None else abs(scale)
+    if scale <= 0 or not np.isfinite(scale):
+        return value
+    return float(round(value, 1 - int(np.floor(np.log10(scale)))))

@@ -1,0 +1,115 @@
+"""Several runs side by side: how the error falls from the base model to the last effect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pace_optim.trajectory_errors import angle_unit, rms
+
+from .joint import noise_floors, rmse_by_part
+from .tracks import RunTracks, Track
+
+_PARTS = ("train", "validation")
+
+
+def check_alike(runs: Sequence[RunTracks]) -> None:
+    """Runs can be compared if they have the same task and joints, and the same recordings, split alike.
+
+    Raises:
+        ValueError: If they do not; it says what differs.
+    """
+    first = runs[0]
+    for other in runs[1:]:
+        differences = []
+        for name in ("task", "joint_names"):
+            a, b = getattr(first.result, name), getattr(other.result, name)
+            if a != b:
+                differences.append(f"the {name.replace('_', ' ')}: {a} against {b}")
+        if not differences:
+            differences = _recording_differences(first.tracks, other.tracks)
+        if differences:
+            raise ValueError(
+                f"{first.folder} and {other.folder} cannot stand side by side; they differ in {'; '.join(differences)}."
+                " Fit both to the same recordings, or simulate both on the same files with --data."
+            )
+
+
+def _recording_differences(ones: Sequence[Track], others: Sequence[Track]) -> list[str]:
+    names = [[track.name for track in tracks] for tracks in (ones, others)]
+    if names[0] != names[1]:
+        return [f"the recordings: {', '.join(names[0])} against {', '.join(names[1])}"]
+    result = []
+    for one, other in zip(ones, others, strict=True):
+        if one.measured.shape != other.measured.shape:
+            result.append(f"the length of {one.name}: {len(one.time)} against {len(other.time)} samples")
+        elif not (np.allclose(one.measured, other.measured) and np.allclose(one.target, other.target)):
+            result.append(f"the content of {one.name}")
+        elif not np.array_equal(one.train, other.train):
+            shares = [f"{100 * track.train.mean():.0f} %" for track in (one, other)]
+            result.append(f"what was trained on of {one.name}: {shares[0]} against {shares[1]}")
+    return result
+
+
+def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
+    """The steps of the ladder, in the order of the runs, and the noise floor beneath it."""
+    joints, tracks = runs[-1].result.joint_names, runs[-1].tracks
+    floors = {joint: _floor(j, tracks) for j, joint in enumerate(joints)}
+    floors["all"] = float(np.sqrt(np.mean(np.square(list(floors.values())))))
+    steps: list[dict[str, Any]] = []
+    for run in runs:
+        rmse = {part: _rmse_by_joint(run, part) for part in _PARTS}
+        before = steps[-1]["rmse"] if steps else {part: {} for part in _PARTS}
+        steps.append(
+            {
+                "run": str(run.folder),
+                "name": " + ".join(run.result.effects) or "base model",
+                "effects": list(run.result.effects),
+                "physics_dt": run.physics_dt,
+                "rmse": rmse,
+                "ratio_to_previous": {
+                    part: before[part]["all"] / rmse[part]["all"]
+                    for part in _PARTS
+                    if before[part] and rmse[part].get("all")
+                },
+            }
+        )
+    return {"steps": steps, "noise_floor": floors}
+
+
+def ladder_table(ladder: dict[str, Any]) -> str:
+    """The ladder for a terminal."""
+    steps, floor = ladder["steps"], ladder["noise_floor"]["all"]
+    factor, unit = angle_unit([s["rmse"][part].get("all") for s in steps for part in _PARTS])
+    rows = [["", *(f"{part} [{unit}]" for part in _PARTS), "× better (train, validation)"]]
+    for step in steps:
+        values = [_cell(step["rmse"][part].get("all"), factor) for part in _PARTS]
+        ratio = [f"{step['ratio_to_previous'][part]:.2f}" for part in _PARTS if part in step["ratio_to_previous"]]
+        rows.append([step["name"], *values, ", ".join(ratio)])
+    rows.append(["noise floor", *[_cell(floor, factor)] * 2, ""])
+    widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
+    return "\n".join(
+        (
+            row[0].ljust(widths[0]) + "".join(f"  {cell.rjust(w)}" for cell, w in zip(row[1:], widths[1:], strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def _floor(j: int, tracks: Sequence[Track]) -> float:
+    floors = noise_floors(j, tracks)
+    return rms(np.concatenate([np.full(len(t.time), f.sigma) for t, f in zip(tracks, floors, strict=True)])) or 0.0
+
+
+def _rmse_by_joint(run: RunTracks, part: str) -> dict[str, float]:
+    """Of every joint and of all; empty if no sample is of that part."""
+    every = rmse_by_part(run.tracks)
+    if part not in every:
+        return {}
+    return {j: rmse_by_part(run.tracks, i)[part] for i, j in enumerate(run.result.joint_names)} | {"all": every[part]}
+
+
+def _cell(value: float | None, factor: float) -> str:
+    return "–" if value is None else f"{factor * value:#.3g}"

@@ -1,0 +1,163 @@
+"""The places where a joint's error sits, the one that says most first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pace_optim.trajectory_errors import angle_text
+
+from .dimensions import Dimension
+from .regions import Layout, Region, best_region, evidence, inside, refine
+from .words import band_text, percent, place_text
+
+AT_THE_FLOOR = 1.1
+"""An error up to this many times its floor is not told from noise."""
+NEGLIGIBLE = 1e-6
+"""Below this an error is nobody's concern [rad]."""
+MOST_PLACES = 3
+_OVERLAP = 0.5
+_COARSE = ("recording",)
+"""Say which data, not what is wrong: named after everything else."""
+_PLAINNESS = {
+    "recording": 0.1,
+    "acceleration": 0.75,
+    "acceleration_size": 0.8,
+    "velocity": 0.85,
+    "load": 0.85,
+    "load_size": 0.9,
+    "position": 0.9,
+    "time": 0.9,
+}
+"""Of two places that say about as much, the one that is easier to act on comes first; 1 where not listed."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Place:
+    """Where a part of one joint's error is."""
+
+    joint: str
+    by: tuple[str, ...]
+    """Dimensions that bound it; ``frequency`` stands alone."""
+    text: str
+    """Where it is, in words."""
+    share: float
+    """Of the joint's squared error above the floor."""
+    base: float
+    """Of the time; of a frequency band, of the octaves."""
+    weight: float
+    """Squared error that is there beyond its share of the time, mean over all samples [rad²]."""
+    mask: np.ndarray | None
+    """Samples in it, (K,) bool; ``None`` of a frequency band."""
+
+    @property
+    def sentence(self) -> str:
+        """For a person."""
+        of = "of the octaves" if self.by == ("frequency",) else "of the time"
+        return (
+            f"{self.joint}: {percent(self.share)} of the remaining error lies {self.text} ({percent(self.base)} {of})."
+        )
+
+
+def places_of(
+    joint: str,
+    error: np.ndarray,
+    floor: np.ndarray,
+    dimensions: Sequence[Dimension],
+    layouts: Sequence[Layout],
+    bands: tuple[np.ndarray, np.ndarray, np.ndarray],
+    recordings: Sequence[str],
+) -> list[Place]:
+    """A joint's places, each in other dimensions than the ones before; empty where the error is spread evenly.
+
+    Args:
+        joint: Its name.
+        error: All recordings', (K,) [rad].
+        floor: σ at each sample, (K,) [rad].
+        dimensions: What to look along.
+        layouts: The error along each.
+        bands: Edges (B + 1,) [Hz], and shares (B,) of the octaves and of the error above the floor.
+        recordings: Their names.
+    """
+    above = error**2 - floor**2
+    total = max(float(above.mean()), 0.0)
+    candidates: list[tuple[float, Place]] = []
+    for dimension, layout in zip(dimensions, layouts, strict=True):
+        region = best_region(layout.time, layout.error, dimension.neighbours)
+        if region is None or not region.is_place:
+            continue
+        mask, by, text = inside(dimension, region), [dimension.name], place_text(dimension, region, recordings)
+        others = [other for other in dimensions if not _akin(other, dimension) and other.name not in ("time", *_COARSE)]
+        if dimension.name not in _COARSE and (finer := refine(above, mask, region, others)):
+            other, region = finer
+            mask = mask & inside(other, region)
+            by.append(other.name)
+            text += ", " + place_text(other, region, recordings)
+        value = evidence(min(region.share, 1.0), region.base) * _PLAINNESS.get(dimension.name, 1.0)
+        candidates.append((value, _place(joint, tuple(by), text, region, total, mask)))
+    edges, octaves, share = bands
+    region = best_region(octaves, share)
+    if region is not None and region.is_place:
+        value = evidence(region.share, region.base)
+        candidates.append((value, _place(joint, ("frequency",), band_text(edges, region), region, total, None)))
+    candidates.sort(key=lambda candidate: -candidate[0])
+    chosen: list[Place] = []
+    for _, place in candidates:
+        if all(_differ(place, other, above) for other in chosen):
+            chosen.append(place)
+    return chosen[:MOST_PLACES]
+
+
+def worst_places(places: Sequence[Sequence[Place]]) -> list[Place]:
+    """The three that hold most error out of proportion: one of each joint, more where fewer than three have one.
+
+    Args:
+        places: Of each joint, the one that says most first.
+    """
+    with_places = [own for own in places if own]
+    per_joint = 1 if len(with_places) >= MOST_PLACES else MOST_PLACES
+    every = [place for own in with_places for place in own[:per_joint]]
+    return sorted(every, key=lambda place: -place.weight)[:MOST_PLACES]
+
+
+def joint_sentence(joint: str, rmse: float, floor: float, places: Sequence[Place]) -> str:
+    """What is to be said of a joint, honestly where there is little."""
+    if rmse < NEGLIGIBLE:
+        return f"{joint}: the error is {angle_text(rmse)}, below what any encoder shows."
+    if rmse <= AT_THE_FLOOR * floor:
+        return f"{joint} is at the noise floor: {angle_text(rmse)} against {angle_text(floor)} of noise."
+    if places:
+        return places[0].sentence
+    return (
+        f"{joint}: the error of {angle_text(rmse)} ({angle_text(floor)} of it noise) is spread evenly; no speed, "
+        "position, load or frequency holds much more than its share."
+    )
+
+
+def _place(joint: str, by: tuple[str, ...], text: str, region: Region, total: float, mask: np.ndarray | None) -> Place:
+    share = min(region.share, 1.0)
+    return Place(
+        joint=joint,
+        by=by,
+        text=text,
+        share=share,
+        base=region.base,
+        weight=total * max(share - region.base, 0.0),
+        mask=mask,
+    )
+
+
+def _akin(one: Dimension, other: Dimension) -> bool:
+    """Whether two dimensions are one quantity, with its sign and without."""
+    families = ({"speed", "velocity", "direction"}, {"load", "load_size"}, {"acceleration", "acceleration_size"})
+    return one.name == other.name or any({one.name, other.name} <= family for family in families)
+
+
+def _differ(one: Place, other: Place, above: np.ndarray) -> bool:
+    """Whether two places hold different parts of the error."""
+    if one.mask is None or other.mask is None:
+        return one.mask is not other.mask
+    both = float(above[one.mask & other.mask].sum())
+    return both < _OVERLAP * min(float(above[one.mask].sum()), float(above[other.mask].sum()))

@@ -1,0 +1,38 @@
+"""A comparison for a terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pace_optim.trajectory_errors import angle_unit
+
+from .ladder import ladder_table
+
+
+def comparison_text(content: dict[str, Any]) -> str:
+    """A row per joint, the worst places, the ladder.
+
+    Args:
+        content: Of comparison.json.
+    """
+    joints = content["joints"]
+    parts = [part for part in ("train", "validation") if part in content["rmse"]]
+    values = [joint["rmse"].get(part) for joint in joints.values() for part in parts]
+    factor, unit = angle_unit(values)
+    width = max(5, *(len(name) for name in joints))
+    head = f"{'joint':{width}}" + "".join(f"  {part:>10}" for part in parts) + f"  {'noise':>10}  above noise"
+    lines = [f"{head}   [{unit}]"]
+    for name, joint in joints.items():
+        cells = "".join(_cell(joint["rmse"].get(part), factor) for part in parts)
+        share = f"{100 * joint['share_above_floor']:.0f} %"
+        lines.append(f"{name:{width}}{cells}{_cell(joint['noise_floor'], factor)}  {share:>11}")
+    lines += ["", content["summary"]]
+    lines += [f"  {place['sentence']}" for place in content["worst_places"]]
+    if "ladder" in content:
+        lines += ["", ladder_table(content["ladder"])]
+    lines += [f"note: {note}" for note in content["notes"]]
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, factor: float) -> str:
+    return f"  {'–':>10}" if value is None else f"  {factor * value:#10.3g}"

@@ -1,0 +1,218 @@
+"""What is compared: each recording, measured and simulated, with what is known of its load and its repetitions."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pace_optim.assessment import trajectories
+from pace_optim.evaluator import Evaluator
+from pace_optim.fit_result import FitResult
+from pace_optim.fit_settings import FitSettings
+from pace_optim.problem import Problem, file_digest, load_problem
+from pace_optim.recording import Drive, Recording
+
+from .load_torque import load_torques
+
+_SAME = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """One recording as a run simulates it: K samples of n joints."""
+
+    name: str
+    time: np.ndarray
+    """(K,) [s]."""
+    target: np.ndarray
+    """(K, n) [rad]."""
+    measured: np.ndarray
+    """Encoder positions, (K, n) [rad]."""
+    error: np.ndarray
+    """Simulated less measured, (K, n) [rad]."""
+    train: np.ndarray
+    """Whether a sample was trained on, (K,) bool."""
+    load: np.ndarray | None
+    """Load torque, (K, n) [N m], if it could be computed."""
+    group: int
+    """Recordings of one group repeat each other: same commands, drive and load."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunTracks:
+    """A run and what it is compared on."""
+
+    folder: Path
+    result: FitResult
+    physics_dt: float
+    """Of the simulation [s]."""
+    data: tuple[str, ...]
+    """Files in place of the run's own; empty for its own."""
+    tracks: tuple[Track, ...]
+    notes: tuple[str, ...]
+    """What could not be done."""
+
+
+def load_tracks(folder: Path, data: Sequence[str] = (), physics_dt: float | None = None) -> RunTracks:
+    """A run's best parameters on its own recordings, or on others.
+
+    Args:
+        folder: The run's folder.
+        data: Recordings to simulate in place of the run's own.
+        physics_dt: Simulate at this physics step in place of the run's [s].
+
+    Raises:
+        ValueError: If the run or a recording cannot be used.
+    """
+    result = FitResult.load(folder)
+    simulate = bool(data) or physics_dt is not None
+    notes: list[str] = []
+    problem: Problem | None = None
+    try:
+        problem = _reload(folder, data, physics_dt, with_effects=simulate)
+    except (ValueError, KeyError, OSError) as error:
+        if simulate:
+            raise
+        message = str(error.args[0] if isinstance(error, KeyError) else error)
+        notes.append(f"The run's recordings cannot be read again, so there is no load torque: {message}")
+    if simulate and problem is not None:
+        evaluator = problem.evaluator()
+        physical = problem.space.from_dict(result.parameters)
+        content = trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled))
+    else:
+        content = _best_trajectory(folder)
+    _check_finite(folder, content)
+    recordings = None if problem is None else problem.dataset.recordings
+    if recordings is not None and not _are_those(recordings, content):
+        notes.append("The run's recordings have changed since it was fitted: there is no load torque.")
+        recordings = problem = None
+    loads: list[np.ndarray] | None = None
+    if problem is not None:
+        bias = np.array([result.parameters["encoder_bias"][name] for name in problem.joint_names])
+        loads = load_torques(Evaluator(problem.make_env, problem.dataset, problem.space), bias)
+    groups = _groups(content["recordings"], recordings)
+    trained = _trained_before(folder, data)
+    tracks = tuple(
+        Track(
+            name=entry["name"],
+            time=np.asarray(entry["time"]),
+            target=np.asarray(entry["des_dof_pos"]),
+            measured=np.asarray(entry["dof_pos"]),
+            error=np.asarray(entry["sim_dof_pos"]) - np.asarray(entry["dof_pos"]),
+            train=trained[r] if trained and len(trained[r]) == len(entry["time"]) else _train(entry, bool(data)),
+            load=None if loads is None else loads[r],
+            group=groups[r],
+        )
+        for r, entry in enumerate(content["recordings"])
+    )
+    return RunTracks(
+        folder=folder,
+        result=result,
+        physics_dt=physics_dt or result.physics_dt,
+        data=tuple(str(path) for path in data),
+        tracks=tracks,
+        notes=tuple(notes),
+    )
+
+
+def _reload(folder: Path, data: Sequence[str], physics_dt: float | None, *, with_effects: bool) -> Problem:
+    """The run's problem; without its effects, which the torque of the load does not depend on, when not simulated."""
+    settings, _ = FitSettings.load(folder / "settings.json")
+    wanted: dict[str, Any] = {
+        name: getattr(settings, name) for name in inspect.signature(load_problem).parameters if hasattr(settings, name)
+    }
+    if data:
+        wanted |= {"data": list(data), "validation": []}
+    if physics_dt is not None:
+        wanted["physics_dt"] = physics_dt
+    if not with_effects:
+        wanted.pop("effects", None)
+    return load_problem(**wanted)
+
+
+def _best_trajectory(folder: Path) -> dict[str, Any]:
+    path = folder / "best_trajectory.pt"
+    if not path.is_file():
+        raise ValueError(
+            f"{folder} has no best_trajectory.pt yet: the fit has not ended. Wait, or go on with "
+            f"scripts/fit.py --resume {folder}"
+        )
+    return torch.load(path, weights_only=True)
+
+
+def _check_finite(folder: Path, content: dict[str, Any]) -> None:
+    for entry in content["recordings"]:
+        if not bool(torch.as_tensor(entry["sim_dof_pos"]).isfinite().all()):
+            raise ValueError(
+                f"{folder}: the simulation of {entry['name']} diverges with the run's parameters, so there is nothing "
+                "to compare. Fit again, with narrower bounds or a finer --physics_dt."
+            )
+
+
+def _are_those(recordings: Sequence[Recording], content: dict[str, Any]) -> bool:
+    """Whether files read again hold what the run was fitted to."""
+    entries = content["recordings"]
+    return len(recordings) == len(entries) and all(
+        r.dof_pos.shape == tuple(entry["dof_pos"].shape)
+        and np.allclose(r.dof_pos, entry["dof_pos"], rtol=0, atol=_SAME)
+        for r, entry in zip(recordings, entries, strict=True)
+    )
+
+
+def _train(entry: dict[str, Any], others: bool) -> np.ndarray:
+    train = np.asarray(entry["train"]).astype(bool)
+    return np.zeros_like(train) if others else train
+
+
+def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
+    """For files named anew, which samples the run was trained on: those of its own recordings, by their digests."""
+    if not data or not (folder / "best_trajectory.pt").is_file():
+        return []
+    settings, digests = FitSettings.load(folder / "settings.json")
+    own = [digests.get(path) for path in (*settings.data, *settings.validation)]
+    entries = _best_trajectory(folder)["recordings"]
+    known = {
+        digest: np.asarray(entry["train"]).astype(bool) for digest, entry in zip(own, entries, strict=False) if digest
+    }
+    return [known.get(file_digest(path), np.zeros(0, dtype=bool)) for path in data]
+
+
+def _groups(entries: Sequence[dict[str, Any]], recordings: Sequence[Recording] | None) -> list[int]:
+    """A number for each recording; the same number for those that repeat each other."""
+    result: list[int] = []
+    for r, entry in enumerate(entries):
+        twin = next((s for s in range(r) if _repeats(entry, entries[s]) and _alike(recordings, r, s)), None)
+        result.append(r if twin is None else result[twin])
+    return result
+
+
+def _repeats(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    length = min(len(one["time"]), len(other["time"]))
+    if max(len(one["time"]), len(other["time"])) > 1.02 * length + 1:
+        return False
+    return all(
+        np.allclose(one[key][:length], other[key][:length], rtol=0, atol=1e-6) for key in ("time", "des_dof_pos")
+    )
+
+
+def _alike(recordings: Sequence[Recording] | None, r: int, s: int) -> bool:
+    """Whether two recordings state the same drive and load; without the files, the commands alone must do."""
+    if recordings is None:
+        return True
+    one, other = recordings[r], recordings[s]
+    drives = all(
+        (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
+        for a, b in ((getattr(one.drive, f.name), getattr(other.drive, f.name)) for f in fields(Drive))
+    )
+    return drives and vars(one.load) == vars(other.load)

@@ -1,0 +1,77 @@
+"""Places in words: "below 0.3 rad/s, within 50 ms after a reversal"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .dimensions import Dimension
+from .regions import Region
+
+_OF = {
+    "velocity": "at velocities ",
+    "acceleration": "at accelerations ",
+    "acceleration_size": "at accelerations of either sign ",
+    "position": "at positions ",
+    "load": "under load torques ",
+    "load_size": "under load torques of either sign ",
+}
+
+
+def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] = ()) -> str:
+    """Where a region is.
+
+    Args:
+        dimension: What it is a region of.
+        region: The region.
+        recordings: Names, for the dimension ``recording``.
+    """
+    low = dimension.edges[region.first] if region.first > 0 else None
+    high = dimension.edges[region.last + 1] if region.last + 1 < dimension.num_bins else None
+    if dimension.name == "recording":
+        return f"in the recording {recordings[region.first]}"
+    if dimension.name == "direction":
+        return "on the way up (q grows)" if region.first else "on the way down (q falls)"
+    if dimension.name == "since_reversal":
+        return _after_reversal(low, high)
+    if dimension.name == "time":
+        return f"in the first {high:g} s" if low is None else _between(low, high, "s", "after", "before")
+    return _OF.get(dimension.name, "") + _between(low, high, dimension.unit)
+
+
+def band_text(edges: np.ndarray, region: Region) -> str:
+    """Where a region of frequency bands is."""
+    low = float(f"{edges[region.first]:.2g}") if region.first > 0 else None
+    high = float(f"{edges[region.last + 1]:.2g}") if region.last + 2 < len(edges) else None
+    return _between(low, high, "Hz")
+
+
+def percent(share: float) -> str:
+    """A share as "61 %"."""
+    return f"{100 * share:.0f} %" if share >= 0.01 or share <= 0 else "less than 1 %"
+
+
+def _between(low: float | None, high: float | None, unit: str, above: str = "above", below: str = "below") -> str:
+    if low is None:
+        return f"{below} {_number(high)} {unit}"
+    if high is None:
+        return f"{above} {_number(low)} {unit}"
+    return f"between {_number(low)} and {_number(high)} {unit}"
+
+
+def _after_reversal(low: float | None, high: float | None) -> str:
+    if low is None:
+        return f"within {_duration(high)} after a reversal"
+    if high is None:
+        return f"more than {_duration(low)} after the last reversal"
+    return f"between {_duration(low)} and {_duration(high)} after a reversal"
+
+
+def _duration(seconds: float | None) -> str:
+    seconds = seconds or 0.0
+    return f"{1e3 * seconds:g} ms" if seconds < 1 else f"{seconds:g} s"
+
+
+def _number(value: float | None) -> str:
+    return f"{value:g}".replace("-", "−")
