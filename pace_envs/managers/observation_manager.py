@@ -66,6 +66,10 @@ class ObservationManager:
         """Names of the terms by group."""
         return {name: [term.name for term in terms] for name, (_, terms) in self._groups.items()}
 
+    def group_terms(self, name: str) -> dict[str, tuple[ObservationTermCfg, int]]:
+        """Configuration and size of the terms of a group, in order."""
+        return {term.name: (term.cfg, term().shape[1]) for term in self._groups[name][1]}
+
     def compute(self) -> dict[str, torch.Tensor]:
         """All groups."""
         return {name: self.compute_group(name) for name in self._groups}

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class JointPositionAction(ActionTerm):
-    """Joint position targets: q* = scale * action + offset."""
+    """Joint position targets: q* = scale * action + offset, both (num_joints,) [rad]."""
 
     cfg: JointPositionActionCfg
 
@@ -25,11 +25,11 @@ class JointPositionAction(ActionTerm):
         ids, names = self._asset.find_joints(cfg.joint_names, preserve_order=cfg.preserve_order)
         self.joint_names = names
         self._joint_ids = None if ids == list(range(self._asset.num_joints)) else torch.tensor(ids)
-        self._scale = resolve_joint_values(cfg.scale, names, field="scale", default=1.0)
-        self._offset = resolve_joint_values(cfg.offset, names, field="offset", default=0.0)
+        self.scale = resolve_joint_values(cfg.scale, names, field="scale", default=1.0)
+        self.offset = resolve_joint_values(cfg.offset, names, field="offset", default=0.0)
         if cfg.use_default_offset:
-            self._offset = self._asset.data.default_joint_pos[0, ids].clone()
-        self._plain = bool((self._scale == 1.0).all()) and not bool(self._offset.any())
+            self.offset = self._asset.data.default_joint_pos[0, ids].clone()
+        self._plain = bool((self.scale == 1.0).all()) and not bool(self.offset.any())
         self.processed_actions = torch.zeros(env.num_envs, len(ids), dtype=torch.float64, device=env.device)
 
     @property
@@ -39,7 +39,7 @@ class JointPositionAction(ActionTerm):
 
     def process_actions(self, actions: torch.Tensor) -> None:
         """Scale and offset."""
-        self.processed_actions = actions if self._plain else actions * self._scale + self._offset
+        self.processed_actions = actions if self._plain else actions * self.scale + self.offset
 
     def apply_actions(self) -> None:
         """Set the joints' position targets."""

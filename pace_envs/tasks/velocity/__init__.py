@@ -1,6 +1,6 @@
 """Walking on flat ground after a commanded velocity."""
 
-from pace_envs.tasks.velocity.options import add_randomization, play_cfg, set_drives, use_rewards
+from pace_envs.tasks.velocity.options import add_randomization, fix_command, play_cfg, set_drives, use_rewards
 from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
 from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
 
@@ -8,6 +8,7 @@ __all__ = [
     "VelocityEnvCfg",
     "add_randomization",
     "energy_rewards",
+    "fix_command",
     "play_cfg",
     "set_drives",
     "use_rewards",

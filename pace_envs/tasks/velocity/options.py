@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pace_actuators import PaceDCMotorCfg
 from pace_envs import mdp
 from pace_envs.managers import EventTermCfg, SceneEntityCfg
-from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg
+from pace_envs.tasks.velocity.velocity_env_cfg import COMMAND, VelocityEnvCfg
 
 
 def use_rewards(cfg: VelocityEnvCfg, name: str) -> None:
@@ -70,3 +70,13 @@ def play_cfg(cfg: VelocityEnvCfg) -> None:
     for group in cfg.observations.values():
         group.enable_corruption = False
     cfg.curriculum = {}
+
+
+def fix_command(cfg: VelocityEnvCfg, command: tuple[float, float, float]) -> None:
+    """Give all robots one command: forward [m/s], left [m/s], yaw rate [rad/s]."""
+    x, y, yaw = command
+    cfg.commands = {
+        COMMAND: mdp.UniformVelocityCommandCfg(
+            lin_vel_x=(x, x), lin_vel_y=(y, y), ang_vel_z=(yaw, yaw), rel_standing_envs=0.0
+        )
+    }

@@ -1,0 +1,52 @@
+"""A policy as files for other programs: TorchScript, ONNX, and what its numbers mean."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from pace_envs.mdp import JointPositionAction
+from pace_envs.rl.runner import PaceOnPolicyRunner
+
+
+def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
+    """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``policy.json`` (observations, joints, targets, rate).
+
+    Both take the observation (batch, dim), normalise it themselves, and give the mean action (batch, joints).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it misses torchvision, which nobody needs here
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of both exporters' own deprecations
+            runner.export_policy_to_jit(str(folder))
+            runner.export_policy_to_onnx(str(folder))
+        onnx.save_model(onnx.load_model(folder / "policy.onnx"), folder / "policy.onnx")  # the weights inside
+        (folder / "policy.onnx.data").unlink(missing_ok=True)
+    finally:
+        log.setLevel(level)
+    text = json.dumps(_describe(runner), indent=2)
+    (folder / "policy.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _describe(runner: PaceOnPolicyRunner) -> dict[str, Any]:
+    env = runner.env.unwrapped
+    robot = env.scene["robot"]
+    terms = []
+    for name, (term, dim) in env.observation_manager.group_terms("policy").items():
+        terms.append({"name": name, "dim": dim, "scale": 1.0 if term.scale is None else term.scale})
+    action = env.action_manager.get_term("joint_pos")
+    described: dict[str, Any] = {"version": 1, "step_dt": env.step_dt, "observations": terms}
+    if isinstance(action, JointPositionAction):
+        described["joint_names"] = action.joint_names
+        described["target"] = "target = action * scale + offset, in the encoder's coordinates [rad]"
+        described["scale"], described["offset"] = action.scale.tolist(), action.offset.tolist()
+    described["default_joint_pos"] = robot.data.default_joint_pos[0].tolist()
+    return described

@@ -1,0 +1,122 @@
+"""Playing a trained policy: figures, films, a window, exports."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pace_envs.rendering import OffscreenRenderer
+from pace_envs.rl.evaluation import Evaluation, evaluate
+from pace_envs.rl.export import export_policy
+from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, latest_checkpoint
+from pace_envs.rl.runner import PaceOnPolicyRunner
+from pace_envs.rl.training import EditCfg, load_cfg, make_env
+from pace_envs.rl.video import check_video_path, write_video
+from pace_envs.rl.viewer import watch
+from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+from pace_envs.tasks.velocity import fix_command, play_cfg
+
+_FRAME_EVERY = 2  # environment steps: 25 pictures per second at 50 Hz
+
+
+@dataclass(kw_only=True)
+class PlaySettings:
+    """What is played, and how."""
+
+    checkpoint: str
+    """A checkpoint ``model_<iteration>.pt``, or a run's folder for its last one."""
+
+    task: str | None = None
+    """Registered environment; ``None`` means the one that the checkpoint's run was trained in."""
+
+    num_envs: int = 64
+    """Number of robots that are judged."""
+
+    seconds: float = 20.0
+    """How long [s]."""
+
+    seed: int = 0
+    """Seed of commands and initial states."""
+
+    command: tuple[float, float, float] | None = None
+    """One command for all: forward, left [m/s], yaw rate [rad/s]; ``None`` draws them as in training."""
+
+    video: str | None = None
+    """A film of the first robot, ``.mp4`` or ``.gif``."""
+
+    viewer: bool = False
+    """Whether to open a window instead."""
+
+    export: str | None = None
+    """Folder for the policy as TorchScript and ONNX."""
+
+
+def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | None:
+    """Play a policy; returns its figures, or nothing after a window was closed.
+
+    Raises:
+        ValueError: If the checkpoint or the task does not exist, or they do not fit.
+    """
+    if settings.video is not None:
+        check_video_path(settings.video)
+    path = Path(settings.checkpoint)
+    if path.is_dir():
+        path = latest_checkpoint(path)
+    elif not path.is_file():
+        raise ValueError(f"The checkpoint {path} does not exist.")
+    run = _run_settings(path, settings)
+    cfg = load_cfg(run, edit)
+    play_cfg(cfg)
+    if settings.command is not None:
+        fix_command(cfg, settings.command)
+    env = make_env(cfg)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
+            runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
+        runner.load(str(path))
+        for name in env.unwrapped.command_manager.active_terms:
+            env.unwrapped.command_manager.get_term(name).scale = 1.0  # type: ignore[attr-defined]
+        policy = runner.get_inference_policy()
+        if settings.export is not None:
+            export_policy(runner, Path(settings.export))
+        if settings.viewer:
+            watch(env, policy)
+            return None
+        steps = max(round(settings.seconds / env.unwrapped.step_dt), 1)
+        if settings.video is None:
+            return evaluate(env, policy, steps)
+        film = _Film(env)
+        result = evaluate(env, policy, steps, film.step)
+        write_video(settings.video, film.frames, 1.0 / (_FRAME_EVERY * env.unwrapped.step_dt))
+        film.renderer.close()
+        return result
+    finally:
+        env.close()
+
+
+class _Film:
+    def __init__(self, env: RslRlVecEnvWrapper):
+        self.renderer = OffscreenRenderer(env.unwrapped.sim, 640, 360)
+        self.frames: list[np.ndarray] = []
+        self._steps = 0
+
+    def step(self) -> None:
+        if self._steps % _FRAME_EVERY == 0:
+            self.frames.append(self.renderer.render().copy())
+        self._steps += 1
+
+
+def _run_settings(checkpoint: Path, settings: PlaySettings) -> RunSettings:
+    if (checkpoint.parent / SETTINGS_FILE).is_file():
+        run = RunSettings.read(checkpoint.parent)
+    elif settings.task is not None:
+        run = RunSettings(task=settings.task)
+    else:
+        raise ValueError(f"There is no {SETTINGS_FILE} beside {checkpoint}: say with --task what it was trained for.")
+    run.task = settings.task or run.task
+    run.num_envs, run.seed, run.randomize = settings.num_envs, settings.seed, False
+    return run

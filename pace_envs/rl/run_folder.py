@@ -1,0 +1,85 @@
+"""A training's folder: settings, checkpoints."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime
+from pathlib import Path
+
+SETTINGS_FILE = "settings.json"
+
+
+@dataclass(kw_only=True)
+class RunSettings:
+    """What a training was told; enough to go on with it and to play its policies."""
+
+    task: str
+    """Registered environment."""
+
+    num_envs: int | None = None
+    """Number of environments; ``None`` means the task's."""
+
+    max_iterations: int | None = None
+    """Iterations in all; ``None`` means the task's."""
+
+    seed: int = 42
+    """Seed of the environment and of the networks."""
+
+    reward: str = "velocity"
+    """Name of the task's reward set."""
+
+    randomize: bool = False
+    """Whether friction and mass are randomised and the robot is pushed."""
+
+    log_dir: str = "logs/rsl_rl"
+    """Where runs are kept."""
+
+    def write(self, folder: Path) -> None:
+        """Write ``settings.json``, whole or not at all."""
+        part = folder / f".{SETTINGS_FILE}.part"
+        part.write_text(json.dumps({"version": 1, **asdict(self)}, indent=2) + "\n", encoding="utf-8")
+        os.replace(part, folder / SETTINGS_FILE)
+
+    @classmethod
+    def read(cls, folder: Path) -> RunSettings:
+        """Read ``settings.json``.
+
+        Raises:
+            ValueError: If the folder has none, or it cannot be read.
+        """
+        path = folder / SETTINGS_FILE
+        if not path.is_file():
+            raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            return cls(**{field.name: data[field.name] for field in fields(cls)})
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}).") from None
+
+
+def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:
+    """Create ``<log_dir>/<experiment_name>/<YY_MM_DD_HH-MM-SS>``; a number is added where that exists."""
+    base = Path(log_dir) / experiment_name / datetime.now().strftime("%y_%m_%d_%H-%M-%S")
+    for number in range(1, 1000):
+        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return folder
+    raise OSError(f"{base} exists, and so do 999 more like it.")
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint of the last iteration.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    found = {int(m[1]): p for p in folder.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", p.name))}
+    if not found:
+        raise ValueError(f"{folder} holds no checkpoint model_<iteration>.pt.")
+    return found[max(found)]

@@ -1,0 +1,79 @@
+"""rsl-rl's runner with what this project adds: threads, the curriculum's state in checkpoints."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+
+from pace_envs.mdp import UniformVelocityCommand
+from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+
+
+class PaceOnPolicyRunner(OnPolicyRunner):
+    """Trains a policy.
+
+    Two kinds of work take turns on the same cores. While samples are collected the physics has a thread per core, and
+    torch's tensors are so small that one thread is fastest; while the networks learn the physics rests and torch takes
+    ``learning_threads``.
+    """
+
+    env: RslRlVecEnvWrapper
+
+    def __init__(
+        self, env: RslRlVecEnvWrapper, train_cfg: dict, log_dir: str | None = None, learning_threads: int | None = None
+    ):
+        """Build the networks; ``learning_threads`` defaults to the number of processors."""
+        super().__init__(env, train_cfg, log_dir, device=str(env.device))
+        self.logger.git_status_repos.clear()  # no copy of somebody's uncommitted work in every run
+        self.learning_threads = learning_threads or os.cpu_count() or 1
+        self.alg.update = _with_threads(self.alg.update, self.learning_threads)
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Save networks, optimizer and the curriculum's state, whole or not at all."""
+        part = Path(path).with_name(f".{Path(path).name}.part")
+        super().save(str(part), {**(infos or {}), "env": self._env_state()})
+        os.replace(part, path)
+
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
+        """Load a checkpoint; training goes on with the iteration after it.
+
+        Raises:
+            ValueError: If the file is no checkpoint of these networks.
+        """
+        if not Path(path).is_file():
+            raise ValueError(f"The checkpoint {path} does not exist.")
+        try:
+            infos = super().load(path, load_cfg, strict, map_location)
+        except (RuntimeError, KeyError, AttributeError) as error:
+            first = str(error).splitlines()[0]
+            raise ValueError(f"{path} is no checkpoint of this task's networks ({first}). Check --task.") from None
+        self.current_learning_iteration += 1
+        for name, scale in (infos or {}).get("env", {}).get("command_scale", {}).items():
+            term = self.env.unwrapped.command_manager.get_term(name)
+            if isinstance(term, UniformVelocityCommand):
+                term.scale = scale
+        return infos
+
+    def _env_state(self) -> dict[str, Any]:
+        manager = self.env.unwrapped.command_manager
+        terms = {name: manager.get_term(name) for name in manager.active_terms}
+        return {"command_scale": {n: t.scale for n, t in terms.items() if isinstance(t, UniformVelocityCommand)}}
+
+
+def _with_threads(update: Callable[[], dict], threads: int) -> Callable[[], dict]:
+    def run() -> dict:
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            return update()
+        finally:
+            torch.set_num_threads(before)
+
+    return run

@@ -1,0 +1,104 @@
+"""Training a policy with rsl-rl."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
+from pace_envs.registration import load_env_cfg
+from pace_envs.rl.export import export_policy
+from pace_envs.rl.run_folder import RunSettings, latest_checkpoint, new_run_folder
+from pace_envs.rl.runner import PaceOnPolicyRunner
+from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
+
+EditCfg = Callable[[VelocityEnvCfg], None]
+
+
+def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvCfg:
+    """The configuration of a training's environment.
+
+    Args:
+        settings: The training.
+        edit: Changes it further, such as by :func:`pace_envs.tasks.velocity.set_drives`.
+
+    Raises:
+        ValueError: If the task is none that can be trained, or a setting is unusable.
+    """
+    cfg = load_env_cfg(settings.task)
+    if not isinstance(cfg, VelocityEnvCfg):
+        raise ValueError(
+            f"{settings.task} is no velocity task: there is nothing to learn in it. "
+            "Available: Pace-AnymalD-Velocity-v0, Pace-Go2-Velocity-v0, and your own with a VelocityEnvCfg."
+        )
+    use_rewards(cfg, settings.reward)
+    if settings.randomize:
+        add_randomization(cfg)
+    if settings.num_envs is not None:
+        cfg.scene.num_envs = settings.num_envs
+    cfg.seed = cfg.runner.seed = settings.seed
+    if settings.max_iterations is not None:
+        if settings.max_iterations < 1:
+            raise ValueError(f"max_iterations is {settings.max_iterations}, expected at least 1.")
+        cfg.runner.max_iterations = settings.max_iterations
+    if edit is not None:
+        edit(cfg)
+    return cfg
+
+
+def make_env(cfg: VelocityEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
+    """The environment as rsl-rl sees it; one thread for torch's small tensors, the physics takes the cores."""
+    torch.set_num_threads(1)
+    return RslRlVecEnvWrapper(ManagerBasedRLEnv(cfg, render_mode), clip_actions=cfg.runner.clip_actions)
+
+
+def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
+    """Train a policy; returns the run's folder, with checkpoints and the exported policy.
+
+    Args:
+        settings: The training.
+        edit: Changes the environment's configuration.
+    """
+    cfg = load_cfg(settings, edit)
+    folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
+    settings.write(folder)
+    return _learn(cfg, folder, checkpoint=None)
+
+
+def resume(run: str | Path, max_iterations: int | None = None, edit: EditCfg | None = None) -> Path:
+    """Go on with a training in its folder, up to ``max_iterations`` in all.
+
+    Raises:
+        ValueError: If there is nothing left to do.
+    """
+    folder = Path(run)
+    settings = RunSettings.read(folder)
+    if max_iterations is not None:
+        settings = replace(settings, max_iterations=max_iterations)
+    checkpoint = latest_checkpoint(folder)
+    settings.write(folder)
+    return _learn(load_cfg(settings, edit), folder, checkpoint)
+
+
+def _learn(cfg: VelocityEnvCfg, folder: Path, checkpoint: Path | None) -> Path:
+    torch.manual_seed(cfg.runner.seed)
+    env = make_env(cfg)
+    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict(), str(folder))
+    if checkpoint is not None:
+        runner.load(str(checkpoint))
+        torch.manual_seed(cfg.runner.seed + runner.current_learning_iteration)
+    left = cfg.runner.max_iterations - runner.current_learning_iteration
+    if left < 1:
+        env.close()
+        raise ValueError(
+            f"{checkpoint} is of iteration {runner.current_learning_iteration - 1}, and the training ends after "
+            f"{cfg.runner.max_iterations} iterations. Raise --max_iterations."
+        )
+    runner.learn(left, init_at_random_ep_len=True)
+    export_policy(runner, folder / "exported")
+    env.close()
+    return folder

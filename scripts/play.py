@@ -1,0 +1,34 @@
+"""Play a trained policy: figures, a film, a window, an export."""
+
+import sys
+
+from pace_envs.rl import PlaySettings, play
+from pace_optim.cli import import_task, make_parser, run_cli
+
+
+def main() -> None:
+    """Parse the command line, play, print the figures."""
+    parser = make_parser(
+        "Let a trained policy walk and print how well it follows the commanded velocity, how often it falls, and its "
+        "cost of transport.",
+        example="scripts/play.py --checkpoint logs/rsl_rl/anymal_d_velocity/<run> --video walk.mp4",
+    )
+    parser.add_argument("--checkpoint", required=True, metavar="FILE", help="model_<n>.pt, or a run for its last one")
+    parser.add_argument("--task", help="registered environment (default: that of the run)")
+    parser.add_argument("--num_envs", type=int, default=64, help="robots that are judged (default 64)")
+    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long (default 20)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command", type=float, nargs=3, metavar=("VX", "VY", "WZ"), help="one command for all robots")
+    parser.add_argument("--video", metavar="FILE", help="film of the first robot, .mp4 or .gif; without a screen too")
+    parser.add_argument("--viewer", action="store_true", help="open a window instead")
+    parser.add_argument("--export", metavar="DIR", help="write the policy as TorchScript and ONNX")
+    args = vars(parser.parse_args())
+    args["task"] = import_task(args["task"]) if args["task"] else None
+    args["command"] = tuple(args["command"]) if args["command"] else None
+    result = play(PlaySettings(**args))
+    if result is not None:
+        print(result)
+
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))
