@@ -8,6 +8,7 @@ import numpy as np
 
 _BANDS_PER_OCTAVE = 3
 _FEWEST_LINES = 5
+_COHERENT = 0.8
 _LEAST_POWER = 1e-4
 """Of the strongest band of the command."""
 
@@ -69,10 +70,35 @@ def response(command: np.ndarray, measured: np.ndarray, simulated: np.ndarray, d
             "phase_deg": np.degrees(np.unwrap(np.angle(gain))),
             "coherence": np.abs(cross) ** 2 / np.maximum(own * its, 1e-300),
         }
-    if len(result["frequency"]):  # the same turn for both
-        turns = np.round((result["model"]["phase_deg"] - result["measured"]["phase_deg"]).mean() / 360)
-        result["model"]["phase_deg"] = result["model"]["phase_deg"] - 360 * turns
+    if not len(result["frequency"]):
+        return None
+    difference = result["model"]["phase_deg"] - result["measured"]["phase_deg"]
+    result["model"]["phase_deg"] = result["model"]["phase_deg"] - 360 * np.round(difference.mean() / 360)
+    return result | {"largest": _largest_differences(result)}
+
+
+def _largest_differences(response: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """Where the model is the furthest from the measurement, among the frequencies at which both are coherent."""
+    measured, model = response["measured"], response["model"]
+    sure = np.flatnonzero(np.minimum(measured["coherence"], model["coherence"]) > _COHERENT)
+    result = {}
+    for name in ("magnitude_db", "phase_deg"):
+        if len(sure):
+            difference = (model[name] - measured[name])[sure]
+            at = int(np.argmax(np.abs(difference)))
+            result[name] = {"difference": difference[at], "frequency": response["frequency"][sure[at]]}
     return result
+
+
+def narrowest_band(share: np.ndarray, least: float = 0.6) -> tuple[int, int] | None:
+    """The fewest neighbouring bands, first and last, that hold at least a share; ``None`` if all hold nothing."""
+    total = np.concatenate([[0.0], np.cumsum(share)])
+    for width in range(1, len(share) + 1):
+        held = total[width:] - total[:-width]
+        if held.max() >= least:
+            first = int(held.argmax())
+            return first, first + width - 1
+    return None
 
 
 def _periodic_spectrum(values: np.ndarray) -> np.ndarray:

@@ -11,14 +11,15 @@ import numpy as np
 from pace_optim.trajectory_errors import rms
 
 from .dimensions import Dimension, dimensions_of
-from .frequency import band_edges, band_power, response
+from .frequency import band_edges, band_power, narrowest_band, response
 from .hysteresis import hysteresis
 from .motion import motion_of
 from .noise import NoiseFloor, noise_floor, with_repetitions
 from .places import Place, joint_sentence, places_of
-from .regions import lay_out
+from .regions import Region, lay_out
 from .tracks import Track
 from .whiteness import whiteness
+from .words import band_text
 
 _STRETCHES = 240
 _EXCITED = 0.01
@@ -194,12 +195,17 @@ def _where(dimensions: Sequence[Dimension], layouts: Sequence[Any]) -> dict[str,
 
 def _band_content(edges: np.ndarray, power: dict[str, np.ndarray], octaves: np.ndarray) -> dict[str, Any]:
     count = float(power["samples"].sum())
+    share = _shares(power["above"])
+    held = narrowest_band(share)
+    region = None if held is None else Region(first=held[0], last=held[1], share=share.sum(), base=0.0)
     return {
+        "most": None if region is None else band_text(edges, region),
+        "most_share": None if region is None else float(share[region.first : region.last + 1].sum()),
         "title": "frequency",
         "unit": "Hz",
         "edges": edges,
         "octaves": octaves,
-        "error": _shares(power["above"]),
+        "error": share,
         "motion": _shares(power["motion"]),
         "rms": np.sqrt(power["error"] / count),
         "noise_rms": np.sqrt(power["noise"] / count),

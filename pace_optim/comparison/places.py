@@ -88,15 +88,16 @@ def places_of(
         region = best_region(layout.time, layout.error, dimension.neighbours)
         if region is None or not region.is_place:
             continue
-        mask, by, text = inside(dimension, region), [dimension.name], place_text(dimension, region, recordings)
+        mask, by = inside(dimension, region), {dimension.name: place_text(dimension, region, recordings)}
         others = [other for other in dimensions if not _akin(other, dimension) and other.name not in ("time", *_COARSE)]
         if dimension.name not in _COARSE and (finer := refine(above, mask, region, others)):
             other, region = finer
             mask = mask & inside(other, region)
-            by.append(other.name)
-            text += ", " + place_text(other, region, recordings)
+            by[other.name] = place_text(other, region, recordings)
         value = evidence(min(region.share, 1.0), region.base) * _PLAINNESS.get(dimension.name, 1.0)
-        candidates.append((value, _place(joint, tuple(by), text, region, total, mask)))
+        names = sorted(by, key=lambda name: -_PLAINNESS.get(name, 1.0))
+        text = ", ".join(by[name] for name in names)
+        candidates.append((value, _place(joint, tuple(names), text, region, total, mask)))
     edges, octaves, share = bands
     region = best_region(octaves, share)
     if region is not None and region.is_place:

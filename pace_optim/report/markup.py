@@ -66,6 +66,26 @@ def figure(
     )
 
 
+def choice(name: str, entries: Sequence[str], group: str = "") -> str:
+    """Radio buttons that look like pills: arrow keys go from one to the next.
+
+    Args:
+        name: What is chosen.
+        entries: From what.
+        group: Sets them apart from another choice of the same on the page.
+    """
+    pills = "".join(
+        f'<label><input type="radio" name="{esc(group + name)}" value="{i}"{" checked" if i == 0 else ""}>'
+        f"<span>{esc(entry)}</span></label>"
+        for i, entry in enumerate(entries)
+    )
+    hidden = " hidden" if len(entries) == 1 and name == "recording" else ""
+    return (
+        f'<div class="pills" role="radiogroup" aria-label="{esc(name)}" data-choice="{esc(name)}"{hidden}>'
+        f"<b>{esc(name.capitalize())}</b><div>{pills}</div></div>"
+    )
+
+
 def json_script(content: Any) -> str:
     """Data for the page's script; numbers that JSON does not have become ``null``."""
     text = json.dumps(_finite(content), separators=(",", ":"), allow_nan=False)

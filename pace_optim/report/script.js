@@ -121,9 +121,40 @@
     return draw;
   }
 
+  /** Figures of one joint and recording at a time: templates, which the chosen cell fills. */
+  function makeChooser(element) {
+    const content = read(element);
+    const chosen = (name) => Number(element.querySelector(`[data-choice="${name}"] input:checked`).value);
+    const merged = (base, more) => Object.fromEntries(
+      [...new Set([...Object.keys(base), ...Object.keys(more)])].map((key) => [
+        key, key in base && key in more && !Array.isArray(base[key]) && typeof base[key] === "object"
+          ? { ...base[key], ...more[key] } : more[key] ?? base[key],
+      ]));
+    async function draw() {
+      const cell = content.cells[chosen("recording")][chosen("joint")];
+      for (const [name, figure] of Object.entries(content.figures)) {
+        const card = element.querySelector(`[data-figure="${name}"]`), filled = cell[name];
+        card.querySelector(".said").textContent = filled.text;
+        const data = figure.traces.map((trace, i) => ({ ...trace, ...filled.traces[i] }));
+        await Plotly.react(
+          card.querySelector(".canvas"), inColor(data), inStyle(merged(figure.layout, filled.layout)), CONFIG);
+      }
+    }
+    element.addEventListener("change", draw);
+    document.addEventListener("click", (event) => {
+      const joint = event.target.closest?.("[data-joint]")?.dataset.joint;
+      const input = element.querySelector(`[data-choice="joint"] input[value="${content.joints.indexOf(joint)}"]`);
+      if (!input) return;
+      input.checked = true;
+      draw();
+    });
+    return draw;
+  }
+
   const drawers = [
     ...[...document.querySelectorAll(".explorer")].map(makeExplorer),
     ...[...document.querySelectorAll("figure.plot")].map(makeFigure),
+    ...[...document.querySelectorAll(".chooser")].map(makeChooser),
   ];
   const drawAll = async () => {
     for (const draw of drawers) await draw();

@@ -10,6 +10,8 @@ from ..markup import Section
 from ..run_data import RunData
 from .consistency import consistency
 from .correlation import correlation
+from .failure import failure
+from .ladder import ladder
 from .making import making
 from .overview import overview
 from .parameters import parameters
@@ -19,7 +21,9 @@ from .trajectories import trajectories
 
 SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     overview,
+    ladder,
     trajectories,
+    failure,
     parameters,
     consistency,
     correlation,

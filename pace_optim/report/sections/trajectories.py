@@ -8,7 +8,7 @@ import numpy as np
 
 from pace_optim.trajectory_errors import angle_text, angle_unit, held_out_spans, rms
 
-from ..markup import Section, esc, json_script
+from ..markup import Section, choice, json_script
 from ..run_data import RecordingData, RunData
 
 _SAMPLES_ON_PAGE = 160_000
@@ -32,24 +32,10 @@ def trajectories(run: RunData) -> Section | None:
         title="Trajectories",
         lead="Drag to zoom, double click to see all. The zoom stays when the joint changes.",
         html=(
-            f'<div class="explorer">{_choice("recording", [r.name for r in run.recordings])}'
-            f"{_choice('joint', run.joint_names)}"
+            f'<div class="explorer">{choice("recording", [r.name for r in run.recordings])}'
+            f"{choice('joint', run.joint_names)}"
             f'<p class="errors-here"></p><div class="canvas" style="height:540px"></div>{json_script(content)}</div>'
         ),
-    )
-
-
-def _choice(name: str, entries: list[str] | tuple[str, ...]) -> str:
-    """Radio buttons that look like pills: arrow keys go from one to the next."""
-    pills = "".join(
-        f'<label><input type="radio" name="{name}" value="{i}"{" checked" if i == 0 else ""}><span>{esc(entry)}</span>'
-        "</label>"
-        for i, entry in enumerate(entries)
-    )
-    hidden = " hidden" if len(entries) == 1 and name == "recording" else ""
-    return (
-        f'<div class="pills" role="radiogroup" aria-label="{name}" data-choice="{name}"{hidden}>'
-        f"<b>{name.capitalize()}</b><div>{pills}</div></div>"
     )
 
 

@@ -1,0 +1,83 @@
+"""Where the model fails: the worst places in words, a row per joint, and the curves to choose from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pace_optim.trajectory_errors import angle_unit
+
+from ..markup import Section, bullets, choice, esc, json_script, table
+from ..run_data import RunData
+from .failure_figures import FIGURES
+
+
+def failure(run: RunData) -> Section | None:
+    """What ``compare.py`` found."""
+    content = run.read_json("comparison.json")
+    if not content:
+        return None
+    recordings = [recording["name"] for recording in content["recordings"]]
+    cards = "".join(
+        f'<div data-figure="{name}"><h3>{esc(made.title)}</h3><p class="said"></p>'
+        f'<div class="canvas" style="height:{made.height}px"></div></div>'
+        for name, made in FIGURES.items()
+    )
+    page = {
+        "joints": content["joint_names"],
+        "figures": {name: {"traces": made.traces, "layout": made.layout} for name, made in FIGURES.items()},
+        "cells": [
+            [
+                {
+                    name: made.cell(content["joints"][joint], r, content["recordings"][r])
+                    for name, made in FIGURES.items()
+                }
+                for joint in content["joint_names"]
+            ]
+            for r in range(len(recordings))
+        ],
+    }
+    notes = bullets(content["notes"], "notes") if content["notes"] else ""
+    return Section(
+        id="failure",
+        title="Where the model fails",
+        lead=content["summary"] + _basis(content),
+        html=(
+            f"{_places(content)}{_by_joint(content)}{notes}"
+            f'<div class="chooser">{choice("recording", recordings, "failure-")}'
+            f"{choice('joint', content['joint_names'], 'failure-')}{cards}{json_script(page)}</div>"
+        ),
+    )
+
+
+def _basis(content: dict[str, Any]) -> str:
+    return f" On {', '.join(content['data'])}, which are not the run's own recordings." if content["data"] else ""
+
+
+def _places(content: dict[str, Any]) -> str:
+    """The worst places, one sentence each; a click shows the joint's curves."""
+    entries = "".join(
+        f'<li><a href="#failure" data-joint="{esc(place["joint"])}">{esc(place["sentence"])}</a></li>'
+        for place in content["worst_places"]
+    )
+    return f'<ol class="places">{entries}</ol>' if entries else ""
+
+
+def _by_joint(content: dict[str, Any]) -> str:
+    parts = [part for part in ("train", "validation") if part in content["rmse"]]
+    joints = content["joints"]
+    factor, unit = angle_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts])
+    rows = []
+    for name, joint in joints.items():
+        share = 100 * joint["share_above_floor"]
+        rows.append(
+            [
+                f'<a href="#failure" data-joint="{esc(name)}"><b>{esc(name)}</b></a>',
+                *(f"{factor * joint['rmse'][part]:#.3g}" for part in parts),
+                f"{factor * joint['noise_floor']:#.3g}",
+                f'<span class="share"><div><i style="width:{share:.0f}%"></i></div>{share:.0f} %</span>',
+                esc(joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} ")),
+            ]
+        )
+    words = {"train": "training", "validation": "validation"}
+    head = ["joint", *(f"{words[part]} [{unit}]" for part in parts), f"noise [{unit}]", "error² above noise", "where"]
+    return table(head, rows, "by-joint")
