@@ -1,0 +1,128 @@
+"""A case of the benchmark: what is hidden, and its files."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pace_optim.atomic import write_atomically
+from pace_optim.recording import save_recording
+
+from .draw import Drawn, draw_base, draw_visible, with_background
+from .hidden import effect_named
+from .robot import PlantRobot, plant_robot
+from .suite import Kind, Suite, make_suite
+from .truth import BaseTruth, PlantCfg, Truth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One case; the same case is always drawn the same."""
+
+    effects: tuple[str, ...] = ()
+    """What is hidden; empty for a clean case."""
+    seed: int = 0
+    """Seed of base parameters, sizes, motions and noise."""
+    task: str = "Pace-TestBench-v0"
+    """The robot."""
+    kind: Kind = "battery"
+    """Which recordings."""
+    background: float = 0.0
+    """RMS change of the motion by about twenty other small effects [rad]; 0 for none."""
+    harmonic_drive: bool = False
+    """A 20:1 harmonic drive with a resonance above 0 dB at 4 to 8 Hz, in place of a drawn elasticity."""
+    noise: float = 1e-4
+    """Of the encoder [rad]."""
+    joints: str = ".*"
+    """Which joints have the effects, a regular expression."""
+
+    @property
+    def name(self) -> str:
+        """A name for its folder."""
+        what = "harmonic_drive" if self.harmonic_drive else "+".join(self.effects) or "clean"
+        small = f"_background{self.background:g}" if self.background else ""
+        return f"{self.task}_{self.kind}_{what}{small}_{self.seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaseFiles:
+    """A case's recordings."""
+
+    train: tuple[Path, ...]
+    """To fit."""
+    validation: tuple[Path, ...]
+    """To judge."""
+    truth: Path
+    """What was hidden, JSON."""
+
+
+def make_case(case: Case) -> tuple[Suite, Drawn]:
+    """Draw a case and simulate its recordings.
+
+    Raises:
+        ValueError: If an effect is unknown or stays invisible.
+    """
+    for name in case.effects:
+        effect_named(name)
+    robot = plant_robot(case.task)
+    key = sum(ord(c) * 31**i for i, c in enumerate("+".join(case.effects))) % 2**31
+    rng = np.random.default_rng([case.seed, key])
+    suite = make_suite(robot, case.kind, seed=case.seed)
+    cfg = PlantCfg(control_dt=robot.control_dt, noise=case.noise, seed=case.seed)
+    if case.harmonic_drive:
+        drawn = draw_visible(robot, suite.runs, (), rng, cfg=cfg, base=harmonic_drive(robot, rng))
+    else:
+        drawn = draw_visible(robot, suite.runs, case.effects, rng, cfg=cfg, joints=case.joints)
+    if case.background:
+        drawn = with_background(robot, suite.runs, drawn, rng, size=case.background, cfg=cfg)
+    return suite, drawn
+
+
+def write_case(case: Case, folder: str | os.PathLike[str]) -> CaseFiles:
+    """Draw a case and write `train_<i>_<name>.npz`, `validation_<i>_<name>.npz` and `truth.json` to a folder."""
+    folder = Path(folder)
+    suite, drawn = make_case(case)
+    files: dict[str, list[Path]] = {"train": [], "validation": []}
+    for i, recording in enumerate(drawn.recordings):
+        part = "train" if i < len(suite.train) else "validation"
+        files[part].append(save_recording(folder / f"{part}_{i}_{recording.name}.npz", recording))
+    truth = {"case": case.name, "size": drawn.size, **drawn.truth.to_dict()}
+    path = write_truth(folder / "truth.json", truth)
+    return CaseFiles(train=tuple(files["train"]), validation=tuple(files["validation"]), truth=path)
+
+
+def write_truth(path: Path, truth: dict[str, Any]) -> Path:
+    """Write what was hidden."""
+    text = json.dumps(truth, indent=2).encode()
+    write_atomically(path, lambda file: file.write(text))
+    return path
+
+
+def harmonic_drive(robot: PlantRobot, rng: np.random.Generator) -> Truth:
+    """A drive whose joint elasticity resonates within the band of identification.
+
+    A 20:1 gear makes the rotor heavy at the joint (0.3 to 0.6 kg m^2, as heavy as the link); the flexspline and the
+    joint behind it are soft, so that the link on its spring resonates at sqrt(k / I) = 2π 4 to 8 Hz, little damped,
+    the encoder on the link.
+    """
+    scale = robot.torque_scale
+    frequency = rng.uniform(4.0, 8.0)
+    inertia = 0.3 * scale  # of the bench's link
+    k = inertia * (2 * np.pi * frequency) ** 2
+    base: BaseTruth = draw_base(robot, rng)
+    effect = {"k": k, "c": 0.02 * np.sqrt(k * inertia), "encoder_on_link": 1.0}
+    return Truth(
+        base=BaseTruth(
+            armature=float(rng.uniform(0.1, 0.25)) * scale,
+            viscous_friction=float(rng.uniform(1.5, 3.5)) * scale,
+            friction=base.friction,
+            encoder_bias=base.encoder_bias,
+            delay=0.003,
+        ),
+        effects={"joint_elasticity": {key: float(value) for key, value in effect.items()}},
+    )

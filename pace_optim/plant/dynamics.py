@@ -1,0 +1,223 @@
+"""One integration step of all recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .friction_solver import friction_impulse
+from .hidden import HiddenEffect
+from .rigid_body import RigidBody
+from .state import Drives, State
+
+
+class Dynamics:
+    """Drives, transmission and links between two control instants.
+
+    Drift-kick-drift, of second order for smooth torques:
+
+        q_m = q + h/2 v
+        (M + J + h/2 D) (v' - v) = h (τ - D v - bias(q_m)) + λ,     λ in ± h F: exact Coulomb friction
+        q'  = q_m + h/2 v'
+
+    with armature J and viscous friction D. Torques that depend on speed take it at mid-step, extrapolated as
+    1.5 v - 0.5 v_before. Where the transmission gives, J, D and friction are the motor's, which has a position and
+    speed of its own; a mount that gives adds coordinates of its own to M.
+    """
+
+    def __init__(self, drives: Drives, body: RigidBody, effects: Sequence[HiddenEffect], position: np.ndarray):
+        """Start at rest.
+
+        Args:
+            drives: Constants.
+            body: The links.
+            effects: What is hidden.
+            position: Where the encoder's side of each joint is, (R, n) [rad].
+        """
+        self.drives, self.body = drives, body
+        self.n, self.size = body.num_joints, body.size
+        overrides = _overriders(effects)
+        self._drive = sorted(overrides["drive"], key=lambda effect: effect.drive_rank)
+        self._friction, self._motor, self._joint = (overrides[k] for k in ("friction", "motor_torque", "joint_torque"))
+        rows = len(position)
+        compliance = drives.compliance
+        given = np.zeros(self.n, dtype=bool) if compliance is None else compliance.joints
+        self.given = given
+        self._any_given = bool(given.any())
+        pad = np.zeros((rows, self.size - self.n))
+        self._J = np.concatenate([np.where(given, 0.0, drives.armature), pad], axis=1)
+        mount_c = pad if drives.model.mount_damping is None else pad + drives.model.mount_damping
+        self._D = np.concatenate([np.where(given, 0.0, drives.viscous_friction), mount_c], axis=1)
+        self._mount_k = drives.model.mount_stiffness
+        self._slope = drives.saturation_effort / drives.velocity_limit
+        self._inverse: np.ndarray | None = None
+        self._inverse_h = 0.0
+        self.q = np.concatenate([position, pad], axis=1)
+        self.v = np.zeros_like(self.q)
+        self.motor_pos = position.copy()
+        self._settle(position)
+        self.motor_vel = np.zeros((rows, self.n))
+        self._v_before, self._w_before = self.v.copy(), self.motor_vel.copy()
+        self._impulse = np.zeros_like(self.q)
+        self._motor_impulse = np.zeros((rows, self.n))
+        self.state = State(
+            h=0.0,
+            time=drives.session_start.copy(),
+            clock=0.0,
+            joint_pos=self.joint_pos,
+            joint_vel=self.joint_vel,
+            motor_pos=self.motor_pos,
+            motor_vel=self.motor_vel,
+            torque=np.zeros((rows, self.n)),
+            bias=np.zeros((rows, self.n)),
+        )
+
+    @property
+    def joint_pos(self) -> np.ndarray:
+        """Link positions, (R, n) [rad]."""
+        return self.q[:, : self.n]
+
+    @property
+    def joint_vel(self) -> np.ndarray:
+        """Link speeds, (R, n) [rad/s]."""
+        return self.v[:, : self.n]
+
+    def encoder_side(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and speed of what the encoder sits on, each (R, n)."""
+        compliance = self.drives.compliance
+        if compliance is None:
+            return self.joint_pos, self.joint_vel
+        on_link = compliance.encoder_on_link | ~self.given
+        return (
+            np.where(on_link, self.joint_pos, self.motor_pos),
+            np.where(on_link, self.joint_vel, self.motor_vel),
+        )
+
+    def step(self, command: np.ndarray, h: float) -> None:
+        """Advance by h seconds under a torque asked for, (R, n) [N m]."""
+        n, drives, state, body = self.n, self.drives, self.state, self.body
+        q_mid = self.q + 0.5 * h * self.v
+        v_mid = 1.5 * self.v - 0.5 * self._v_before
+        M, bias = body.mass(q_mid, v_mid)
+        state.h = h
+        state.joint_pos, state.joint_vel, state.bias = q_mid[:, :n], v_mid[:, :n], bias[:, :n]
+        state.motor_pos, state.motor_vel = state.joint_pos, state.joint_vel
+        if self._any_given:
+            motor_mid = self.motor_pos + 0.5 * h * self.motor_vel
+            state.motor_pos = np.where(self.given, motor_mid, state.joint_pos)
+            state.motor_vel = np.where(self.given, 1.5 * self.motor_vel - 0.5 * self._w_before, state.joint_vel)
+
+        state.torque = self._motor_output(command, state)
+        forward, backward = drives.friction, drives.friction
+        for effect in self._friction:
+            forward, backward = effect.friction(forward, backward, state)
+        on_motor = state.torque
+        for effect in self._motor:
+            on_motor = on_motor + effect.motor_torque(state)
+        on_link: np.ndarray | float = 0.0
+        for effect in self._joint:
+            on_link = on_link + effect.joint_torque(state)
+
+        into_link = on_motor
+        if self._any_given:
+            into_link = np.where(self.given, self._step_motor(on_motor, forward, backward, motor_mid, h), on_motor)
+        force = -bias - self._D * self.v
+        force[:, :n] += into_link + on_link
+        if self._mount_k is not None:
+            force[:, n:] -= self._mount_k * q_mid[:, n:]
+        inverse = self._inverse_of(M, h)
+        v_free = self.v + _apply(inverse, h * force, body.blocks)
+        lower, upper = np.zeros_like(self.q), np.zeros_like(self.q)
+        lower[:, :n] = np.where(self.given, 0.0, -h * forward)
+        upper[:, :n] = np.where(self.given, 0.0, h * backward)
+        self._v_before = self.v
+        self.v, self._impulse = friction_impulse(v_free, inverse, lower, upper, body.blocks, self._impulse)
+        self.q = q_mid + 0.5 * h * self.v
+        state.time = state.time + h
+        state.clock += h
+
+    def _motor_output(self, command: np.ndarray, state: State) -> np.ndarray:
+        """The drive's stages, then the four-quadrant curve of a DC motor at the motor's speed.
+
+        min(τ_s (1 - v / v_0), τ_c) above, max(τ_s (-1 - v / v_0), -τ_c) below.
+        """
+        drives = self.drives
+        torque = command
+        for effect in self._drive:
+            torque = effect.drive(torque, state)
+        drop = self._slope * state.motor_vel
+        torque = np.maximum(np.minimum(torque, drives.saturation_effort - drop), -drives.saturation_effort - drop)
+        return np.maximum(np.minimum(torque, drives.effort_limit), -drives.effort_limit)
+
+    def _step_motor(
+        self, torque: np.ndarray, forward: np.ndarray, backward: np.ndarray, motor_mid: np.ndarray, h: float
+    ) -> np.ndarray:
+        """Advance the motors that a spring joins to their links; returns the springs' torque [N m]."""
+        drives = self.drives
+        assert drives.compliance is not None
+        twist = motor_mid - self.state.joint_pos
+        rate = self.state.motor_vel - self.state.joint_vel
+        spring = drives.compliance.torque(twist, rate)
+        inverse = 1 / (drives.armature + 0.5 * h * drives.viscous_friction)
+        w = self.motor_vel + inverse * h * (torque - spring - drives.viscous_friction * self.motor_vel)
+        impulse = np.minimum(np.maximum(-w / inverse, -h * forward), h * backward)
+        self._w_before = self.motor_vel
+        self.motor_vel = w + inverse * impulse
+        self.motor_pos = motor_mid + 0.5 * h * self.motor_vel
+        return spring
+
+    def _inverse_of(self, M: np.ndarray, h: float) -> np.ndarray:
+        """(M + J + h/2 D)⁻¹ of each tree, (R, K, B, B)."""
+        if self.body.constant and self._inverse is not None and self._inverse_h == h:
+            return self._inverse
+        total = M.copy()
+        where = np.arange(self.size)
+        total[:, where, where] += self._J + 0.5 * h * self._D
+        blocks = self.body.blocks
+        self._inverse = np.linalg.inv(total[:, blocks[:, :, None], blocks[:, None, :]])
+        self._inverse_h = h
+        return self._inverse
+
+    def _settle(self, position: np.ndarray) -> None:
+        """Put springs to where they carry gravity at rest, the encoder's side where it is asked to be."""
+        compliance = self.drives.compliance
+        if compliance is None and self._mount_k is None:
+            return
+        for _ in range(30):
+            _, bias = self.body.mass(self.q, np.zeros_like(self.v))
+            if compliance is not None:
+                load = bias[:, : self.n]
+                twist = load / compliance.stiffness + 0.5 * compliance.gap * np.sign(load)
+                link = np.where(compliance.encoder_on_link | ~self.given, position, position - twist)
+                self.q[:, : self.n] = link
+                self.motor_pos = np.where(self.given, link + twist, position)
+            if self._mount_k is not None:
+                self.q[:, self.n :] = -bias[:, self.n :] / self._mount_k
+
+
+def _apply(A: np.ndarray, force: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """A force, block by block, (R, N)."""
+    if blocks.size == 1:
+        return A[:, 0, 0] * force
+    result = np.empty_like(force)
+    result[:, blocks] = np.matmul(A, force[:, blocks][..., None])[..., 0]
+    return result
+
+
+def _overriders(effects: Sequence[HiddenEffect]) -> dict[str, list[HiddenEffect]]:
+    """Effects by the stage that they override."""
+    stages = (
+        "command",
+        "measure",
+        "speed_feedback",
+        "controller",
+        "drive",
+        "friction",
+        "motor_torque",
+        "joint_torque",
+    )
+    return {
+        stage: [each for each in effects if getattr(type(each), stage) is not getattr(HiddenEffect, stage)]
+        for stage in stages
+    }

@@ -1,0 +1,107 @@
+"""Effects on the way of a command, and in the controller."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pace_optim.plant.state import Drives
+
+from .effect import Draw, HiddenEffect, draws_of, hidden
+
+
+@hidden
+class CommandRateLimit(HiddenEffect):
+    """The drive follows targets no faster than |dq*/dt| <= v_max (servo firmware)."""
+
+    name = "command_rate_limit"
+    draws = draws_of(v_max=Draw(unit="rad/s", low=0.8, high=6.0, log=True, role="inverse", null=np.inf))
+
+    def prepare(self, drives: Drives) -> None:
+        """Start at the first target."""
+        self.last: np.ndarray | None = None
+
+    def command(self, target: np.ndarray, dt: float) -> np.ndarray:
+        """Targets as the drive takes them [rad]."""
+        if self.last is None:
+            self.last = target
+        reach = self.v_max * dt
+        self.last = np.clip(target, self.last - reach, self.last + reach)
+        return self.last
+
+
+@hidden
+class OtherDelay(HiddenEffect):
+    """The path that the base delay does not delay is late by T: the torque if the base delays targets, or reverse."""
+
+    name = "other_delay"
+    draws = draws_of(delay=Draw(unit="s", low=0.002, high=0.008))
+
+    def prepare(self, drives: Drives) -> None:
+        """Add the delay to the other path."""
+        if drives.delay_mode == "command":
+            drives.effort_delay = drives.effort_delay + self.delay
+        else:
+            drives.command_delay = drives.command_delay + self.delay
+
+
+@hidden
+class ProportionalGain(HiddenEffect):
+    """kp (1 + g)."""
+
+    name = "proportional_gain"
+    draws = draws_of(gain=Draw(unit="1", low=0.08, high=0.35, signed=True))
+
+    def prepare(self, drives: Drives) -> None:
+        """Change the gain."""
+        drives.stiffness = drives.stiffness * (1 + self.gain)
+
+
+@hidden
+class DerivativeGain(HiddenEffect):
+    """kd (1 + g)."""
+
+    name = "derivative_gain"
+    draws = draws_of(gain=Draw(unit="1", low=0.15, high=0.5, signed=True))
+
+    def prepare(self, drives: Drives) -> None:
+        """Change the gain."""
+        drives.damping = drives.damping * (1 + self.gain)
+
+
+@hidden
+class VelocityFilter(HiddenEffect):
+    """The controller's speed is low-passed: T u' + u = v, sampled at the control rate (exact for a held input)."""
+
+    name = "velocity_filter"
+    draws = draws_of(time_constant=Draw(unit="s", low=0.004, high=0.025))
+
+    def prepare(self, drives: Drives) -> None:
+        """Start at rest."""
+        self.filtered: np.ndarray | float = 0.0
+
+    def speed_feedback(self, speed: np.ndarray, dt: float) -> np.ndarray:
+        """The filtered speed [rad/s]."""
+        share = -np.expm1(-dt / np.maximum(self.time_constant, 1e-9))
+        self.filtered = self.filtered + share * (speed - self.filtered)
+        return np.asarray(self.filtered)
+
+
+@hidden
+class IntegralGain(HiddenEffect):
+    """An integrator nobody speaks of: torque += ki ∫ error dt, the integral's torque within ± limit."""
+
+    name = "integral_gain"
+    outside = True
+    draws = draws_of(
+        ki=Draw(unit="N m/(rad s)", low=40.0, high=200.0, torque=True),
+        limit=Draw(unit="N m", low=3.0, high=10.0, torque=True, role="shape"),
+    )
+
+    def prepare(self, drives: Drives) -> None:
+        """Start at nothing."""
+        self.sum: np.ndarray | float = 0.0
+
+    def controller(self, torque: np.ndarray, error: np.ndarray, dt: float) -> np.ndarray:
+        """Torque with the integral's part [N m]."""
+        self.sum = np.clip(self.sum + self.ki * error * dt, -self.limit, self.limit)
+        return torque + self.sum

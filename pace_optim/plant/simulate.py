@@ -1,0 +1,269 @@
+"""From commands and a truth to recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pace_optim.recording import Drive, Recording
+
+from .dynamics import Dynamics, _overriders
+from .hidden import HiddenEffect, effect_named
+from .rigid_body import ModelChange, RigidBody
+from .robot import DRIVE_FIELDS, PlantRobot, plant_robot
+from .state import Drives
+from .truth import PlantCfg, Run, Truth, per_joint
+
+
+def simulate_runs(
+    task: str | PlantRobot, runs: Sequence[Run], truth: Truth, cfg: PlantCfg | None = None
+) -> list[Recording]:
+    """Make recordings of a robot with hidden effects, all side by side.
+
+    At every control instant the encoder is read, that instant's target is issued, the controller computes, and its
+    torque holds until the next. The robot starts at rest with its encoder at the first target.
+
+    Args:
+        task: Identification task, or a robot.
+        runs: Commands, gains and loads of each recording; commands of the same length.
+        truth: What is hidden.
+        cfg: How the plant is stepped and measured.
+
+    Raises:
+        ValueError: If something does not fit, or the motion diverges.
+    """
+    return simulate_truths(task, runs, [truth], cfg)[0]
+
+
+def simulate_truths(
+    task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
+) -> list[list[Recording]]:
+    """The same for several truths with the same effects and delay mode, with the same noise: [truth][run]."""
+    cfg = cfg or PlantCfg()
+    robot = plant_robot(task) if isinstance(task, str) else task
+    _check(robot, runs, truths)
+    logged, drives = _Session(robot, runs, truths, cfg).run()
+    time = np.arange(len(runs[0].command)) * cfg.control_dt
+    result = []
+    for i, _ in enumerate(truths):
+        rows = range(i * len(runs), (i + 1) * len(runs))
+        result.append(
+            [
+                Recording(
+                    name=run.name,
+                    joint_names=robot.joint_names,
+                    time=time,
+                    dof_pos=np.ascontiguousarray(logged[:, row]),
+                    des_dof_pos=run.command,
+                    drive=Drive(**{field: drives[field][row].copy() for field in DRIVE_FIELDS}),
+                    load=run.load,
+                )
+                for row, run in zip(rows, runs, strict=True)
+            ]
+        )
+    return result
+
+
+def _check(robot: PlantRobot, runs: Sequence[Run], truths: Sequence[Truth]) -> None:
+    if not runs or not truths:
+        raise ValueError(f"There are {len(runs)} runs and {len(truths)} truths; expected at least one of each.")
+    shape = (len(runs[0].command), robot.num_joints)
+    for run in runs:
+        if run.command.shape != shape or shape[0] < 2:
+            raise ValueError(f"The command of {run.name!r} has shape {run.command.shape}; expected {shape}.")
+    first = truths[0]
+    for truth in truths:
+        if set(truth.effects) != set(first.effects) or truth.delay_mode != first.delay_mode:
+            raise ValueError("Truths that are simulated together must have the same effects and delay mode.")
+
+
+@dataclass(eq=False)
+class _Session:
+    """Rows: truth by truth, run by run."""
+
+    robot: PlantRobot
+    runs: Sequence[Run]
+    truths: Sequence[Truth]
+    cfg: PlantCfg
+
+    def run(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Logged positions, (T, R, n) [rad], and the drive's stated gains and limits, {field: (R, n)}."""
+        stated = self._stated_drive()
+        drives = self._drives(stated)
+        effects = self._effects()
+        for effect in effects:
+            effect.prepare(drives)
+        loads = [run.load for _ in self.truths for run in self.runs]
+        body = RigidBody(self.robot, loads, drives.model)
+        return self._play(drives, body, effects), stated
+
+    def _play(self, drives: Drives, body: RigidBody, effects: list[HiddenEffect]) -> np.ndarray:
+        cfg, dt = self.cfg, self.cfg.control_dt
+        issued = np.concatenate([np.stack([run.command for run in self.runs], axis=1)] * len(self.truths), axis=1)
+        steps, rows, n = issued.shape
+        substeps = math.ceil(dt / cfg.step - 1e-9)
+        h = dt / substeps
+        beyond = math.ceil(max(0.0, float(drives.log_skew.max())) * steps) + 2  # the log's clock may run ahead
+        noise = self._noise(steps + beyond, n)
+        stages = _overriders(effects)
+        targets, torques = np.empty((steps + beyond, rows, n)), np.empty((steps + beyond, rows, n))
+        seen, speed = np.empty_like(targets), np.empty_like(targets)
+
+        dynamics = Dynamics(drives, body, effects, self._start(stages["measure"], issued[0] + drives.encoder_bias))
+        for k in range(steps + beyond):
+            position, rate = dynamics.encoder_side()
+            for effect in stages["measure"]:
+                position, rate = effect.measure(position, rate)
+            seen[k], speed[k] = position, rate
+            reading = self._quantised(position - drives.encoder_bias + noise[k])
+
+            target = issued[min(k, steps - 1)]
+            for effect in stages["command"]:
+                target = effect.command(target, dt)
+            targets[k] = target
+            error = _delayed(targets, k, drives.command_delay / dt) - reading
+            for effect in stages["speed_feedback"]:
+                rate = effect.speed_feedback(rate, dt)
+            torque = drives.stiffness * error - drives.damping * rate
+            for effect in stages["controller"]:
+                torque = effect.controller(torque, error, dt)
+            torques[k] = torque
+            torque = _delayed(torques, k, drives.effort_delay / dt)
+            for _ in range(substeps):
+                dynamics.step(torque, h)
+            if k % 100 == 0:
+                self._check_finite(dynamics.q, k)
+        self._check_finite(dynamics.q, steps)
+        return self._log(seen, speed, drives, noise, steps)
+
+    def _log(self, seen: np.ndarray, speed: np.ndarray, drives: Drives, noise: np.ndarray, steps: int) -> np.ndarray:
+        """What is written: positions at the instants of the log's clock, with the loop's noise, (T, R, n)."""
+        dt = self.cfg.control_dt
+        if not drives.log_delay.any() and not drives.log_skew.any():
+            position = seen[:steps]
+        else:
+            k = np.arange(steps)[:, None, None]
+            at = k * (1 + drives.log_skew) - drives.log_delay / dt
+            position = _hermite(seen, speed, np.maximum(at, 0.0), dt)
+        return self._quantised(position - drives.encoder_bias + noise[:steps])
+
+    def _stated_drive(self) -> dict[str, np.ndarray]:
+        stated = {}
+        for field in DRIVE_FIELDS:
+            rows = [
+                self.robot.drive[field]
+                if getattr(run.drive, field) is None
+                else np.broadcast_to(np.asarray(getattr(run.drive, field), dtype=float), (self.robot.num_joints,))
+                for run in self.runs
+            ]
+            stated[field] = np.tile(np.stack(rows), (len(self.truths), 1))
+        return stated
+
+    def _drives(self, stated: dict[str, np.ndarray]) -> Drives:
+        names, count = self.robot.joint_names, len(self.runs)
+        rows = count * len(self.truths)
+        zeros = np.zeros((rows, len(names)))
+
+        def rows_of(field: str, default: float = 0.0) -> np.ndarray:
+            values = [per_joint(getattr(truth.base, field), names, default, field) for truth in self.truths]
+            return np.repeat(np.stack(values), count, axis=0)
+
+        delay = np.repeat([truth.base.delay for truth in self.truths], count)[:, None] + zeros
+        mode = self.truths[0].delay_mode
+        return Drives(
+            stiffness=stated["stiffness"],
+            damping=stated["damping"],
+            saturation_effort=stated["saturation_effort"],
+            effort_limit=stated["effort_limit"],
+            velocity_limit=stated["velocity_limit"],
+            armature=rows_of("armature"),
+            viscous_friction=rows_of("viscous_friction"),
+            friction=rows_of("friction"),
+            encoder_bias=rows_of("encoder_bias"),
+            delay_mode=mode,
+            command_delay=delay if mode == "command" else zeros,
+            effort_delay=delay if mode == "effort" else zeros,
+            log_delay=zeros,
+            log_skew=zeros,
+            session_start=np.tile([run.session_start for run in self.runs], len(self.truths))[:, None],
+            rng=np.random.default_rng([self.cfg.seed, 2]),
+            model=ModelChange(mass_factor=zeros + 1.0, com_angle=zeros),
+        )
+
+    def _effects(self) -> list[HiddenEffect]:
+        names, count = self.robot.joint_names, len(self.runs)
+        effects = []
+        for effect_name in self.truths[0].effects:
+            kind = effect_named(effect_name)
+            values = {}
+            for parameter, draw in kind.draws.items():
+                rows = []
+                for truth in self.truths:
+                    given = truth.effects[effect_name]
+                    if set(given) != set(kind.draws):
+                        raise ValueError(
+                            f"{effect_name} is given {', '.join(given)}; expected {', '.join(kind.draws)}."
+                        )
+                    rows.append(per_joint(given[parameter], names, draw.null, f"{effect_name}.{parameter}"))
+                values[parameter] = np.repeat(np.stack(rows), count, axis=0)
+            effects.append(kind(values))
+        return effects
+
+    def _start(self, measures: list[HiddenEffect], wanted: np.ndarray) -> np.ndarray:
+        """The position whose reading is the first target."""
+        position = wanted.copy()
+        for _ in range(20):
+            shown, _ = position, position
+            for effect in measures:
+                shown, _ = effect.measure(shown, np.zeros_like(shown))
+            position = position + (wanted - shown)
+        return position
+
+    def _noise(self, steps: int, n: int) -> np.ndarray:
+        """The same for every truth; each run has its own, whatever the others are."""
+        streams = [
+            np.random.default_rng([self.cfg.seed, 1, r]).normal(0.0, self.cfg.noise, (steps, n))
+            if self.cfg.noise
+            else np.zeros((steps, n))
+            for r in range(len(self.runs))
+        ]
+        return np.tile(np.stack(streams, axis=1), (1, len(self.truths), 1))
+
+    def _quantised(self, reading: np.ndarray) -> np.ndarray:
+        if self.cfg.counts_per_turn is None:
+            return reading
+        width = 2 * np.pi / self.cfg.counts_per_turn
+        return np.round(reading / width) * width
+
+    def _check_finite(self, q: np.ndarray, k: int) -> None:
+        if not np.all(np.isfinite(q)) or np.abs(q).max() > 100.0:
+            row = int(np.argmax(np.where(np.isfinite(q), np.abs(q), np.inf).max(axis=1)))
+            run = self.runs[row % len(self.runs)].name
+            raise ValueError(
+                f"The plant diverges in {run!r} at {k * self.cfg.control_dt:.2f} s. Give it less delay, more damping "
+                "or lower gains."
+            )
+
+
+def _delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
+    """History at instant k - delay [control steps], linear between instants; the first value before the start."""
+    if not delay.any():
+        return history[k]
+    whole = np.floor(delay).astype(int)
+    part = delay - whole
+    near, far = np.maximum(k - whole, 0), np.maximum(k - whole - 1, 0)
+    return (1 - part) * np.take_along_axis(history, near[None], axis=0)[0] + part * np.take_along_axis(
+        history, far[None], axis=0
+    )[0]
+
+
+def _hermite(value: np.ndarray, slope: np.ndarray, at: np.ndarray, dt: float) -> np.ndarray:
+    """Values between samples by the cubic that has their values and slopes; ``at`` counts samples, (T, R, n)."""
+    left = np.clip(np.floor(at).astype(int), 0, len(value) - 2)
+    s = np.clip(at - left, 0.0, 1.0)
+    p0, p1 = np.take_along_axis(value, left, axis=0), np.take_along_axis(value, left + 1, axis=0)
+    m0, m1 = np.take_along_axis(slope, left, axis=0) * dt, np.take_along_axis(slope, left + 1, axis=0) * dt
+    return (1 + 2 * s) * (1 - s) ** 2 * p0 + s * (1 - s) ** 2 * m0 + s**2 * (3 - 2 * s) * p1 + s**2 * (s - 1) * m1
