@@ -55,18 +55,22 @@ def test_the_tutorial_for_an_own_objective_works_when_typed(tmp_path):
     type_in(ROOT / "docs" / "your_own_objective.md", tmp_path, ROOT)
 
 
-def test_the_readmes_code_runs(tmp_path):
-    for i, (_, text) in enumerate(blocks(ROOT / "README.md", "python")):
+SHOWN = [ROOT / "README.md", ROOT / "docs" / "training.md"]
+"""Pages whose code runs and whose commands exist; they take too long to be typed."""
+
+
+@pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
+def test_the_code_runs(page, tmp_path):
+    for i, (_, text) in enumerate(blocks(page, "python")):
         run = subprocess.run(
             [sys.executable, "-"], input=text, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
         )
         assert run.returncode == 0, f"block {i}:\n{run.stderr}"
 
 
-def test_the_readmes_commands_exist_with_these_options():
-    scripts = [
-        line for _, text in blocks(ROOT / "README.md", "bash") for line in text.splitlines() if "scripts/" in line
-    ]
+@pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
+def test_the_commands_exist_with_these_options(page):
+    scripts = [line for _, text in blocks(page, "bash") for line in text.splitlines() if "scripts/" in line]
     assert scripts
     for line in scripts:
         words = line.split("#")[0].split()
