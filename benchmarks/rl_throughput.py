@@ -211,7 +211,7 @@ def main() -> int:
     parser.add_argument("--num_envs", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=25, help="environment steps a repetition")
     parser.add_argument("--repetitions", type=int, default=5)
-    parser.add_argument("--async_envs", type=int, default=8, help="processes of AsyncVectorEnv; 0 leaves it out")
+    parser.add_argument("--async_envs", type=int, nargs="*", default=[2, 8, 32], help="processes of AsyncVectorEnv")
     parser.add_argument("--iterations", type=int, default=3, help="iterations of the timed training; 0 leaves it out")
     parser.add_argument("--learning_threads", type=int, help="torch's threads while learning (default: all processors)")
     parser.add_argument("--at_least", type=float, default=0.0, help="ratio to the bare loop that env.step must reach")
@@ -229,9 +229,8 @@ def main() -> int:
     samples = args.num_envs * args.steps
     ratios = np.array(bare[1:]) / np.array(ours[1:])  # the first turn warms up
     rates = {"bare mujoco.batch loop": samples / np.median(bare[1:]), "env.step": samples / np.median(ours[1:])}
-    if args.async_envs:
-        name = f"AsyncVectorEnv of {args.async_envs}"
-        rates[name] = async_rate(env, law, start, decimation, args.async_envs, 20 * args.steps)
+    for count in args.async_envs:
+        rates[f"AsyncVectorEnv of {count}"] = async_rate(env, law, start, decimation, count, 4000 // count)
     env.close()
 
     load = os.getloadavg()[0]

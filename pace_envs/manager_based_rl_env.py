@@ -112,6 +112,6 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         log = self.reward_manager.reset(env_ids) | self.termination_manager.reset(env_ids)
         log |= self.curriculum_manager.reset(env_ids)
         super()._reset_idx(env_ids)
-        self.command_manager.reset(env_ids)
+        log |= self.command_manager.reset(env_ids)
         self.episode_length_buf[env_ids] = 0
         self.extras["log"] = log

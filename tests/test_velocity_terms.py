@@ -239,6 +239,22 @@ def test_commands_keep_to_the_scale():
     assert 0.9 < term.command.abs().max() <= 1.0
 
 
+def test_the_error_of_an_episode_is_logged_with_its_end(env):
+    term = env.command_manager.get_term("base_velocity")
+    term.reset(torch.arange(2))
+    term.time_left[:] = 9.0
+    for speed in (0.2, 0.4):
+        put(env, velocity=(speed, 0.0, 0.0))
+        command(env, 0.0, 0.0, 0.5)
+        term.compute(0.02)
+    log = env.command_manager.reset(torch.tensor([1]))
+    assert log == {
+        "Metrics/base_velocity/error_vel_xy": pytest.approx(0.3),
+        "Metrics/base_velocity/error_vel_yaw": pytest.approx(0.5),
+    }
+    assert env.command_manager.reset(torch.tensor([1])) == {}
+
+
 def says(env, env_ids):
     return {"ended": len(env_ids)}
 

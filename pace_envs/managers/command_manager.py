@@ -40,12 +40,14 @@ class CommandTerm:
         """The present command, (num_envs, dim)."""
         raise NotImplementedError
 
-    def reset(self, env_ids: torch.Tensor) -> None:
-        """Draw new commands for some environments."""
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Draw new commands for some environments; returns how well their last episodes followed theirs."""
         self._resample(env_ids)
+        return {}
 
     def compute(self, dt: float) -> None:
         """Let time pass and draw where it has run out."""
+        self._update_metrics()
         self.time_left -= dt
         self._resample((self.time_left <= 0.0).nonzero()[:, 0])
         self._update_command()
@@ -57,6 +59,9 @@ class CommandTerm:
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         raise NotImplementedError
+
+    def _update_metrics(self) -> None:
+        """Note how well the command is followed (nothing by default)."""
 
     def _update_command(self) -> None:
         """Change the command with the state (none by default)."""
@@ -91,7 +96,9 @@ class CommandManager:
         for term in self._terms.values():
             term.compute(dt)
 
-    def reset(self, env_ids: torch.Tensor) -> None:
-        """Draw new commands for some environments."""
-        for term in self._terms.values():
-            term.reset(env_ids)
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Draw new commands for some environments; returns the terms' metrics as ``Metrics/<term>/<metric>``."""
+        log: dict[str, float] = {}
+        for name, term in self._terms.items():
+            log |= {f"Metrics/{name}/{metric}": value for metric, value in term.reset(env_ids).items()}
+        return log

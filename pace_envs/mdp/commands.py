@@ -29,11 +29,27 @@ class UniformVelocityCommand(CommandTerm):
         self._command = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)
         ranges = torch.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z], dtype=torch.float64)
         self._low, self._high = ranges[:, 0], ranges[:, 1]
+        self._errors = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)  # planar, yaw, steps
 
     @property
     def command(self) -> torch.Tensor:
         """The present command, (num_envs, 3)."""
         return self._command
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+        """Draw new commands; returns the mean errors of the episodes that ended [m/s], [rad/s]."""
+        super().reset(env_ids)
+        planar, yaw, steps = self._errors[env_ids].sum(dim=0).tolist()
+        self._errors[env_ids] = 0.0
+        return {"error_vel_xy": planar / steps, "error_vel_yaw": yaw / steps} if steps else {}
+
+    def _update_metrics(self) -> None:
+        data = self._env.scene["robot"].data
+        if data.root_ang_vel_b is None:
+            return
+        planar = (data.root_lin_vel_b[:, :2] - self._command[:, :2]).norm(dim=1)
+        yaw = (data.root_ang_vel_b[:, 2] - self._command[:, 2]).abs()
+        self._errors += torch.stack([planar, yaw, torch.ones_like(yaw)], dim=1)
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         drawn = self._env.uniform((len(env_ids), 3), self._low, self._high) * self.scale
