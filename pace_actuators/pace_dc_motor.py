@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,10 +11,14 @@ import torch
 
 from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
+
+_INVERSION_STEPS = 6
+"""Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
 
 _NOT_NEGATIVE = (lambda x: (x >= 0) & x.isfinite(), "a finite number >= 0")
 _DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
@@ -45,6 +50,10 @@ class PaceDCMotor:
         τ     = clip(τ, τ_min(v), τ_max(v))                   four-quadrant torque-speed limit
         τ     = 0 where the drive is disabled
 
+    Effects of ``cfg.effects`` act on this way, each at its stage: command, measurement, controller, drive (before the
+    limit), friction and transmission (after it). What they ask the simulator to apply itself is in ``joint_armature``,
+    ``joint_friction`` and ``joint_viscous_friction``.
+
     Source: Bjelonic et al., PACE (arXiv 2509.06342); torque-speed limit as Isaac Lab's ``DCMotor``.
     The constructor, the attributes and :meth:`compute` are those of an Isaac Lab actuator. Override
     :meth:`compute_effort_command` or :meth:`drive_effort` to model a motor of your own.
@@ -54,9 +63,16 @@ class PaceDCMotor:
         applied_effort: The torque at the joint [N m], (num_envs, num_joints).
         stiffness, damping, effort_limit, saturation_effort, velocity_limit: See the configuration;
             each (num_envs, num_joints) and writable per environment.
-        armature, friction, dynamic_friction, viscous_friction: For the simulator, (num_envs, num_joints).
+        armature, friction, dynamic_friction, viscous_friction: The identified ones, (num_envs, num_joints).
+        effects: The effects beyond the base model, an ``EffectStack``, or ``None``.
         encoder_bias: [rad], (num_envs, num_joints).
         torque_enable: Whether the drive gives torque, (num_envs, 1), or ``None`` when all do.
+        holds_line: Whether, between two calls, the simulator holds a torque that runs along the torque-speed line
+            (``held_effort`` with its slope in ``joint_viscous_friction``) rather than one number. It should where it
+            takes several physics steps between two calls.
+        centred: Whether the first call of a control step gives the mean of the old and the new torque. Where a
+            simulator updates speeds before positions (semi-implicit Euler), a torque acts half a physics step early;
+            with this it does not.
     """
 
     is_implicit_model = False
@@ -77,6 +93,7 @@ class PaceDCMotor:
         effort_limit: torch.Tensor | float = torch.inf,
         velocity_limit: torch.Tensor | float = torch.inf,
         *,
+        physics_dt: float | None = None,
         dtype: torch.dtype = torch.float32,
     ):
         """Create the drive of a group of joints.
@@ -96,6 +113,7 @@ class PaceDCMotor:
             viscous_friction: [N m s/rad].
             effort_limit: [N m].
             velocity_limit: [rad/s].
+            physics_dt: Time between two calls of :meth:`compute` [s], where the configuration says ``None``.
             dtype: Type of all tensors.
 
         Raises:
@@ -131,6 +149,10 @@ class PaceDCMotor:
             self.saturation_effort = self._parameter("saturation_effort", torch.inf)
         self.encoder_bias = self._parameter("encoder_bias", 0.0)
         self.torque_enable: torch.Tensor | None = None
+        self.holds_line = False
+        self.centred = False
+        self._first_call = True
+        self._speed_slope: torch.Tensor | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
         self.applied_effort = torch.zeros_like(self.stiffness)
@@ -141,6 +163,8 @@ class PaceDCMotor:
         self._silent: set[str] = set()  # commands that were not given at the last control step
         self._calls_until_control = 0
         self.update_time_lags(cfg.delay)
+        self.effects = self._make_effects(cfg.physics_dt or physics_dt)
+        self.update_effects()
 
     @property
     def num_joints(self) -> int:
@@ -175,11 +199,25 @@ class PaceDCMotor:
         Returns:
             A copy of ``control_action`` whose ``joint_efforts`` are the torques at the joints [N m].
         """
+        if self.effects is not None:
+            self._begin_step(joint_pos, joint_vel)
+        asked = self.computed_effort
         if self._calls_until_control == 0:
-            self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
+            before, first = asked, self._first_call
+            asked = self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
             self._calls_until_control = self.cfg.control_decimation
+            self._first_call = False
+            if self.centred and not first:
+                asked = 0.5 * (before + asked)
         self._calls_until_control -= 1
-        self.applied_effort = self.drive_effort(self.computed_effort, joint_pos, joint_vel)
+        effort = self.drive_effort(asked, joint_pos, joint_vel)
+        if self.effects is not None:
+            effort = self.transmitted_effort(effort)
+            self.effects.state.time += self.effects.dt
+            self._step_begun = False
+        self.applied_effort = effort
+        if self._speed_slope is not None:
+            self._held_effort = torch.addcmul(effort, self._speed_slope, joint_vel)
         return dataclasses.replace(
             control_action, joint_positions=None, joint_velocities=None, joint_efforts=self.applied_effort
         )
@@ -200,15 +238,22 @@ class PaceDCMotor:
         position = self._delayed("positions", control_action.joint_positions)
         velocity = self._delayed("velocities", control_action.joint_velocities)
         feed_forward = self._delayed("efforts", control_action.joint_efforts)
-        encoder_pos = joint_pos - self.encoder_bias
+        stiffness, damping, encoder_vel = self.stiffness, self.damping, joint_vel
+        if self.effects is not None:
+            position, encoder_vel, stiffness, damping = self._seen_by_controller(position, joint_vel)
+        encoder_pos = self.sensed_position(joint_pos) - self.encoder_bias
         if position is None:  # no position target: velocity and effort control
             position = encoder_pos
-        velocity_error = -joint_vel if velocity is None else velocity - joint_vel
-        effort = pd_effort(position - encoder_pos, velocity_error, self.stiffness, self.damping)
+        velocity_error = -encoder_vel if velocity is None else velocity - encoder_vel
+        effort = pd_effort(position - encoder_pos, velocity_error, stiffness, damping)
         if feed_forward is not None:
             effort += feed_forward
         if self.cfg.delay_mode == "effort":
-            return self._delay_buffers["torque"].compute(effort)
+            effort = self._delay_buffers["torque"].compute(effort)
+        if self.effects is not None and self.effects.has("effort_command"):
+            self.effects.state.effort = effort
+            self.effects.run("effort_command")
+            effort = self.effects.state.effort.clone()
         return effort
 
     def drive_effort(
@@ -222,10 +267,141 @@ class PaceDCMotor:
             joint_vel: v [rad/s], (num_envs, num_joints).
 
         Returns:
-            The torque at the joint [N m], (num_envs, num_joints).
+            The motor's torque [N m], (num_envs, num_joints).
         """
-        effort = clip_effort(effort_command, joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
-        return effort if self.torque_enable is None else effort * self.torque_enable
+        asked, slope = effort_command, None
+        if self.effects is not None and self.effects.has("drive"):
+            s = self.effects.state
+            s.effort = asked
+            s.speed_slope.zero_()
+            self.effects.run("drive")
+            asked, slope = s.effort, s.speed_slope
+        effort = clip_effort(asked, joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
+        if self.holds_line:
+            line = self.saturation_effort / self.velocity_limit
+            unchanged = effort == asked
+            free = effort.abs() < self.effort_limit
+            self._speed_slope = torch.where(unchanged, 0.0 if slope is None else slope, line * free)
+        if self.torque_enable is not None:
+            effort = effort * self.torque_enable
+            if self._speed_slope is not None:
+                self._speed_slope = self._speed_slope * self.torque_enable
+        return effort
+
+    def transmitted_effort(self, effort: torch.Tensor) -> torch.Tensor:
+        """The transmission's part, at every call: effects of friction and transmission.
+
+        Args:
+            effort: The motor's torque [N m], (num_envs, num_joints).
+
+        Returns:
+            The torque at the joint [N m]; friction that the simulator is to apply is in ``joint_friction`` and
+            ``joint_viscous_friction``.
+        """
+        stack = self.effects
+        if stack is None or not stack.changes_passive:
+            return effort
+        s = stack.state
+        s.effort, s.friction, s.viscous_friction = effort, self.friction, self.viscous_friction
+        stack.run("friction")
+        stack.run("transmission")
+        torch.clamp(s.friction, min=0.0, out=s.friction)
+        torch.clamp(s.viscous_friction, min=0.0, out=s.viscous_friction)
+        return s.effort.clone()
+
+    @property
+    def held_effort(self) -> torch.Tensor:
+        """The torque that the simulator is to hold until the next call [N m], (num_envs, num_joints).
+
+        ``applied_effort``, unless ``holds_line``: then the torque that the line has at standstill.
+        """
+        return self.applied_effort if self._speed_slope is None else self._held_effort
+
+    @property
+    def joint_armature(self) -> torch.Tensor:
+        """Rotor inertia that the simulator is to carry [kg m²], (num_envs, num_joints)."""
+        return self.armature if self.effects is None else self.effects.state.armature
+
+    @property
+    def joint_friction(self) -> torch.Tensor:
+        """Coulomb friction that the simulator is to apply until the next call [N m], (num_envs, num_joints)."""
+        stack = self.effects
+        return stack.state.friction if stack is not None and stack.changes_passive else self.friction
+
+    @property
+    def joint_viscous_friction(self) -> torch.Tensor:
+        """Viscous friction that the simulator is to apply until the next call [N m s/rad], (num_envs, num_joints)."""
+        stack = self.effects
+        own = stack.state.viscous_friction if stack is not None and stack.changes_passive else self.viscous_friction
+        return own if self._speed_slope is None else own + self._speed_slope
+
+    @property
+    def changes_passive(self) -> bool:
+        """Whether ``joint_friction`` and ``joint_viscous_friction`` change from call to call."""
+        return self.holds_line or (self.effects is not None and self.effects.changes_passive)
+
+    @property
+    def needs_load(self) -> bool:
+        """Whether an effect reads the torque of gravity and load (:meth:`set_load_effort`)."""
+        return self.effects is not None and self.effects.needs_load
+
+    def sensed_position(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """What the encoder shows, before its bias is subtracted [rad], (num_envs, num_joints).
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+        """
+        if self.effects is None or not self.effects.has("measurement"):
+            return joint_pos
+        s = self.effects.state
+        s.encoder_pos, s.joint_pos = joint_pos, joint_pos
+        self.effects.run("measurement")
+        return s.encoder_pos
+
+    def position_that_shows(self, encoder_pos: torch.Tensor) -> torch.Tensor:
+        """The joint position at which the encoder shows a value before its bias: inverse of :meth:`sensed_position`.
+
+        Args:
+            encoder_pos: [rad], (num_envs, num_joints).
+        """
+        position = encoder_pos.clone()
+        if self.effects is not None and self.effects.has("measurement"):
+            for _ in range(_INVERSION_STEPS):
+                position += encoder_pos - self.sensed_position(position)
+        return position
+
+    def observe(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
+        """What the encoder shows now, before its bias; may be called before :meth:`compute` of the same instant.
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+            joint_vel: v [rad/s], (num_envs, num_joints).
+        """
+        if self.effects is None:
+            return joint_pos
+        self._begin_step(joint_pos, joint_vel)
+        return self.sensed_position(joint_pos)
+
+    def set_load_effort(self, load_effort: torch.Tensor) -> None:
+        """Give the torque of gravity and load on the joints at this instant [N m], (num_envs, num_joints)."""
+        if self.effects is not None:
+            self.effects.state.load_effort = load_effort
+
+    def set_session_time(self, time: torch.Tensor) -> None:
+        """Set the time since the session began [s], (num_envs, 1) or (num_envs, num_joints); it goes on from there."""
+        if self.effects is not None:
+            self.effects.state.time = time.expand_as(self.effects.state.time)
+
+    def update_effects(self) -> None:
+        """Take over changed parameters of the base model and of the effects."""
+        if self.effects is None:
+            return
+        s = self.effects.state
+        s.base_armature, s.base_friction, s.base_viscous_friction = self.armature, self.friction, self.viscous_friction
+        for effect in self.effects.effects:
+            effect.prepare()
+        s.armature, s.friction, s.viscous_friction = self.armature, self.friction, self.viscous_friction
+        self.effects.run("armature")
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments; parameters stay."""
@@ -234,6 +410,10 @@ class PaceDCMotor:
         if env_ids is None:
             self._silent.clear()
             self._calls_until_control = 0
+            self._first_call = True
+        if self.effects is not None:
+            self.effects.reset(env_ids)
+            self._step_begun = False
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it."""
@@ -257,6 +437,56 @@ class PaceDCMotor:
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
         self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
+
+    def _make_effects(self, physics_dt: float | None) -> EffectStack | None:
+        cfgs = [cfg for cfg in effect_cfgs(self.cfg.effects) if _applies(cfg, self._joint_names)]
+        self._step_begun = False
+        if not cfgs:
+            return None
+        if physics_dt is None:
+            raise ValueError(
+                f"The effects {', '.join(cfg.label for cfg in cfgs)} need to know the time between two calls: set "
+                "physics_dt [s] in the actuator's configuration."
+            )
+        return EffectStack(
+            cfgs,
+            self._joint_names,
+            self._num_envs,
+            dt=physics_dt,
+            control_dt=physics_dt * self.cfg.control_decimation,
+            delay_mode=self.cfg.delay_mode,
+            device=self._device,
+            dtype=self._dtype,
+        )
+
+    def _begin_step(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> None:
+        """Bring the effects' own states to the present instant, once per physics step."""
+        stack = self.effects
+        if stack is None or self._step_begun:
+            return
+        s = stack.state
+        s.joint_pos, s.joint_vel = joint_pos, joint_vel
+        stack.run("advance")
+        self._step_begun = True
+
+    def _seen_by_controller(self, position: torch.Tensor | None, joint_vel: torch.Tensor) -> tuple:
+        """Target, speed and gains after the effects on them."""
+        stack = self.effects
+        s = stack.state
+        encoder_vel, stiffness, damping = joint_vel, self.stiffness, self.damping
+        if position is not None and stack.has("command"):
+            s.joint_pos_target = position
+            stack.run("command")
+            position = s.joint_pos_target
+        if stack.has("sensed_velocity"):
+            s.encoder_vel = joint_vel
+            stack.run("sensed_velocity")
+            encoder_vel = s.encoder_vel
+        if stack.has("controller"):
+            s.stiffness, s.damping = stiffness, damping
+            stack.run("controller")
+            stiffness, damping = s.stiffness, s.damping
+        return position, encoder_vel, stiffness, damping
 
     def _delayed(self, name: str, data: torch.Tensor | None) -> torch.Tensor | None:
         buffer = self._delay_buffers.get(name)
@@ -300,3 +530,12 @@ class PaceDCMotor:
             raise ValueError(f"Unknown delay_mode {self.cfg.delay_mode!r}. Available: 'command', 'effort'.")
         if not (isinstance(self.cfg.control_decimation, int) and self.cfg.control_decimation >= 1):
             raise ValueError(f"control_decimation is {self.cfg.control_decimation!r}, expected an integer >= 1.")
+
+
+def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:
+    """Whether an effect has joints in this group of joints; in another group it may have some."""
+    return any(
+        re.fullmatch(pattern, name)
+        for pattern in ([cfg.joint_names_expr] if isinstance(cfg.joint_names_expr, str) else cfg.joint_names_expr)
+        for name in joint_names
+    )

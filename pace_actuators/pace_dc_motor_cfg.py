@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from pace_actuators.effects import EffectCfg
 from pace_actuators.joint_values import JointValue
 
 if TYPE_CHECKING:
@@ -69,3 +70,9 @@ class PaceDCMotorCfg:
 
     control_decimation: int = 1
     """Calls of ``compute`` (physics steps) per control step; the commanded torque is held in between."""
+
+    effects: Sequence[EffectCfg | str] = ()
+    """Physical effects beyond this base model, by name (``"stribeck_friction"``) or with their values."""
+
+    physics_dt: float | None = None
+    """Time between two calls of ``compute`` [s]; effects need it, an environment gives its own."""

@@ -11,6 +11,7 @@ import torch
 from pace_actuators import ActuatorActions, PaceDCMotor, match_names, resolve_joint_values
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
+from pace_envs.link_model import LinkModel
 from pace_envs.simulation import EnvIds, Simulation
 
 JointIds = Sequence[int] | torch.Tensor | slice | None
@@ -84,6 +85,7 @@ class Articulation:
                 sim.qvel[:, v + 3 : v + 6],
             )
         self._effort = sim.qfrc_applied[:, self._dof_view] if self._side_by_side else None
+        self._link_model: LinkModel | None = None
         self._build_actuators()
         self.reset()
 
@@ -223,6 +225,8 @@ class Articulation:
         data = self.data
         for actuator in self.actuators.values():
             ids = actuator.joint_indices
+            if actuator.needs_load:
+                actuator.set_load_effort(self.load_effort[:, ids])
             action = ActuatorActions(
                 data.joint_pos_target[:, ids],
                 None if data.joint_vel_target is None else data.joint_vel_target[:, ids],
@@ -238,10 +242,97 @@ class Articulation:
             self._effort.copy_(data.applied_torque)
         else:
             self._sim.qfrc_applied[:, self._dof_columns] = data.applied_torque
+        for actuator in self.actuators.values():
+            if actuator.changes_passive:
+                columns = self._columns_of(actuator)
+                self._sim.qfrc_applied[:, columns] = actuator.held_effort
+                self._sim.expand("dof_frictionloss")[:, columns] = actuator.joint_friction
+                self._sim.expand("dof_damping")[:, columns] = actuator.joint_viscous_friction
 
     def update(self) -> None:
         """Read the state after a physics step."""
         self._refresh()
+
+    @property
+    def load_effort(self) -> torch.Tensor:
+        """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
+        return -self._sim.bind("qfrc_bias")[:, self._dof_columns]
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the effects of all drives."""
+        stacks = [actuator.effects for actuator in self.actuators.values() if actuator.effects is not None]
+        return list(dict.fromkeys(effect.name for stack in stacks for effect in stack.effects))
+
+    def sensed_joint_pos(self) -> torch.Tensor:
+        """What the encoders show before their bias is subtracted [rad], (num_envs, num_joints)."""
+        if not any(actuator.effects is not None for actuator in self.actuators.values()):
+            return self.data.joint_pos
+        result = self.data.joint_pos.clone()
+        for actuator in self.actuators.values():
+            ids = actuator.joint_indices
+            if actuator.effects is not None:
+                if actuator.needs_load:
+                    actuator.set_load_effort(self.load_effort[:, ids])
+                result[:, ids] = actuator.observe(self.data.joint_pos[:, ids], self.data.joint_vel[:, ids])
+        return result
+
+    def write_effect_parameter_to_sim(
+        self,
+        effect: str,
+        parameter: str,
+        values: torch.Tensor,
+        joint_ids: Sequence[int] | None = None,
+    ) -> None:
+        """Write a parameter of an effect to the drives that have it.
+
+        Args:
+            effect: Its name.
+            parameter: The parameter's name.
+            values: (num_envs, len(joint_ids)), or (num_envs, 1) for one value of all those joints.
+            joint_ids: The joints; ``None`` for all.
+
+        Raises:
+            ValueError: If no drive has the effect, or it has no such parameter.
+        """
+        wanted = list(range(self.num_joints)) if joint_ids is None else list(joint_ids)
+        values = values.expand(-1, len(wanted))
+        found = False
+        for actuator in self.actuators.values():
+            if actuator.effects is None or effect not in [e.name for e in actuator.effects.effects]:
+                continue
+            found = True
+            own = self._joint_list(actuator)
+            pairs = [(own.index(j), k) for k, j in enumerate(wanted) if j in own]
+            if pairs:
+                local, chosen = zip(*pairs, strict=True)
+                here = actuator.effects.find(effect)
+                here.set_parameter(parameter, values[here.rows][:, list(chosen)], joints=torch.tensor(local))
+            self._write_passive(actuator)
+        if not found:
+            raise ValueError(f"No drive has the effect {effect!r}. Present: {', '.join(self.effects) or 'none'}.")
+
+    def _joint_list(self, actuator: PaceDCMotor) -> list[int]:
+        ids = actuator.joint_indices
+        return list(range(self.num_joints)) if isinstance(ids, slice) else torch.as_tensor(ids).tolist()
+
+    def _columns_of(self, actuator: PaceDCMotor) -> torch.Tensor:
+        return self._dof_columns[actuator.joint_indices]
+
+    def _write_passive(self, actuator: PaceDCMotor) -> None:
+        """Write what the simulator carries of a drive: rotor inertia, friction, the link's rigid body."""
+        actuator.update_effects()
+        columns = self._columns_of(actuator)
+        self._sim.expand("dof_armature")[:, columns] = actuator.joint_armature
+        self._sim.expand("dof_damping")[:, columns] = actuator.joint_viscous_friction
+        self._sim.expand("dof_frictionloss")[:, columns] = actuator.joint_friction
+        stack = actuator.effects
+        for effect in stack.effects if stack is not None else ():
+            if effect.overrides("write_model"):
+                self._link_model = self._link_model or LinkModel(self._sim, self.joint_names)
+                for local, joint in enumerate(self._joint_list(actuator)):
+                    effect.write_model(self._link_model.of(effect.rows, joint), local)
+        self._sim.constants_changed()
 
     def _find_joints_in_model(self, model: mujoco.MjModel) -> None:
         self._root = None
@@ -306,10 +397,13 @@ class Articulation:
                 joint_ids,
                 self.num_envs,
                 self._sim.device,
+                physics_dt=self._sim.cfg.dt,
                 dtype=torch.float64,
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
+            actuator.holds_line = self._sim.cfg.substeps > 1
+            actuator.centred = actuator.cfg.control_decimation > 1
             driven = actuator.joint_indices
             self.write_joint_armature_to_sim(actuator.armature, driven)
             self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)
@@ -324,6 +418,15 @@ class Articulation:
             raise ValueError(f"{name} is {tensor[bad][0].item():g}, expected a finite number >= 0.")
         self._write(self._sim.expand(field), self._dof_columns, tensor, joint_ids, env_ids)
         self._sim.constants_changed()
+        for actuator in self.actuators.values():  # their torque law may depend on it
+            if actuator.changes_passive or actuator.effects is not None:
+                whole = self._sim.expand(field).clone()
+                own = getattr(actuator, name)
+                columns = self._columns_of(actuator)
+                written = torch.zeros_like(whole, dtype=torch.bool)
+                self._write(written, self._dof_columns, True, joint_ids, env_ids)
+                setattr(actuator, name, torch.where(written[:, columns], whole[:, columns], own))
+                self._write_passive(actuator)
 
     def _write(
         self,

@@ -116,8 +116,8 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
-    The drives are called as before, their torques held over the finer steps, unless they have an effect with fast
-    dynamics of its own: then they are called at every physics step.
+    The drives are called as before, their torques held over the finer steps, which are Runge-Kutta's. With an effect
+    that has fast dynamics of its own, the drives are called at every physics step instead, and it stays implicit.
 
     Raises:
         ValueError: If the present time step is no multiple of the finer one.
@@ -128,13 +128,16 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
             f"physics_dt is {physics_dt:g} s, expected a whole fraction of the time step {cfg.sim.dt:g} s, "
             f"such as {cfg.sim.dt / 5:g}."
         )
-    cfg.sim.substeps = ratio
+    if ratio == 1:
+        return
     drives = cfg.scene.robot.actuators.values()
     if any(effect.effect_class.every_physics_step for drive in drives for effect in effect_cfgs(drive.effects)):
-        cfg.sim.dt, cfg.sim.substeps = cfg.sim.dt / ratio, 1
+        cfg.sim.dt /= ratio
         cfg.decimation *= ratio
         for drive in drives:
             drive.control_decimation *= ratio
+    else:
+        cfg.sim.substeps, cfg.sim.integrator = ratio, "rk4"
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

@@ -34,6 +34,8 @@ class Dataset:
     """Whether the drives give torque, (T, R) bool; ``None`` when always."""
     validation_only: tuple[bool, ...]
     """For each recording, whether none of it is trained on."""
+    session_start: torch.Tensor
+    """When each recording began, as if they had been made one after another in this order, (R,) [s]."""
 
     @property
     def num_recordings(self) -> int:
@@ -57,6 +59,7 @@ class Dataset:
             train=self.train[:, chosen],
             torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
             validation_only=tuple(self.validation_only[r] for r in chosen),
+            session_start=self.session_start[chosen],
         )
 
     def trained(self) -> list[int]:
@@ -130,6 +133,7 @@ def make_dataset(
         train=train,
         torque_enable=None if bool(enable.all()) else enable,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
+        session_start=torch.tensor([0.0, *(r.duration for r in every[:-1])], dtype=torch.float64).cumsum(0),
     )
 
 

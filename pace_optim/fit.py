@@ -88,6 +88,7 @@ def _load(settings: FitSettings) -> Problem:
         validation=settings.validation,
         delay_mode=settings.delay_mode,
         physics_dt=settings.physics_dt,
+        effects=settings.effects,
     )
     cmaes = problem.env_cfg.sim2real.cmaes
     chosen = {
@@ -113,7 +114,7 @@ def _load(settings: FitSettings) -> Problem:
 def _try_out(problem: Problem) -> None:
     """Write one candidate to one simulation of each recording: what cannot be applied fails before anything is kept."""
     rollout = problem.evaluator().rollout(1)
-    rollout.start(problem.space.to_physical(torch.zeros(1, problem.space.size, dtype=torch.float64)))
+    rollout.start(problem.space.to_physical(problem.space.start[None]))
     rollout.env.close()
 
 
@@ -180,7 +181,7 @@ class _Fit:
 
     def _optimize(self) -> Outcome:
         if not self.descents:
-            starts = [torch.zeros(self.problem.space.size, dtype=torch.float64)]
+            starts = [self.problem.space.start]
             if self.optimizer is not None:
                 starts = self._search(self.optimizer) + starts
                 self._search_stop = self.optimizer.stop_reasons
@@ -231,7 +232,14 @@ class _Fit:
         population = max(4, self.settings.num_envs // self.evaluator.dataset.num_recordings)
         if self.settings.optimizer == "hybrid":
             population = min(population, _HYBRID_POPULATION)
-        return CMAESOptimizer(self.problem.space, population, cfg, trees=self.problem.trees, seed=self.settings.seed)
+        return CMAESOptimizer(
+            self.problem.space,
+            population,
+            cfg,
+            trees=self.problem.trees,
+            seed=self.settings.seed,
+            start=self.problem.space.start,
+        )
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history
@@ -279,7 +287,7 @@ class _Fit:
             return min(known, key=lambda d: d.score).x
         if self.optimizer is not None and self.optimizer.generation:
             return self.optimizer.best
-        return torch.zeros(self.problem.space.size, dtype=torch.float64)
+        return self.problem.space.start
 
     def _check_consistency(self, outcome: Outcome, score: float) -> Consistency:
         """Fit each recording alone, where there are several and the optimizer can afford it."""
@@ -307,7 +315,7 @@ class _Fit:
             outcome.x,
             every,
             uncertainty,
-            effects=[],
+            effects=problem.effects,
             optimizer=self.settings.optimizer,
             seed=self.settings.seed,
             generations=self.optimizer.generation if self.optimizer else 0,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters
+from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters, effect_parameters
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -48,8 +48,20 @@ class ParameterSpace:
 
     @classmethod
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
-        """The space of a robot's configuration: the base parameters and the user's own."""
-        return cls((*base_parameters(cfg), *cfg.extra_parameters))
+        """The space of a robot's configuration: the base parameters, the effects', and the user's own."""
+        return cls((*base_parameters(cfg), *effect_parameters(cfg), *cfg.extra_parameters))
+
+    @property
+    def start(self) -> torch.Tensor:
+        """The normalised vector where a search starts, (size,): the middle, or where a parameter says."""
+        x = torch.zeros(self.size, dtype=torch.float64)
+        for parameter in self.parameters:
+            if parameter.start is not None:
+                here = self.slices[parameter.name]
+                physical = self.to_physical(x)
+                physical[here] = parameter.start
+                x[here] = self.to_normalised(physical)[here]
+        return x
 
     @property
     def units(self) -> dict[str, str]:

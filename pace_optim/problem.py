@@ -11,6 +11,7 @@ from typing import cast
 
 import torch
 
+from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.dataset import Dataset, make_dataset
@@ -43,7 +44,12 @@ class Problem:
     @property
     def physics_dt(self) -> float:
         """Physics step [s]."""
-        return self.env_cfg.sim.dt
+        return self.env_cfg.sim.dt / self.env_cfg.sim.substeps
+
+    @property
+    def effects(self) -> list[str]:
+        """The effects whose parameters are identified, as on the command line."""
+        return [cfg.label for cfg in effect_cfgs(self.env_cfg.sim2real.effects)]
 
     def make_env(self, num_envs: int) -> ManagerBasedRLEnv:
         """Build the environment."""
@@ -67,6 +73,7 @@ def load_problem(
     validation: Sequence[str | Path] = (),
     delay_mode: str | None = None,
     physics_dt: float | None = None,
+    effects: Sequence[EffectCfg | str] = (),
 ) -> Problem:
     """Read and check everything that a fit needs.
 
@@ -76,6 +83,8 @@ def load_problem(
         validation: Recordings that are never trained on; none keeps the last 30 % of each recording for that.
         delay_mode: ``"command"`` or ``"effort"``; ``None`` keeps the configuration's.
         physics_dt: A finer physics step under the same control rate [s].
+        effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
+            keeps the configuration's.
 
     Raises:
         ValueError: If anything does not fit.
@@ -86,6 +95,8 @@ def load_problem(
     if delay_mode is not None and delay_mode not in DELAY_MODES:
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
     control_dt = cfg.sim.dt * cfg.decimation
+    if effects:
+        cfg.set_effects(effects)
     if physics_dt is not None:
         set_physics_dt(cfg, physics_dt)
     drives = cfg.scene.robot.actuators.values()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,8 @@ class Rollout:
         for sim_dof_pos, real_dof_pos in rollout:   # each (num_envs, n) [rad]
             …
 
-    ``sim_dof_pos`` is the true joint position: subtract the candidate's encoder bias to compare.
+    ``sim_dof_pos`` is what the encoders would show without bias (the true joint position, unless an effect changes
+    that): subtract the candidate's encoder bias to compare.
     During the iteration, ``weight`` (num_envs, 1) says how much each environment's sample counts in the score (its
     sum over the rollout is 1 per candidate), and ``sim_dof_vel`` and ``real_dof_vel`` are at hand.
     """
@@ -59,6 +61,8 @@ class Rollout:
         self.physical = torch.empty(0)
         for r in range(count):
             self._set_facts(r)
+        begin = dataset.session_start.repeat(self.num_candidates)[:, None]
+        self._session_start = begin.expand(-1, self.robot.num_joints)
 
     @property
     def sim_dof_vel(self) -> torch.Tensor:
@@ -105,16 +109,55 @@ class Rollout:
         data = self.dataset
         weights = self._where.double() / self._where.sum()
         counts = self._where.any(dim=1).tolist()
-        enable = data.torque_enable
-        steps = self.duration_steps
-        for self._step in range(steps):
+        for self._step, sim_dof_pos in self._samples():
             k = self._step
             if counts[k]:
                 self.weight = self._rows(weights[k, :, None])
-                yield self.robot.data.joint_pos, self._rows(data.measured[k])
-            if k + 1 == steps:
+                yield sim_dof_pos, self._rows(data.measured[k])
+
+    def _samples(self) -> Iterator[tuple[int, torch.Tensor]]:
+        """Step and sensed positions at every control step, as late as the effects on the recording have them."""
+        steps = self.duration_steps
+        lag = self._observation_lag(steps)
+        if lag is None:
+            yield from enumerate(self._simulated(steps))
+            return
+        # a sample of step k is taken at k - lag: some steps are simulated ahead, some are remembered
+        ahead = max(0, math.ceil(-float(lag.min()))) + 2
+        behind = max(0, math.ceil(float(lag.max()))) + 2
+        length = ahead + behind + 1
+        seen = torch.zeros(length, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        rate = (lag[-1] - lag[0]) / max(1, steps - 1)  # lags are linear in time
+        for j, position in enumerate(self._simulated(steps + ahead)):
+            seen[j % length] = position
+            if j == 0:
+                seen[:] = position
+            if (k := j - ahead) >= 0:
+                yield k, _interpolated(seen, k - (lag[0] + rate * k))
+
+    def _observation_lag(self, steps: int) -> torch.Tensor | None:
+        """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
+        dt = self.env.step_dt
+        total = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        found = False
+        for actuator in self.robot.actuators.values():
+            if actuator.effects is not None and actuator.effects.lags:
+                found = True
+                for row, at in enumerate((0.0, (steps - 1) * dt)):
+                    time = torch.full((self.env.num_envs, actuator.num_joints), at, dtype=torch.float64)
+                    total[row][:, actuator.joint_indices] = actuator.effects.observation_lag(time) / dt
+        return total if found else None
+
+    def _simulated(self, steps: int) -> Iterator[torch.Tensor]:
+        """Sensed positions at every control step."""
+        data, enable = self.dataset, self.dataset.torque_enable
+        last = len(data.command) - 1
+        for j in range(steps):
+            yield self.robot.sensed_joint_pos()
+            if j + 1 == steps:
                 break
-            if enable is not None and (k == 0 or not torch.equal(enable[k], enable[k - 1])):
+            k = min(j, last)
+            if enable is not None and (j == 0 or not torch.equal(enable[k], enable[k - 1])):
                 for actuator in self.robot.actuators.values():
                     actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
             self.env.simulate(self._rows(data.command[k]))
@@ -130,10 +173,14 @@ class Rollout:
     def _set_initial_state(self, offset: torch.Tensor | float) -> None:
         position = self._rows(self.dataset.measured[0]).clone()
         for actuator in self.robot.actuators.values():
-            position[:, actuator.joint_indices] += actuator.encoder_bias
+            ids = actuator.joint_indices
+            position[:, ids] = actuator.position_that_shows(position[:, ids] + actuator.encoder_bias)
+            actuator.set_session_time(self._session_start[:, ids])
         measured = [recording.dof_vel is not None for recording in self.dataset.recordings]
         speed = self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None]
         self.robot.write_joint_state_to_sim(position + offset, self._rows(speed))
+        if any(actuator.needs_load for actuator in self.robot.actuators.values()):
+            self.env.sim.forward()
 
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]
@@ -155,3 +202,20 @@ class Rollout:
             ids, _ = self.robot.find_bodies(body)
             self.env.sim.expand("body_mass")[rows, ids] += mass
             self.env.sim.constants_changed()
+
+
+def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+    """A ring of samples (length, m, n) at real-valued steps (m, n), by the cubic through four samples (Lagrange)."""
+    whole = at.floor()
+    f = (at - whole)[None]
+    index = whole.long()[None] + torch.arange(-1, 3)[:, None, None]
+    samples = seen.gather(0, index % len(seen))
+    weights = torch.cat(
+        [
+            -f * (f - 1) * (f - 2) / 6,
+            (f + 1) * (f - 1) * (f - 2) / 2,
+            -(f + 1) * f * (f - 2) / 2,
+            (f + 1) * f * (f - 1) / 6,
+        ]
+    )
+    return (weights * samples).sum(dim=0)

@@ -23,6 +23,9 @@ def main() -> None:
         "--data", nargs="+", default=[], metavar="FILE", help="recordings (default: the robot's sample)"
     )
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
+    parser.add_argument(
+        "--effects", nargs="+", default=[], metavar="NAME", help="effects to add: NAME, NAME@JOINTS or NAME@shared"
+    )
     parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
     parser.add_argument("--epsilon", type=float, help="stop at this relative spread of a generation's scores")

@@ -2,7 +2,7 @@
 
 from pace_envs.tasks.pace.pace_cfg import CMAESOptimizerCfg, ExcitationCfg, PaceCfg, make_bounds
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters
+from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters, effect_parameters
 
 __all__ = [
     "GLOBAL",
@@ -13,5 +13,6 @@ __all__ = [
     "PaceSim2realSceneCfg",
     "Parameter",
     "base_parameters",
+    "effect_parameters",
     "make_bounds",
 ]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from pace_actuators.effects import EffectCfg
 
 PARAMETER_GROUPS = ("armature", "viscous_friction", "friction", "encoder_bias")
 """The parameters of each joint, in the order of the parameter vector; the delay follows them."""
@@ -75,6 +77,9 @@ class PaceCfg:
 
     sample_params: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
     """The true parameters of simulated recordings, by name: a number, or a number per joint."""
+
+    effects: Sequence[EffectCfg | str] = ()
+    """Physical effects identified beside the base parameters: ``"name"``, ``"name@joints"`` or ``"name@shared"``."""
 
     extra_parameters: tuple[Any, ...] = ()
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""

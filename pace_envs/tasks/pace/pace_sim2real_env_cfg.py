@@ -1,9 +1,10 @@
 """The identification environment."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import mdp
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
 from pace_envs.managers import ActionTermCfg, ObservationGroupCfg, ObservationTermCfg, TerminationTermCfg
@@ -62,3 +63,21 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         """Use the identification's joint order everywhere."""
         robot = dataclasses.replace(self.scene.robot, joint_order=tuple(self.sim2real.joint_order))
         self.scene = dataclasses.replace(self.scene, robot=robot)
+        if self.sim2real.effects:
+            self.set_effects(self.sim2real.effects)
+
+    def set_effects(self, effects: Sequence[EffectCfg | str]) -> None:
+        """Give the drives effects whose parameters are identified; before a finer physics step is set.
+
+        Args:
+            effects: ``"name"``, ``"name@joints"`` or ``"name@shared"``, or configurations.
+
+        Raises:
+            ValueError: If an effect or a joint is unknown.
+        """
+        cfgs = effect_cfgs(effects)
+        for cfg in cfgs:
+            cfg.joints(self.sim2real.joint_order)  # complains about patterns that match nothing
+        self.sim2real.effects = tuple(cfgs)
+        for drive in self.scene.robot.actuators.values():
+            drive.effects = tuple(cfgs)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 
 if TYPE_CHECKING:
@@ -50,6 +52,9 @@ class Parameter:
 
     scale: Literal["linear", "log"] = "linear"
     """How the optimizer's coordinate runs from the lower to the upper bound."""
+
+    start: float | None = None
+    """Where a search starts; ``None``: in the middle of the bounds, on the parameter's scale."""
 
     per_joint_copies: bool = False
     """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
@@ -109,6 +114,37 @@ def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
         per_joint_copies=True,
     )
     return (*result, delay)
+
+
+def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
+    """The parameters of the effects that are identified beside the base ones, ``<effect>.<parameter>``."""
+    joints = tuple(cfg.joint_order)
+    result = []
+    for effect in effect_cfgs(cfg.effects):
+        own = tuple(effect.joints(joints))
+        ids = [joints.index(joint) for joint in own]
+        kind = effect.effect_class
+        for parameter in kind.parameters:
+            keys = (GLOBAL,) if effect.shared else own
+            result.append(
+                Parameter(
+                    name=f"{kind.name}.{parameter.name}",
+                    unit=parameter.unit,
+                    lower=(parameter.lower,) * len(keys),
+                    upper=(parameter.upper,) * len(keys),
+                    apply=partial(_apply_effect, effect=kind.name, parameter=parameter.name, joint_ids=ids),
+                    keys=keys,
+                    scale=parameter.scale,
+                    start=parameter.start,
+                )
+            )
+    return tuple(result)
+
+
+def _apply_effect(
+    env: ManagerBasedEnv, values: torch.Tensor, *, effect: str, parameter: str, joint_ids: list[int]
+) -> None:
+    env.scene["robot"].write_effect_parameter_to_sim(effect, parameter, values, joint_ids)
 
 
 def _apply_armature(env: ManagerBasedEnv, values: torch.Tensor) -> None:

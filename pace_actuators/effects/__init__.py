@@ -1,0 +1,32 @@
+"""Physical effects of a drive beyond the base model: one small class each, found by name.
+
+:class:`Effect` says how to write one; :func:`available_effects` lists those that come with the package.
+"""
+
+from pace_actuators.effects import command, drive, friction, measurement, model, transmission, two_mass
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter, probe_points
+from pace_actuators.effects.effect_cfg import SHARED, EffectCfg, effect_cfgs
+from pace_actuators.effects.registry import available_effects, get_effect, register_effect
+from pace_actuators.effects.stack import EffectStack
+
+__all__ = [
+    "SHARED",
+    "DriveState",
+    "Effect",
+    "EffectCfg",
+    "EffectParameter",
+    "EffectStack",
+    "available_effects",
+    "command",
+    "drive",
+    "effect_cfgs",
+    "friction",
+    "get_effect",
+    "measurement",
+    "model",
+    "probe_points",
+    "register_effect",
+    "transmission",
+    "two_mass",
+]

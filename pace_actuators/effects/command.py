@@ -1,0 +1,145 @@
+"""Effects between the command and the controller."""
+
+from __future__ import annotations
+
+import torch
+
+from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.effects.registry import register_effect
+
+
+@register_effect
+class CommandRateLimit(Effect):
+    """The drive's firmware lets its target move only so fast.
+
+    x(k) = x(k-1) + clip(q* - x(k-1), ± v_max Δt), Δt the control step.
+    """
+
+    name = "command_rate_limit"
+    stage = "command"
+    parameters = (
+        EffectParameter(
+            name="velocity",
+            unit="rad/s",
+            lower=0.2,
+            upper=50.0,
+            null=float("inf"),
+            start=5.0,
+            scale="log",
+            meaning="fastest motion of the target inside the drive",
+        ),
+    )
+    equation = "|dq*/dt| <= v_max inside the drive"
+    looks = "measured speed never exceeds a plateau"
+    source = "profile velocity of servo firmware, e.g. Dynamixel control tables"
+    probes = ({"velocity": 8.0}, {"velocity": 4.0}, {"velocity": 2.0}, {"velocity": 1.0}, {"velocity": 0.5})
+    two_sided = False
+    separates = "a larger and faster motion"
+    velocity: torch.Tensor
+
+    def prepare(self) -> None:
+        """Largest move per control step."""
+        self._step = self.velocity * self.control_dt
+        if not hasattr(self, "_target"):
+            self._target, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """The next target counts as reached."""
+        self._fresh[rows] = True
+
+    def command(self, s: DriveState) -> None:
+        """Follow the target at the limit."""
+        if bool(self._fresh.any()):
+            self._target = torch.where(self._fresh, s.joint_pos_target, self._target)
+            self._fresh[:] = False
+        error = s.joint_pos_target - self._target
+        limited = self._target + error.clamp(-self._step, self._step)
+        self._target = torch.where(error.abs() <= self._step, s.joint_pos_target, limited)
+        s.joint_pos_target = self._target
+
+
+@register_effect
+class OtherDelay(Effect):
+    """The delay path that the base model does not have.
+
+    Where the base delays commands, the controller's torque is delayed too (feedback included); where the base delays
+    torque, the commands are delayed too.
+    """
+
+    name = "other_delay"
+    stage = "command"
+    parameters = (
+        EffectParameter(
+            name="delay", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002, meaning="delay of the other path"
+        ),
+    )
+    equation = "τ(t - s) where the base delays q*, q*(t - s) where the base delays τ"
+    looks = "phase at the band's upper end, and less damping of the loop"
+    source = "PACE (arXiv 2509.06342), delay modes of its releases"
+    probes = ({"delay": 0.001}, {"delay": 0.003})
+    two_sided = False
+    twins = ("measurement_delay",)
+    separates = "recordings at another proportional gain"
+    delay: torch.Tensor
+
+    def prepare(self) -> None:
+        """Lags in control steps."""
+        if not hasattr(self, "_buffer"):
+            upper = self.parameters[0].upper / self.control_dt
+            self._buffer = DelayBuffer(upper, self.shape[0], self._options["device"])
+        lags = self.delay / self.control_dt
+        self._buffer.set_time_lag(lags.clamp(0.0, self._buffer.max_delay).double())
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """Forget the history."""
+        self._buffer.reset(rows)
+
+    def command(self, s: DriveState) -> None:
+        """Delay the target where the base delays the torque."""
+        if self.delay_mode == "effort":
+            s.joint_pos_target = self._buffer.compute(s.joint_pos_target)
+
+    def effort_command(self, s: DriveState) -> None:
+        """Delay the torque where the base delays the command."""
+        if self.delay_mode == "command":
+            s.effort = self._buffer.compute(s.effort)
+
+
+@register_effect
+class ProportionalGain(Effect):
+    """The controller's proportional gain is not what the recording says: kp (1 + g)."""
+
+    name = "proportional_gain"
+    stage = "controller"
+    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02),)
+    equation = "kp (1 + g)"
+    looks = "static sag and stiffness off; parameters change from gain set to gain set"
+    source = "EFFECTS of PACE on MuJoCo; users of PACE report drives whose gains are not in SI units"
+    probes = ({"gain": 0.02},)
+    separates = "recordings at another gain, and a known added mass"
+    gain: torch.Tensor
+
+    def controller(self, s: DriveState) -> None:
+        """Scale kp."""
+        s.stiffness *= 1 + self.gain
+
+
+@register_effect
+class DerivativeGain(Effect):
+    """The controller's derivative gain is not what the recording says: kd (1 + g)."""
+
+    name = "derivative_gain"
+    stage = "controller"
+    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.05),)
+    equation = "kd (1 + g)"
+    looks = "damping changes from gain set to gain set"
+    source = "as proportional_gain"
+    probes = ({"gain": 0.05},)
+    separates = "recordings at another derivative gain"
+    gain: torch.Tensor
+
+    def controller(self, s: DriveState) -> None:
+        """Scale kd."""
+        s.damping *= 1 + self.gain

@@ -1,0 +1,226 @@
+"""Effects inside the motor and its power stage."""
+
+from __future__ import annotations
+
+import torch
+
+from pace_actuators.dc_motor import clip_effort
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.effects.registry import register_effect
+
+_INFINITE = float("inf")
+_RIPPLE_PERIODS = (
+    5,
+    6,
+    7,
+    8,
+    9,
+    10,
+    12,
+    14,
+    16,
+    18,
+    21,
+    24,
+    28,
+    32,
+    36,
+    42,
+    48,
+    56,
+    64,
+    72,
+    84,
+    96,
+    112,
+    128,
+    144,
+    168,
+    200,
+)
+
+
+@register_effect
+class TorqueGain(Effect):
+    """The drive gives more or less torque than it is asked for: τ -> (1 + g) τ."""
+
+    name = "torque_gain"
+    stage = "drive"
+    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02),)
+    equation = "τ -> (1 + g) τ"
+    looks = "static sag and amplitude off together"
+    source = "a wrong torque constant, gear ratio or efficiency"
+    probes = ({"gain": 0.02},)
+    twins = ("payload",)
+    separates = "a recording with a known added mass"
+    gain: torch.Tensor
+
+    def drive(self, s: DriveState) -> None:
+        """Scale the torque."""
+        s.effort *= 1 + self.gain
+
+
+@register_effect
+class DriveBandwidth(Effect):
+    """The drive's torque follows the command with a first-order lag: T τ̇ + τ = τ_cmd, exact for a held command."""
+
+    name = "drive_bandwidth"
+    stage = "drive"
+    parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
+    equation = "T dτ/dt + τ = τ_cmd"
+    looks = "phase falls beyond what the delay explains"
+    source = "current loop of a motor drive"
+    probes = ({"time_constant": 0.001}, {"time_constant": 0.005}, {"time_constant": 0.015})
+    two_sided = False
+    separates = "a known added mass, and recordings at another gain"
+    time_constant: torch.Tensor
+
+    def prepare(self) -> None:
+        """Weights of the command in the torque at the end of a step and in its mean over the step."""
+        decay = self.dt / self.time_constant
+        self._weight = -torch.expm1(-decay)
+        self._mean_weight = torch.where(decay.isinf(), 1.0, 1 - self._weight / decay)
+        if not hasattr(self, "_torque"):
+            self._torque, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """The next torque counts as settled."""
+        self._fresh[rows] = True
+
+    def drive(self, s: DriveState) -> None:
+        """Give the mean torque over the coming step."""
+        if bool(self._fresh.any()):
+            self._torque = torch.where(self._fresh, s.effort, self._torque)
+            self._fresh[:] = False
+        before, asked = self._torque, s.effort.clone()
+        self._torque = torch.lerp(before, asked, self._weight)
+        s.effort = torch.lerp(before, asked, self._mean_weight)
+
+
+@register_effect
+class TorqueRipple(Effect):
+    """The torque varies with the position: a sin(N q) + b cos(N q)."""
+
+    name = "torque_ripple"
+    stage = "drive"
+    parameters = (
+        EffectParameter(name="sine", unit="N m", lower=-3.0, upper=3.0, null=0.0, start=0.1),
+        EffectParameter(name="cosine", unit="N m", lower=-3.0, upper=3.0, null=0.0, start=0.0),
+        EffectParameter(
+            name="periods", unit="1/rev", lower=3.0, upper=220.0, null=None, start=40.0, scale="log", meaning="N"
+        ),
+    )
+    equation = "τ + a sin(N q) + b cos(N q)"
+    looks = "a comb over position"
+    source = "cogging and commutation of a motor, seen through its gear"
+    probes = tuple(
+        {"sine": a, "cosine": b, "periods": float(n)}
+        for n in (
+            5,
+            6,
+            7,
+            8,
+            9,
+            10,
+            12,
+            14,
+            16,
+            18,
+            21,
+            24,
+            28,
+            32,
+            36,
+            42,
+            48,
+            56,
+            64,
+            72,
+            84,
+            96,
+            112,
+            128,
+            144,
+            168,
+            200,
+        )
+        for a, b in ((0.1, 0.0), (0.0, 0.1))
+    )
+    separates = "a slow motion over a wide range"
+    sine: torch.Tensor
+    cosine: torch.Tensor
+    periods: torch.Tensor
+
+    def drive(self, s: DriveState) -> None:
+        """Add the ripple."""
+        angle = self.periods * s.joint_pos
+        s.effort += self.sine * torch.sin(angle) + self.cosine * torch.cos(angle)
+
+
+@register_effect
+class TorqueLimit(Effect):
+    """The drive limits its torque more than the configuration says: |τ| <= τ_max."""
+
+    name = "torque_limit"
+    stage = "drive"
+    parameters = (
+        EffectParameter(name="effort", unit="N m", lower=0.1, upper=200.0, null=_INFINITE, start=20.0, scale="log"),
+    )
+    equation = "|τ| <= τ_max"
+    looks = "peaks are cut, in the fast parts only"
+    source = "current limit of a drive"
+    probes = tuple({"effort": e} for e in (60.0, 40.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.0, 1.0, 0.5, 0.3))
+    two_sided = False
+    separates = "a larger and faster motion"
+    effort: torch.Tensor
+
+    def drive(self, s: DriveState) -> None:
+        """Clip."""
+        s.speed_slope *= s.effort.abs() <= self.effort
+        s.effort = torch.clamp(s.effort, -self.effort, self.effort)
+
+
+@register_effect
+class TorqueSpeedLimit(Effect):
+    """The torque falls with the speed: τ <= τ_stall (1 - v/v_0) where the motor drives, as Isaac Lab's ``DCMotor``."""
+
+    name = "torque_speed_limit"
+    stage = "drive"
+    parameters = (
+        EffectParameter(
+            name="velocity", unit="rad/s", lower=0.5, upper=60.0, null=_INFINITE, start=8.0, scale="log", meaning="v_0"
+        ),
+        EffectParameter(
+            name="effort",
+            unit="N m",
+            lower=0.1,
+            upper=300.0,
+            null=_INFINITE,
+            start=50.0,
+            scale="log",
+            meaning="τ_stall",
+        ),
+    )
+    equation = "|τ| <= τ_stall (1 - |v|/v_0) where τ v > 0"
+    looks = "speed saturates"
+    source = "DC motor at its supply's voltage"
+    probes = tuple(
+        {"velocity": v, "effort": e} for v in (2.0, 3.5, 6.0, 10.0, 20.0) for e in (5.0, 10.0, 20.0, 40.0, 80.0)
+    )
+    two_sided = False
+    separates = "a larger and faster motion"
+    velocity: torch.Tensor
+    effort: torch.Tensor
+
+    def prepare(self) -> None:
+        """Stall torque, finite so that no speed makes it undefined."""
+        self._stall = self.effort.clamp(max=torch.finfo(self.effort.dtype).max)
+        self._on = ~(self.effort.isinf() | self.velocity.isinf())
+
+    def drive(self, s: DriveState) -> None:
+        """Clip by quadrant."""
+        clipped = clip_effort(s.effort, s.joint_vel, self._stall, self.effort, self.velocity)
+        on_the_line = self._on & (clipped != s.effort) & (clipped.abs() < self.effort)
+        s.speed_slope = torch.where(on_the_line, self._stall / self.velocity, s.speed_slope)
+        s.effort = torch.where(self._on, clipped, s.effort)

@@ -1,0 +1,76 @@
+"""What the effects of a drive see and change."""
+
+from __future__ import annotations
+
+import torch
+
+_WRITABLE = (
+    "joint_pos_target",
+    "encoder_pos",
+    "encoder_vel",
+    "stiffness",
+    "damping",
+    "effort",
+    "speed_slope",
+    "friction",
+    "viscous_friction",
+    "armature",
+    "joint_pos",
+    "joint_vel",
+    "load_effort",
+    "base_friction",
+    "base_viscous_friction",
+    "base_armature",
+    "time",
+)
+
+
+class DriveState:
+    """The quantities of a drive at one instant, each (rows, num_joints); a field is changed in place or assigned.
+
+    What effects change:
+        joint_pos_target: q* [rad].
+        encoder_pos: What the encoder shows before its bias is subtracted [rad].
+        encoder_vel: The speed that the controller sees [rad/s].
+        stiffness: kp [N m/rad].
+        damping: kd [N m s/rad].
+        effort: The torque on its way to the joint [N m].
+        speed_slope: How fast a limit in force lets the torque fall with the speed [N m s/rad], ≥ 0.
+        friction: Level of Coulomb friction that the simulator is to apply [N m]; it holds a joint that sticks.
+        viscous_friction: What the simulator is to apply [N m s/rad]; it is integrated implicitly.
+        armature: Rotor inertia that the simulator carries [kg m²].
+
+    What effects read:
+        joint_pos, joint_vel: True joint position [rad] and speed [rad/s].
+        load_effort: Torque of gravity and load on the joint [N m]; zero where the simulator does not give it.
+        base_friction, base_viscous_friction, base_armature: The identified base parameters.
+        time: Since the session began [s].
+    """
+
+    __slots__ = ("_fields",)
+
+    def __init__(self, fields: dict[str, torch.Tensor]):
+        """Keep the tensors of the fields."""
+        object.__setattr__(self, "_fields", fields)
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_joints: int, device: torch.device, dtype: torch.dtype) -> DriveState:
+        """All fields zero."""
+        return cls({name: torch.zeros(num_envs, num_joints, device=device, dtype=dtype) for name in _WRITABLE})
+
+    def of_rows(self, rows: slice) -> DriveState:
+        """The same fields, seen through some rows."""
+        return DriveState({name: tensor[rows] for name, tensor in self._fields.items()})
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        """A field."""
+        try:
+            return self._fields[name]
+        except KeyError:
+            raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(self._fields)}.") from None
+
+    def __setattr__(self, name: str, value: torch.Tensor) -> None:
+        """Write into a field."""
+        field = getattr(self, name)
+        if field is not value:
+            field.copy_(value)

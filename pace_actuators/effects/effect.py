@@ -1,0 +1,248 @@
+"""What a physical effect is: its parameters, where it acts on the drive's path, and its state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import torch
+
+if TYPE_CHECKING:
+    from pace_actuators.effects.drive_state import DriveState
+
+Stage = Literal["command", "measurement", "controller", "drive", "friction", "transmission", "model", "recording"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectParameter:
+    """One number of an effect, per joint."""
+
+    name: str
+    """Its name; results call it ``<effect>.<name>``."""
+
+    unit: str
+    """Its unit, ``"1"`` if it has none."""
+
+    lower: float
+    """Lower bound of its identification."""
+
+    upper: float
+    """Upper bound of its identification."""
+
+    null: float | None
+    """Where the effect vanishes exactly (``inf`` for one that is off when infinitely stiff or large); ``None``: it
+    shapes the effect and has no such value."""
+
+    start: float
+    """Where a search for it starts."""
+
+    scale: Literal["linear", "log"] = "linear"
+    """How the search's coordinate runs from the lower to the upper bound."""
+
+    meaning: str = ""
+    """What it is, in a few words."""
+
+
+class Effect:
+    """A physical effect on a group of joints, batched over environments.
+
+    A subclass declares its parameters and overrides the methods of the stages where it acts; each changes the
+    :class:`DriveState` in place. ``self.<parameter>`` is a tensor (rows, num_joints), as are the state's fields.
+
+    Example::
+
+        @register_effect
+        class CableDrag(Effect):
+            name = "cable_drag"
+            stage = "transmission"
+            parameters = (EffectParameter(name="effort", unit="N m", lower=-2, upper=2, null=0.0, start=0.1),)
+
+            def transmission(self, s):
+                s.effort -= self.effort * torch.tanh(s.joint_pos)
+
+    Attributes:
+        rows: Which environments it acts on; the others never see it.
+        dt: Time between two calls of the drive (the physics step) [s].
+        control_dt: Time between two control steps [s].
+    """
+
+    name: ClassVar[str]
+    """Its public name."""
+    stage: ClassVar[Stage]
+    """Where on the drive's path it acts."""
+    parameters: ClassVar[tuple[EffectParameter, ...]]
+    """Its numbers."""
+    equation: ClassVar[str] = ""
+    """Its equation, as text."""
+    looks: ClassVar[str] = ""
+    """What a person would see in the data."""
+    source: ClassVar[str] = ""
+    """Where the equation comes from."""
+    probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
+    """Small values at which a screening looks at it; parameters left out are at their start."""
+    two_sided: ClassVar[bool] = True
+    """Whether it can also act with the opposite sign of its probes."""
+    shared: ClassVar[bool] = False
+    """Whether it is one for the whole robot by its nature."""
+    every_physics_step: ClassVar[bool] = False
+    """Whether it has fast dynamics of its own, so that the drive must be called at every physics step."""
+    twins: ClassVar[tuple[str, ...]] = ()
+    """Effects that act alike by construction with one load, one gain and no absolute reference."""
+    separates: ClassVar[str] = ""
+    """Which further recording tells it from its likes."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        num_joints: int,
+        *,
+        dt: float,
+        control_dt: float,
+        delay_mode: str = "command",
+        rows: slice = slice(None),
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ):
+        """Start at the null values.
+
+        Args:
+            num_envs: Number of environments of the drive.
+            num_joints: Number of joints of the drive.
+            dt: Time between two calls [s].
+            control_dt: Time between two control steps [s].
+            delay_mode: What the drive's own delay delays.
+            rows: Which environments it acts on.
+            device: Device of all tensors.
+            dtype: Type of all tensors.
+        """
+        self.rows = rows
+        self.shape = (len(range(*rows.indices(num_envs))), num_joints)
+        self.dt, self.control_dt, self.delay_mode = dt, control_dt, delay_mode
+        self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
+        for parameter in self.parameters:
+            value = parameter.start if parameter.null is None else parameter.null
+            setattr(self, parameter.name, self.full(value))
+        self.prepare()
+
+    # ---- what a subclass overrides -------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Compute what follows from the parameters; called after each change of them."""
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """Forget the history of some of its rows."""
+
+    def advance(self, s: DriveState) -> None:
+        """Once per physics step, before all else: bring the own state to the present joint state."""
+
+    def command(self, s: DriveState) -> None:
+        """Once per control step, after the command's delay: change ``s.joint_pos_target``."""
+
+    def measurement(self, s: DriveState) -> None:
+        """Whenever the encoder is read: change ``s.encoder_pos`` (before the bias)."""
+
+    def sensed_velocity(self, s: DriveState) -> None:
+        """Once per control step: change ``s.encoder_vel``, the speed that the controller sees."""
+
+    def controller(self, s: DriveState) -> None:
+        """Once per control step: change ``s.stiffness`` and ``s.damping``."""
+
+    def effort_command(self, s: DriveState) -> None:
+        """Once per control step, after the controller and its delay: change ``s.effort``."""
+
+    def drive(self, s: DriveState) -> None:
+        """Once per physics step, before the torque-speed limit: change ``s.effort``."""
+
+    def friction(self, s: DriveState) -> None:
+        """Once per physics step: change ``s.friction`` (level of Coulomb friction) and ``s.viscous_friction``."""
+
+    def transmission(self, s: DriveState) -> None:
+        """Once per physics step, last: change ``s.effort``, or what the simulator is to apply itself."""
+
+    def armature(self, s: DriveState) -> None:
+        """After each change of parameters: change ``s.armature``, the rotor inertia that the simulator carries."""
+
+    def write_model(self, model: Any, joint: int) -> None:
+        """After each change of parameters: change the rigid body that a joint moves (see ``LinkModel``)."""
+
+    def observation_lag(self, time: torch.Tensor) -> torch.Tensor | None:
+        """How much later than its time stamp a sample of the recording was taken [s], (rows, num_joints)."""
+        return None
+
+    # ---- what a subclass uses ------------------------------------------------------------------------------------
+
+    def full(self, value: float) -> torch.Tensor:
+        """A tensor of its shape (rows, num_joints)."""
+        return torch.full(self.shape, value, **self._options)
+
+    def zeros(self) -> torch.Tensor:
+        """Zeros of its shape (rows, num_joints)."""
+        return self.full(0.0)
+
+    # ---- what the drive calls ------------------------------------------------------------------------------------
+
+    def set_parameter(
+        self, name: str, values: torch.Tensor | float, rows: Any = slice(None), joints: Any = None
+    ) -> None:
+        """Set a parameter in some of its rows and joints; call :meth:`prepare` after the last one.
+
+        Raises:
+            ValueError: If there is no such parameter.
+        """
+        if name not in {parameter.name for parameter in self.parameters}:
+            known = ", ".join(parameter.name for parameter in self.parameters)
+            raise ValueError(f"The effect {self.name!r} has no parameter {name!r}. Available: {known}.")
+        tensor = getattr(self, name)
+        values = torch.as_tensor(values, **self._options)
+        if joints is None:
+            tensor[rows] = values
+        else:
+            tensor[rows] = tensor[rows].index_copy(1, joints, values.expand(tensor[rows].shape[0], len(joints)))
+
+    @classmethod
+    def overrides(cls, method: str) -> bool:
+        """Whether the class has a method of its own for a stage."""
+        return getattr(cls, method) is not getattr(Effect, method)
+
+    @classmethod
+    def check(cls) -> None:
+        """Check the declaration.
+
+        Raises:
+            ValueError: If something is missing or contradictory.
+        """
+        for attribute in ("name", "stage", "parameters"):
+            if not getattr(cls, attribute, None):
+                raise ValueError(f"The effect {cls.__name__} has no {attribute}. Declare it in the class.")
+        for p in cls.parameters:
+            place = f"The parameter {p.name!r} of the effect {cls.name!r}"
+            if not p.name.isidentifier() or hasattr(Effect, p.name):
+                raise ValueError(f"{place} needs another name: a new Python identifier.")
+            if not (math.isfinite(p.lower) and math.isfinite(p.upper) and p.lower < p.upper):
+                raise ValueError(f"{place} has the bounds ({p.lower}, {p.upper}), expected finite, lower < upper.")
+            if p.scale == "log" and p.lower <= 0:
+                raise ValueError(f"{place} has a logarithmic scale and the lower bound {p.lower}, expected > 0.")
+            if not p.lower <= p.start <= p.upper:
+                raise ValueError(f"{place} starts at {p.start}, expected a value inside ({p.lower}, {p.upper}).")
+        if all(p.null is None for p in cls.parameters):
+            raise ValueError(f"The effect {cls.name!r} has no parameter with a null value: it cannot be switched off.")
+        for probe in cls.probes:
+            unknown = sorted(set(probe) - {p.name for p in cls.parameters})
+            if unknown:
+                raise ValueError(f"A probe of the effect {cls.name!r} names {unknown[0]!r}, which is no parameter.")
+
+
+def probe_points(effect: type[Effect]) -> list[dict[str, float]]:
+    """The complete parameter values at which a screening looks at an effect."""
+    start = {parameter.name: parameter.start for parameter in effect.parameters}
+    return [{**start, **probe} for probe in effect.probes or ({},)]
+
+
+def off(value: torch.Tensor) -> torch.Tensor:
+    """Where a parameter whose null is infinite is at it."""
+    return torch.isinf(value)
+
+
+Effects = Sequence[Effect]

@@ -1,0 +1,202 @@
+"""Friction laws beyond Coulomb and viscous friction.
+
+The simulator applies Coulomb friction itself, so that a stuck joint sticks; an effect changes its level.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter, off
+from pace_actuators.effects.registry import register_effect
+
+_SLIDING_SPEED = 5e-3
+"""Above this speed a joint counts as sliding [rad/s]."""
+
+
+@register_effect
+class StribeckFriction(Effect):
+    """Friction is larger near standstill: F(v) = F_c + F_s exp(-(v/v_s)²)."""
+
+    name = "stribeck_friction"
+    stage = "friction"
+    parameters = (
+        EffectParameter(name="effort", unit="N m", lower=0.0, upper=4.0, null=0.0, start=0.1, meaning="F_s"),
+        EffectParameter(
+            name="velocity", unit="rad/s", lower=0.01, upper=1.0, null=None, start=0.1, scale="log", meaning="v_s"
+        ),
+    )
+    equation = "F(v) = F_c + F_s exp(-(v/v_s)^2)"
+    looks = "error right after reversals and at creep; torque against speed dips, then rises"
+    source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994"
+    probes = ({"velocity": 0.03}, {"velocity": 0.1}, {"velocity": 0.3}, {"velocity": 0.8})
+    two_sided = False
+    separates = "a slow triangle"
+    effort: torch.Tensor
+    velocity: torch.Tensor
+
+    def friction(self, s: DriveState) -> None:
+        """Raise the level near standstill."""
+        s.friction += self.effort * torch.exp(-((s.joint_vel / self.velocity) ** 2))
+
+
+@register_effect
+class LoadDependentFriction(Effect):
+    """Friction grows with the load on the gear: F = F_c + k_l |τ - τ_g|."""
+
+    name = "load_dependent_friction"
+    stage = "friction"
+    parameters = (
+        EffectParameter(name="coefficient", unit="1", lower=0.0, upper=0.5, null=0.0, start=0.01, meaning="k_l"),
+    )
+    equation = "F = F_c + k_l |τ - τ_g|, τ_g the torque of gravity and load on the joint"
+    looks = "the hysteresis loop widens with the load"
+    source = "Duclusaud et al., BAM (Rhoban), model M3"
+    probes = ({"coefficient": 0.01},)
+    two_sided = False
+    separates = "recordings at two loads"
+    coefficient: torch.Tensor
+
+    def friction(self, s: DriveState) -> None:
+        """Raise the level with the load."""
+        s.friction += self.coefficient * (s.effort - s.load_effort).abs()
+
+
+@register_effect
+class FrictionAsymmetry(Effect):
+    """Sliding friction differs between the directions: F_c + a one way, F_c - a the other."""
+
+    name = "friction_asymmetry"
+    stage = "friction"
+    parameters = (EffectParameter(name="effort", unit="N m", lower=-1.5, upper=1.5, null=0.0, start=0.05),)
+    equation = "F = F_c + a sgn(v)"
+    looks = "up and down strokes differ"
+    source = "BAM (Rhoban), directional friction"
+    probes = ({"effort": 0.05},)
+    twins = ("torque_offset",)
+    separates = "breaking away from rest in both directions, in another pose"
+    effort: torch.Tensor
+
+    def transmission(self, s: DriveState) -> None:
+        """Brake one way, help the other, while sliding: -(F_c + a sgn v) sgn v = -F_c sgn v - a."""
+        square = s.joint_vel**2
+        s.effort -= self.effort * (square / (square + _SLIDING_SPEED**2))
+
+
+@register_effect
+class QuadraticFriction(Effect):
+    """Friction that grows with the square of the speed: b₂ v |v|.
+
+    Where b₂ is negative it takes from the viscous friction, never more than there is: it does not drive the joint.
+    """
+
+    name = "quadratic_friction"
+    stage = "friction"
+    parameters = (
+        EffectParameter(name="coefficient", unit="N m s^2/rad^2", lower=-1.0, upper=3.0, null=0.0, start=0.02),
+    )
+    equation = "τ - b2 v |v|"
+    looks = "the error grows with speed, in both directions"
+    source = "churning of a gear's oil; BAM (Rhoban)"
+    probes = ({"coefficient": 0.02},)
+    separates = "a faster motion"
+    coefficient: torch.Tensor
+
+    def friction(self, s: DriveState) -> None:
+        """Change the viscous friction, which the simulator integrates implicitly."""
+        s.viscous_friction += self.coefficient * s.joint_vel.abs()
+
+
+@register_effect
+class FrictionDrift(Effect):
+    """Friction changes as the drive warms up: d and F_c times 1 + δ (1 - exp(-t/T)), t since the session began."""
+
+    name = "friction_drift"
+    stage = "friction"
+    parameters = (
+        EffectParameter(name="ratio", unit="1", lower=-0.8, upper=0.8, null=0.0, start=0.05, meaning="δ"),
+        EffectParameter(name="time_constant", unit="s", lower=1.0, upper=600.0, null=None, start=30.0, scale="log"),
+    )
+    equation = "d and F_c times (1 + δ (1 - exp(-t/T)))"
+    looks = "the error grows or shrinks from recording to recording"
+    source = "grease that warms up"
+    probes = ({"time_constant": 5.0}, {"time_constant": 20.0}, {"time_constant": 80.0})
+    separates = "the first recording once more at the end of the session"
+    ratio: torch.Tensor
+    time_constant: torch.Tensor
+
+    def friction(self, s: DriveState) -> None:
+        """Scale the base friction."""
+        change = -self.ratio * torch.expm1(-s.time / self.time_constant)
+        s.friction += change * s.base_friction
+        s.viscous_friction += change * s.base_viscous_friction
+
+
+@register_effect
+class PreslidingFriction(Effect):
+    """Coulomb friction behind a bristle: the joint gives way elastically before it slides (Dahl, LuGre).
+
+    ż = v - σ₀ |v| z / F, friction σ₀ z. It depends on the path only, so that each step is integrated exactly:
+    z₊ = ± F/σ₀ + (z ∓ F/σ₀) exp(-σ₀ |Δq| / F).
+    """
+
+    name = "presliding_friction"
+    stage = "friction"
+    parameters = (
+        EffectParameter(
+            name="stiffness",
+            unit="N m/rad",
+            lower=10.0,
+            upper=3000.0,
+            null=float("inf"),
+            start=300.0,
+            scale="log",
+            meaning="σ_0",
+        ),
+    )
+    equation = "dz/dt = v - σ0 |v| z / F, friction σ0 z"
+    looks = "soft loops at tiny amplitudes, no sharp stick"
+    source = "Dahl 1968; Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
+    probes = ({"stiffness": 1000.0}, {"stiffness": 300.0}, {"stiffness": 100.0}, {"stiffness": 30.0})
+    two_sided = False
+    every_physics_step = True
+    separates = "a slow triangle of small amplitude"
+    stiffness: torch.Tensor
+
+    def prepare(self) -> None:
+        """Where it acts."""
+        self._on = ~off(self.stiffness)
+        self._sigma = torch.where(self._on, self.stiffness, 0.0)
+        if not hasattr(self, "_bristle"):
+            self._bristle, self._position = self.zeros(), self.zeros()
+            self._fresh = torch.ones_like(self.zeros(), dtype=torch.bool)
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """No bristle is bent."""
+        self._fresh[rows] = True
+
+    def transmission(self, s: DriveState) -> None:
+        """Take the Coulomb level over from the simulator.
+
+        The bristle's force is taken at the present position, its slope towards the next one implicitly (a quarter
+        of a step, as Newmark's average acceleration does), so that no stiffness is too large for the step.
+        """
+        if bool(self._fresh.any()):
+            self._bristle = torch.where(self._fresh, 0.0, self._bristle)
+            self._position = torch.where(self._fresh, s.joint_pos, self._position)
+            self._fresh[:] = False
+        level = s.friction.clamp(min=1e-9)
+        moved = s.joint_pos - self._position
+        direction = torch.sign(moved)
+        limit = direction * level / self._sigma.clamp(min=1e-9)
+        decay = torch.exp(-self._sigma * moved.abs() / level)
+        bent = torch.where(moved == 0, self._bristle, limit + (self._bristle - limit) * decay)
+        furthest = level / self._sigma.clamp(min=1e-9)
+        self._bristle = torch.clamp(bent, -furthest, furthest)
+        self._position = s.joint_pos.clone()
+        slope = self._sigma * (1 - self._sigma * self._bristle * torch.sign(s.joint_vel) / level).clamp(0.0, 1.0)
+        implicit = slope * (0.3 * self.dt)
+        s.effort += torch.where(self._on, implicit * s.joint_vel - self._sigma * self._bristle, 0.0)
+        s.viscous_friction += implicit
+        s.friction = torch.where(self._on, 0.0, s.friction)

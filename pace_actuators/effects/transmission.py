@@ -1,0 +1,52 @@
+"""Torques between the motor and the link."""
+
+from __future__ import annotations
+
+import torch
+
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.effects.registry import register_effect
+
+
+@register_effect
+class TorqueOffset(Effect):
+    """A constant torque on the joint: + τ₀."""
+
+    name = "torque_offset"
+    stage = "transmission"
+    parameters = (EffectParameter(name="effort", unit="N m", lower=-4.0, upper=4.0, null=0.0, start=0.1),)
+    equation = "τ + τ_0"
+    looks = "a constant lean"
+    source = "offset of a current sensor, a pulling cable"
+    probes = ({"effort": 0.1},)
+    twins = ("friction_asymmetry",)
+    separates = "another pose of the robot, and an absolute reference of the position"
+    effort: torch.Tensor
+
+    def transmission(self, s: DriveState) -> None:
+        """Add it."""
+        s.effort += self.effort
+
+
+@register_effect
+class ParallelSpring(Effect):
+    """A spring beside the drive, such as a cable or a hose: - k (q - q₀)."""
+
+    name = "parallel_spring"
+    stage = "transmission"
+    parameters = (
+        EffectParameter(name="stiffness", unit="N m/rad", lower=-2.0, upper=20.0, null=0.0, start=0.2),
+        EffectParameter(name="rest", unit="rad", lower=-1.5, upper=1.5, null=None, start=0.0, meaning="q_0"),
+    )
+    equation = "τ - k (q - q_0)"
+    looks = "a lean proportional to the angle"
+    source = "cables and hoses along a joint; balancing springs"
+    probes = ({"rest": 0.0}, {"rest": 1.0}, {"rest": -1.0})
+    separates = "a wide range of motion, and a known added mass"
+    stiffness: torch.Tensor
+    rest: torch.Tensor
+
+    def transmission(self, s: DriveState) -> None:
+        """Pull towards its rest position."""
+        s.effort -= self.stiffness * (s.joint_pos - self.rest)

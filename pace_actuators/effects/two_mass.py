@@ -1,0 +1,220 @@
+"""Motor and link as two inertias: joint elasticity and backlash.
+
+The simulator keeps the link; the effect keeps the motor (angle θ, armature J, viscous friction b, Coulomb friction F):
+
+    J θ̈ = τ - f - b θ̇ - F sgn θ̇        f = k δ + c δ̇,  δ = θ - q        link: + f
+
+Both are integrated together with Newmark's average acceleration: with v the link's speed and ₊ the next step,
+
+    f = f_e + K (θ̇₊ - v₊)    f_e = k δ + (c/2 - k h/4)(θ̇ - v)    K = k h/4 + c/2
+
+The motor's equation gives θ̇₊ as a function of v₊, so that f = f₀ - D v₊: the link gets the torque f₀, and D as
+viscous friction, which the simulator integrates implicitly. No stiffness is too large for the step, whatever the
+link's inertia; for k -> ∞, D -> J/h, which is the rigid drive's armature.
+
+Source: Newmark 1959; Spong 1987 for the flexible joint.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.effects.effect import Effect, EffectParameter, off
+from pace_actuators.effects.registry import register_effect
+
+_NUMERICAL_DAMPING = 0.05
+"""Part of k h that is added to c: what is too fast for the step dies out, a resonance inside the band does not."""
+
+_SMALLEST_ARMATURE = 1e-6
+"""A motor without inertia would have no state [kg m²]."""
+
+_SIDE = EffectParameter(
+    name="encoder_side",
+    unit="1",
+    lower=0.0,
+    upper=1.0,
+    null=None,
+    start=0.0,
+    meaning="where the encoder sits: 0 on the link, 1 on the motor",
+)
+
+
+class _TwoMass(Effect):
+    """What elasticity and backlash share."""
+
+    stage = "transmission"
+    every_physics_step = True
+    two_sided = False
+    encoder_side: torch.Tensor
+
+    def switched_on(self) -> torch.Tensor:
+        """Where motor and link are two, (rows, num_joints) bool."""
+        raise NotImplementedError
+
+    def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Torque k δ and stiffness k at a deflection."""
+        raise NotImplementedError
+
+    def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
+        """Damping c of the transmission."""
+        raise NotImplementedError
+
+    def prepare(self) -> None:
+        """Where it acts."""
+        self._on = self.switched_on()
+        self._any = bool(self._on.any())
+        if not hasattr(self, "_angle"):
+            zeros = self.zeros
+            self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
+            self._drive, self._coupling, self._inertia, self._direction = zeros(), zeros(), zeros() + 1, zeros()
+            self._fresh = torch.ones_like(zeros(), dtype=torch.bool)
+            self._started = False
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """Motor and link stand at rest against each other, the spring holding the load."""
+        self._fresh[rows] = True
+
+    def rest_deflection(self, s: DriveState) -> torch.Tensor:
+        """Deflection that holds the load."""
+        raise NotImplementedError
+
+    def armature(self, s: DriveState) -> None:
+        """The motor's inertia is not the link's."""
+        s.armature = torch.where(self._on, 0.0, s.armature)
+
+    def advance(self, s: DriveState) -> None:
+        """The motor's step, now that the link's speed after it is known."""
+        if not self._any:
+            return
+        total = self._inertia + self._coupling
+        speed = (self._drive + self._coupling * s.joint_vel) / total
+        # friction brakes, it does not push; 0 in direction: the motor stuck
+        speed = torch.where(speed * self._direction > 0, speed, 0.0)
+        self._speed = speed
+        self._angle = self._angle + self.dt * speed
+        if bool(self._fresh.any()):
+            self._angle = torch.where(self._fresh, s.joint_pos + self.rest_deflection(s), self._angle)
+            self._speed = torch.where(self._fresh, s.joint_vel, self._speed)
+            self._fresh[:] = False
+
+    def measurement(self, s: DriveState) -> None:
+        """An encoder on the motor sees the motor."""
+        if self._any:
+            s.encoder_pos += torch.where(self._on, self.encoder_side * (self._angle - s.joint_pos), 0.0)
+
+    def sensed_velocity(self, s: DriveState) -> None:
+        """And its speed."""
+        if self._any:
+            s.encoder_vel += torch.where(self._on, self.encoder_side * (self._speed - s.joint_vel), 0.0)
+
+    def transmission(self, s: DriveState) -> None:
+        """Turn the motor's torque into that of the spring."""
+        if not self._any:
+            return
+        h, relative = self.dt, self._speed - s.joint_vel
+        torque, k = self.spring(self._angle - s.joint_pos + 0.5 * h * relative)
+        torque = torque - k * (0.5 * h * relative)  # looked ahead for contact only
+        c = self.damping_of(k, s) + (_NUMERICAL_DAMPING * h) * k
+        coupling = 0.25 * h * k + 0.5 * c
+        explicit = torque + (0.5 * c - 0.25 * h * k) * relative
+        momentum = s.base_armature.clamp(min=_SMALLEST_ARMATURE) / h
+        inertia = momentum + s.viscous_friction
+        push = momentum * self._speed + s.effort - explicit
+        free = push + coupling * s.joint_vel
+        stuck = free.abs() <= s.friction
+        direction = torch.where(stuck, 0.0, torch.sign(free))
+        push = push - s.friction * direction
+        total = inertia + coupling
+        share = torch.where(stuck, 0.0, coupling / total)
+        on = self._on
+        self._drive, self._coupling, self._inertia, self._direction = push, coupling, inertia, direction
+        s.effort = torch.where(on, explicit + share * push, s.effort)
+        s.viscous_friction = torch.where(on, coupling * (1 - share), s.viscous_friction)
+        s.friction = torch.where(on, 0.0, s.friction)
+
+
+@register_effect
+class JointElasticity(_TwoMass):
+    """Motor and link are joined by a spring and a damper, k and c."""
+
+    name = "joint_elasticity"
+    parameters = (
+        EffectParameter(
+            name="stiffness",
+            unit="N m/rad",
+            lower=80.0,
+            upper=2e4,
+            null=float("inf"),
+            start=1000.0,
+            scale="log",
+            meaning="k",
+        ),
+        EffectParameter(name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=0.5, meaning="c"),
+        _SIDE,
+    )
+    equation = "J d²θ/dt² = τ - f - friction, link: + f, f = k (θ - q) + c (dθ/dt - dq/dt)"
+    looks = "resonance and anti-resonance; the base fit is overdamped with parameters at their bounds"
+    source = "Spong 1987, flexible joint"
+    probes = tuple({"stiffness": k, "encoder_side": e} for k in (5000.0, 1500.0, 500.0, 200.0) for e in (0.0, 1.0))
+    separates = "higher frequencies, and a known added mass"
+    stiffness: torch.Tensor
+    damping: torch.Tensor
+
+    def switched_on(self) -> torch.Tensor:
+        """Where the stiffness is finite."""
+        return ~off(self.stiffness)
+
+    def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Linear."""
+        k = torch.where(self._on, self.stiffness, 0.0)
+        return k * deflection, k
+
+    def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
+        """A parameter."""
+        return self.damping
+
+    def rest_deflection(self, s: DriveState) -> torch.Tensor:
+        """-τ_g / k."""
+        return -s.load_effort / self.stiffness
+
+
+@register_effect
+class Backlash(_TwoMass):
+    """Motor and link touch each other only beyond a gap; the contact is stiff."""
+
+    name = "backlash"
+    parameters = (
+        EffectParameter(name="gap", unit="rad", lower=0.0, upper=0.05, null=0.0, start=0.004),
+        EffectParameter(
+            name="stiffness", unit="N m/rad", lower=300.0, upper=2e4, null=None, start=5000.0, scale="log", meaning="k"
+        ),
+        _SIDE,
+    )
+    equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"
+    looks = "loose around zero load, a step at reversals"
+    source = "Nordin, Gutman 2002, dead-zone model"
+    probes = tuple({"gap": g, "encoder_side": e} for g in (0.002, 0.008, 0.025) for e in (0.0, 1.0))
+    separates = "several amplitudes, and a 1.5 times larger proportional gain"
+    gap: torch.Tensor
+    stiffness: torch.Tensor
+    _DAMPING_RATIO = 0.3
+
+    def switched_on(self) -> torch.Tensor:
+        """Where there is a gap."""
+        return self.gap > 0
+
+    def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Nothing inside the gap."""
+        beyond = (deflection.abs() - 0.5 * self.gap).clamp(min=0.0)
+        k = torch.where(beyond > 0, self.stiffness, 0.0)
+        return k * torch.sign(deflection) * beyond, k
+
+    def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
+        """Of a contact that bounces little, c = 2 ζ √(k J)."""
+        return 2 * self._DAMPING_RATIO * torch.sqrt(stiffness * s.base_armature)
+
+    def rest_deflection(self, s: DriveState) -> torch.Tensor:
+        """-τ_g / k beyond the gap, on the side that the load presses on."""
+        side = -torch.sign(s.load_effort)
+        return side * 0.5 * self.gap - s.load_effort / self.stiffness
