@@ -118,8 +118,8 @@ JAW_COUNTS = 1523.2
 JAW_CLOSED = -0.174533
 """What jaw 0 is taken for [rad]: the model's lower limit. Gravity on the jaw is 3 mN m, so little depends on it."""
 
-SO101_STIFFNESS = 12.2
-"""[N m/rad]. From the recordings: static lean under the model's gravity (``sag`` of real_recordings.py)."""
+SO101_STIFFNESS = 11.6
+"""[N m/rad]. From the recordings: mean of what ``real_recordings.py sag`` prints for the model's signs."""
 
 
 def _so101(recording: Recording) -> Recording:
@@ -132,8 +132,10 @@ def _so101(recording: Recording) -> Recording:
     position, target = recording.dof_pos.copy(), recording.des_dof_pos.copy()
     for series in (position, target):
         series[:, 5] = JAW_CLOSED + series[:, 5] * JAW_COUNTS / COUNTS_PER_RAD
-    stall = SO101_STIFFNESS / (0.164 * 16)  # torque and speed follow the supply alike, so the back-EMF stays
+    stall = SO101_STIFFNESS / (0.164 * 16)  # a supply below 12 V; torque and speed follow it alike
     drive = servo_drive(0.164 * 16, stall, stall / (5.51 / 4.71), joints=6)
+    # the firmware's D works against the back-EMF, in a unit that is not published: viscous friction stands for both
+    drive = replace(drive, damping=np.zeros(6))
     return replace(recording, joint_names=SO101_JOINTS, dof_pos=position, des_dof_pos=target, dof_vel=None, drive=drive)
 
 
@@ -172,11 +174,11 @@ ROBOTS = {
             train=("chirp_sweep", "friction_gravity", "single_joint_elbow", "step_response"),
             validation=("multisine", "velocity_ramp"),
             windows={
-                "chirp_sweep": (72.0, 102.0),
-                "friction_gravity": (0.0, 30.0),
-                "single_joint_elbow": (20.0, 50.0),
-                "step_response": (0.0, 30.0),
-                "multisine": (0.0, 30.0),
+                "chirp_sweep": (80.0, 100.0),  # 1 to 2 Hz
+                "friction_gravity": (0.0, 25.0),
+                "single_joint_elbow": (45.2, 50.0),  # before, the hand pushes against the table
+                "step_response": (10.0, 26.0),
+                "multisine": (0.0, 20.0),
                 "velocity_ramp": (0.0, 30.0),
             },
         ),
