@@ -11,6 +11,8 @@ from .motion import Motion
 
 _REVERSAL_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 _POSITION_BINS = 8
+_NEXT_SPEED = 1.3
+"""An edge of speed is at least this many times the one below."""
 _TIME_BINS = 10
 _LEAST_PER_BIN = 0.005
 """A bin with less of the time than this says nothing."""
@@ -100,11 +102,16 @@ def _index(values: np.ndarray, edges: Sequence[float]) -> np.ndarray:
 
 
 def _size_edges(size: np.ndarray, still: float) -> tuple[float, ...]:
-    """Standing, then the moving samples in quarters and the fastest tenth."""
+    """Standing, then the moving samples in thirds, the fastest tenth apart."""
     moving = size[size > still]
     if not len(moving):
         return (0.0, np.inf)
-    return _distinct([0.0, still, *(_round(float(np.quantile(moving, q))) for q in (0.2, 0.4, 0.6, 0.8, 0.95)), np.inf])
+    inner = [still]
+    for q in (0.3, 0.6, 0.9):
+        edge = _round(float(np.quantile(moving, q)))
+        if edge > _NEXT_SPEED * inner[-1]:
+            inner.append(edge)
+    return (0.0, *inner, np.inf)
 
 
 def _mirrored(edges: Sequence[float]) -> tuple[float, ...]:

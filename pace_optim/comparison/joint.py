@@ -16,7 +16,7 @@ from .hysteresis import hysteresis
 from .motion import motion_of
 from .noise import NoiseFloor, noise_floor, with_repetitions
 from .places import Place, joint_sentence, places_of
-from .regions import Region, lay_out
+from .regions import lay_out
 from .tracks import Track
 from .whiteness import whiteness
 from .words import band_text
@@ -197,10 +197,9 @@ def _band_content(edges: np.ndarray, power: dict[str, np.ndarray], octaves: np.n
     count = float(power["samples"].sum())
     share = _shares(power["above"])
     held = narrowest_band(share)
-    region = None if held is None else Region(first=held[0], last=held[1], share=share.sum(), base=0.0)
     return {
-        "most": None if region is None else band_text(edges, region),
-        "most_share": None if region is None else float(share[region.first : region.last + 1].sum()),
+        "most": None if held is None else band_text(edges[held[0]], edges[held[1] + 1], edges[-1]),
+        "most_share": None if held is None else float(share[held[0] : held[1] + 1].sum()),
         "title": "frequency",
         "unit": "Hz",
         "edges": edges,

@@ -59,13 +59,13 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
     floors = {joint: _floor(j, tracks) for j, joint in enumerate(joints)}
     floors["all"] = float(np.sqrt(np.mean(np.square(list(floors.values())))))
     steps: list[dict[str, Any]] = []
-    for run in runs:
+    for run, name in zip(runs, _names(runs), strict=True):
         rmse = {part: _rmse_by_joint(run, part) for part in _PARTS}
         before = steps[-1]["rmse"] if steps else {part: {} for part in _PARTS}
         steps.append(
             {
                 "run": str(run.folder),
-                "name": " + ".join(run.result.effects) or "base model",
+                "name": name,
                 "effects": list(run.result.effects),
                 "physics_dt": run.physics_dt,
                 "rmse": rmse,
@@ -101,6 +101,15 @@ def ladder_table(ladder: dict[str, Any]) -> str:
 def _floor(j: int, tracks: Sequence[Track]) -> float:
     floors = noise_floors(j, tracks)
     return rms(np.concatenate([np.full(len(t.time), f.sigma) for t, f in zip(tracks, floors, strict=True)])) or 0.0
+
+
+def _names(runs: Sequence[RunTracks]) -> list[str]:
+    """Each run's effects, and whatever else it has to itself."""
+    names = [" + ".join(run.result.effects) or "base model" for run in runs]
+    for part in ([f"{run.result.delay_mode} delay" for run in runs], [f"{1e3 * run.physics_dt:g} ms" for run in runs]):
+        if len(set(part)) > 1:
+            names = [f"{name}, {own}" for name, own in zip(names, part, strict=True)]
+    return names
 
 
 def _rmse_by_joint(run: RunTracks, part: str) -> dict[str, float]:

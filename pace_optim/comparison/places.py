@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pace_optim.trajectory_errors import angle_text
+from pace_optim.trajectory_errors import angle_text, angle_unit
 
 from .dimensions import Dimension
 from .regions import Layout, Region, best_region, evidence, inside, refine
@@ -19,7 +19,7 @@ NEGLIGIBLE = 1e-6
 """Below this an error is nobody's concern [rad]."""
 MOST_PLACES = 3
 _OVERLAP = 0.5
-_COARSE = ("recording",)
+_COARSE = ("recording", "time")
 """Say which data, not what is wrong: named after everything else."""
 _PLAINNESS = {
     "recording": 0.1,
@@ -29,7 +29,7 @@ _PLAINNESS = {
     "load": 0.85,
     "load_size": 0.9,
     "position": 0.9,
-    "time": 0.9,
+    "time": 0.6,
 }
 """Of two places that say about as much, the one that is easier to act on comes first; 1 where not listed."""
 
@@ -89,7 +89,11 @@ def places_of(
         if region is None or not region.is_place:
             continue
         mask, by = inside(dimension, region), {dimension.name: place_text(dimension, region, recordings)}
-        others = [other for other in dimensions if not _akin(other, dimension) and other.name not in ("time", *_COARSE)]
+        others = [
+            (_PLAINNESS.get(other.name, 1.0), other)
+            for other in dimensions
+            if not _akin(other, dimension) and other.name not in _COARSE
+        ]
         if dimension.name not in _COARSE and (finer := refine(above, mask, region, others)):
             other, region = finer
             mask = mask & inside(other, region)
@@ -99,10 +103,12 @@ def places_of(
         text = ", ".join(by[name] for name in names)
         candidates.append((value, _place(joint, tuple(names), text, region, total, mask)))
     edges, octaves, share = bands
-    region = best_region(octaves, share)
+    held = np.flatnonzero(octaves)
+    region = best_region(octaves[held], share[held])
     if region is not None and region.is_place:
+        text = band_text(edges[held[region.first]], edges[held[region.last] + 1], edges[-1])
         value = evidence(region.share, region.base)
-        candidates.append((value, _place(joint, ("frequency",), band_text(edges, region), region, total, None)))
+        candidates.append((value, _place(joint, ("frequency",), text, region, total, None)))
     candidates.sort(key=lambda candidate: -candidate[0])
     chosen: list[Place] = []
     for _, place in candidates:
@@ -128,7 +134,10 @@ def joint_sentence(joint: str, rmse: float, floor: float, places: Sequence[Place
     if rmse < NEGLIGIBLE:
         return f"{joint}: the error is {angle_text(rmse)}, below what any encoder shows."
     if rmse <= AT_THE_FLOOR * floor:
-        return f"{joint} is at the noise floor: {angle_text(rmse)} against {angle_text(floor)} of noise."
+        factor, unit = angle_unit([rmse])
+        return (
+            f"{joint} is at the noise floor: {factor * rmse:.3g} {unit} against {factor * floor:.3g} {unit} of noise."
+        )
     if places:
         return places[0].sentence
     return (

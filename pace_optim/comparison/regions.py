@@ -104,7 +104,10 @@ def inside(dimension: Dimension, region: Region) -> np.ndarray:
 
 
 def refine(
-    above: np.ndarray, mask: np.ndarray, region: Region, others: Sequence[Dimension]
+    above: np.ndarray,
+    mask: np.ndarray,
+    region: Region,
+    others: Sequence[tuple[float, Dimension]],
 ) -> tuple[Dimension, Region] | None:
     """A part of a region, by another dimension, that holds most of its error in much less of its time.
 
@@ -112,14 +115,14 @@ def refine(
         above: Squared error less floor at each sample, (K,).
         mask: The region's samples, (K,) bool.
         region: The region.
-        others: Dimensions to narrow it by.
+        others: Dimensions to narrow it by, each with the weight of its evidence.
 
     Returns:
         The dimension and its region; share and base are of the whole error and time. ``None`` if no one does.
     """
     total = max(float(above.sum()), 1e-300)
     best, most = None, evidence(region.share, region.base)
-    for dimension in others:
+    for weight, dimension in others:
         held = np.bincount(dimension.bin[mask], weights=above[mask], minlength=dimension.num_bins)
         part = np.maximum(held, 0.0) / total
         time = np.bincount(dimension.bin[mask], minlength=dimension.num_bins) / len(above)
@@ -127,6 +130,6 @@ def refine(
             for last in range(first, dimension.num_bins if dimension.neighbours else first + 1):
                 share, base = float(part[first : last + 1].sum()), float(time[first : last + 1].sum())
                 narrow = 0.75 * region.share <= share and base <= 0.75 * region.base and base > 0
-                if narrow and (value := evidence(min(share, 1.0), base)) > most:
+                if narrow and (value := weight * evidence(min(share, 1.0), base)) > most:
                     best, most = (dimension, Region(first=first, last=last, share=share, base=base)), value
     return best

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from .dimensions import Dimension
 from .regions import Region
 
@@ -40,11 +38,11 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
     return _OF.get(dimension.name, "") + _between(low, high, dimension.unit)
 
 
-def band_text(edges: np.ndarray, region: Region) -> str:
-    """Where a region of frequency bands is."""
-    low = float(f"{edges[region.first]:.2g}") if region.first > 0 else None
-    high = float(f"{edges[region.last + 1]:.2g}") if region.last + 2 < len(edges) else None
-    return _between(low, high, "Hz")
+def band_text(low: float, high: float, nyquist: float) -> str:
+    """Where frequencies from ``low`` to ``high`` [Hz] are."""
+    return _between(
+        float(f"{low:.2g}") if low > 0 else None, float(f"{high:.2g}") if high < 0.999 * nyquist else None, "Hz"
+    )
 
 
 def percent(share: float) -> str:

@@ -184,7 +184,13 @@ def _response(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
 def _response_traces() -> list[dict[str, Any]]:
     traces = []
     for i, unit in enumerate((" dB", "°", "")):
-        on = {"yaxis": f"y{i + 1 if i else ''}", "showlegend": i == 0, "hovertemplate": f"%{{y:.3g}}{unit}"}
+        on = {
+            "mode": "lines+markers",
+            "marker": {"size": 4},
+            "yaxis": f"y{i + 1 if i else ''}",
+            "showlegend": i == 0,
+            "hovertemplate": f"%{{y:.3g}}{unit}",
+        }
         traces.append(_line("measured", _MEASURED, width=3.2, legendgroup="measured", **on))
         traces.append(_line("model", _MODEL, width=1.6, legendgroup="model", **on))
     return traces
@@ -277,10 +283,14 @@ FIGURES: dict[str, FailureFigure] = {
         title="At which frequencies?",
         height=290,
         traces=[
-            _line("error", _MODEL, mode="lines+markers", hovertemplate="%{y:.3g}"),
-            _line("noise floor", _NOISE, dash="dot", hovertemplate="%{y:.3g}"),
+            _line("error", _MODEL, mode="lines+markers", connectgaps=True, hovertemplate="%{y:.3g}"),
+            _line("noise floor", _NOISE, dash="dot", connectgaps=True, hovertemplate="%{y:.3g}"),
         ],
-        layout={"xaxis": _LOG_HZ, "yaxis": {"type": "log", "exponentformat": "none"}, "hovermode": "x unified"},
+        layout={
+            "xaxis": _LOG_HZ,
+            "yaxis": {"type": "log", "exponentformat": "none", "dtick": 1},
+            "hovermode": "x unified",
+        },
         cell=_spectrum,
     ),
     "response": FailureFigure(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pace_optim.trajectory_errors import angle_text, angle_unit
+from pace_optim.trajectory_errors import angle_unit
 
 from ..markup import Section, esc, figure, table
 from ..run_data import RunData
@@ -33,13 +33,15 @@ def ladder(run: RunData) -> Section | None:
 
 def _sentence(steps: list[dict[str, Any]], part: str, floor: float) -> str:
     first, last = (step["rmse"][part]["all"] for step in (steps[0], steps[-1]))
+    factor, unit = angle_unit([first])
     change = first / last if last > 0 else 1.0
     size = (
         f"{change:.3g} times less" if change >= 1.005 else "no less" if change > 0.995 else f"{1 / change:.3g} × more"
     )
+    fall = f"{factor * first:.3g} to {factor * last:.3g} {unit}"
     return (
-        f"From “{steps[0]['name']}” to “{steps[-1]['name']}” the {_PARTS[part][0]} error goes from {angle_text(first)} "
-        f"to {angle_text(last)}, {size}. The measurement's noise is {angle_text(floor)}: no model can go below."
+        f"From “{steps[0]['name']}” to “{steps[-1]['name']}” the {_PARTS[part][0]} error goes from {fall}, {size}. "
+        f"The measurement's noise is {factor * floor:.3g} {unit}: no model can go below."
     )
 
 
@@ -55,7 +57,8 @@ def _traces(
             "name": joint,
             "x": names,
             "y": [factor * step["rmse"][parts[0]][joint] for step in steps],
-            "line": {"width": 1, "color": "var(--line)"},
+            "line": {"width": 1, "color": "var(--target)"},
+            "opacity": 0.45,
             "showlegend": False,
             "hovertemplate": f"{esc(joint)}: %{{y:.3g}} {unit}<extra></extra>",
         }
@@ -90,7 +93,13 @@ def _traces(
 
 
 def _layout(unit: str) -> dict[str, Any]:
-    axis = {"type": "log", "title": {"text": f"error [{unit}]"}, "nticks": 6, "exponentformat": "none"}
+    axis = {
+        "type": "log",
+        "title": {"text": f"error [{unit}]"},
+        "nticks": 6,
+        "exponentformat": "none",
+        "minexponent": 9,
+    }
     return {"yaxis": axis, "xaxis": {"type": "category", "showgrid": False}, "hovermode": "closest"}
 
 
