@@ -19,9 +19,13 @@ def main() -> None:
         print(design_table(collection.design))
     for warning in collection.warnings:
         print(f"warning: {warning}", file=sys.stderr)
+    for line in collection.hidden:
+        print(f"hidden: {line}")
     for kind in ("recordings", "commands", "plots"):
         for path in getattr(collection, kind):
             print(f"{kind[:-1]}: {path}")
+    if collection.truth is not None:
+        print(f"truth: {collection.truth}")
 
 
 if __name__ == "__main__":

@@ -31,6 +31,10 @@ class CollectionCfg:
     """With ``optimize``: width of the range of targets, as a multiple of what the robot's excitation states."""
     seed: int = 0
     """Seed of the motion and of the noise."""
+    effects: tuple[str, ...] = ()
+    """Physical effects hidden in the recordings, by name; they are then made by the independent plant."""
+    effect_joints: str = ".*"
+    """Which joints have them, a regular expression."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """True parameters in place of ``PaceCfg.sample_params``: by name, or ``name/joint``."""
     noise: float = 0.0
@@ -77,6 +81,10 @@ class CollectionCfg:
                 raise ValueError(f"{name} is {value:g}; expected a finite number of 0 or more.")
         if self.encoder_bits is not None and not 1 <= self.encoder_bits <= 32:
             raise ValueError(f"encoder_bits is {self.encoder_bits}; expected 1 to 32 (12 to 20 are usual).")
+        if self.command_only and self.effects:
+            raise ValueError("Nothing is simulated with --command_only, so --effect has no use. Leave one out.")
+        if self.effect_joints != ".*" and not self.effects:
+            raise ValueError("--effect_joints says where effects are, and there are none. Add --effect NAME.")
         if self.command_only and self.output is not None:
             raise ValueError(
                 "Nothing is recorded with --command_only, so --output has no use. Name the file of the commands with "

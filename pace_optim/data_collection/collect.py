@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -24,12 +24,14 @@ from pace_optim.motion_check import (
     summarise,
 )
 from pace_optim.parameter_space import ParameterSpace
+from pace_optim.plant import write_truth
 from pace_optim.recording import save_recording
 
 from .cfg import CollectionCfg
 from .design import design_motion
 from .encoder import Encoder
-from .files import Files, plan_files
+from .files import Files, plan_files, truth_file
+from .hidden import Hidden, simulate_hidden
 from .plot import plot_motion
 from .simulate import Simulated, simulate
 from .truth import true_parameters
@@ -47,6 +49,10 @@ class Collection:
     """PNG files."""
     warnings: tuple[str, ...]
     """What the check of the motion found, in plain sentences."""
+    hidden: tuple[str, ...] = ()
+    """What is hidden in the recordings, a line per effect."""
+    truth: Path | None = None
+    """JSON file that says so."""
     design: Design | None = None
     """What the chosen motion is expected to tell; None if none was asked for."""
 
@@ -94,7 +100,11 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         for trajectory, found in zip(trajectories, findings, strict=True):
             refuse_errors(found, trajectory.name)
         simulated: list[Simulated] = []
-        if truth is not None:
+        hidden: Hidden | None = None
+        if truth is not None and cfg.effects:
+            hidden = simulate_hidden(cfg, trajectories, space=space, truth=truth, delay_mode=_delay_mode(env))
+            simulated = hidden.simulated
+        elif truth is not None:
             simulated = simulate(
                 env,
                 trajectories,
@@ -104,12 +114,16 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
                 drive=cfg.drive(env.scene["robot"].num_joints),
                 load=cfg.load,
             )
+        if simulated:
             for trajectory, result, found in zip(trajectories, simulated, findings, strict=True):
                 found += check_simulated(trajectory.time, result.position, result.torque, limits)
                 refuse_errors(found, trajectory.name)
     finally:
         env.close()
     written = _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
+    if hidden is not None:
+        path = write_truth(truth_file(cfg, sim2real.robot_name), hidden.truth.to_dict())
+        written = replace(written, hidden=hidden.lines, truth=path)
     return replace(written, design=design)
 
 
@@ -160,6 +174,10 @@ def _sim2real(env_cfg: Any, task: str) -> PaceCfg:
             f"{', '.join(suited)}."
         )
     return sim2real
+
+
+def _delay_mode(env: Any) -> Literal["command", "effort"]:
+    return next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode
 
 
 def _limits_of(env: Any) -> MotionLimits:

@@ -10,6 +10,7 @@ from pathlib import Path
 from pace_optim.cli import Parser, import_task, make_parser
 from pace_optim.excitation import excitations
 from pace_optim.motion_check import MAX_SHARE_AT_LIMIT
+from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
 
 from .cfg import CollectionCfg
@@ -61,6 +62,19 @@ def make_collection_parser() -> Parser:
         metavar="NAME[/JOINT]=VALUE",
         help="true parameter of all joints or one, in place of the robot's sample_params; may be repeated",
     )
+    robot.add_argument(
+        "--effect",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="hide physical effects of a random size (by --seed) in the recordings; they are made by the independent "
+        "plant, and what was hidden goes to <recording>.truth.json. Available: "
+        f"{', '.join(library_effects())}; unknown to the diagnosis: {', '.join(outside_effects())}",
+    )
+    robot.add_argument(
+        "--effect_joints", default=".*", metavar="REGEX", help="joints that have the effects (default: all)"
+    )
     robot.add_argument("--stiffness", type=float, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
     robot.add_argument("--damping", type=float, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
     robot.add_argument("--delay_mode", metavar="MODE", help="command or effort: what the delay delays")
@@ -98,7 +112,8 @@ def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
     )
     parameters = _pairs("--parameter", options.pop("parameter"), "NAME=VALUE or NAME/JOINT=VALUE")
     task = import_task(options.pop("task"))
-    return CollectionCfg(task=task, load=load, parameters=parameters, **options)
+    effects = tuple(options.pop("effect"))
+    return CollectionCfg(task=task, load=load, parameters=parameters, effects=effects, **options)
 
 
 def _pairs(option: str, words: Sequence[str], form: str) -> dict[str, float]:

@@ -58,6 +58,13 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     return files
 
 
+def truth_file(cfg: CollectionCfg, robot_name: str) -> Path:
+    """Where it is said what was hidden: the recording's stem (of several, what theirs have in common)."""
+    stem = f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
+    recording = cfg.output or Path("data") / robot_name / f"{stem}.npz"
+    return recording.with_name(f"{recording.stem}.truth.json")
+
+
 def _part(path: Path | None, name: str, count: int) -> Path | None:
     return path.with_name(f"{path.stem}_{name}{path.suffix}") if path and count > 1 else path
 

@@ -10,7 +10,7 @@ from .case import Case, CaseFiles, make_case, write_case, write_truth
 from .draw import Drawn, draw_base, draw_effect, draw_visible, joints_of, motion_change, with_background
 from .hidden import EFFECTS, effect_named, library_effects, outside_effects
 from .robot import PlantRobot, plant_robot
-from .simulate import simulate_runs, simulate_truths
+from .simulate import Motion, simulate_motions, simulate_runs, simulate_truths
 from .suite import BENCH_LOAD, Suite, make_suite, session_of
 from .truth import BaseTruth, PlantCfg, Run, Truth
 
@@ -21,6 +21,7 @@ __all__ = [
     "Case",
     "CaseFiles",
     "Drawn",
+    "Motion",
     "PlantCfg",
     "PlantRobot",
     "Run",
@@ -38,6 +39,7 @@ __all__ = [
     "outside_effects",
     "plant_robot",
     "session_of",
+    "simulate_motions",
     "simulate_runs",
     "simulate_truths",
     "with_background",

@@ -17,7 +17,7 @@ from .truth import BaseTruth, PlantCfg, Run, Truth
 
 VISIBLE = 3.0
 """An effect changes the motion by at least this many times the noise (RMS)."""
-_DRAWS = 3  # simulated side by side
+_DRAWS = 3  # of each round
 _ROUNDS = 4
 _BOOST = 1.7  # from round to round
 _NOT_IN_BACKGROUND = {"torque_limit", "torque_speed_limit", "command_rate_limit", "backlash"}
@@ -112,6 +112,7 @@ def draw_visible(
     cfg: PlantCfg | None = None,
     base: Truth | None = None,
     joints: str = ".*",
+    smallest: float | None = None,
 ) -> Drawn:
     """Draw effects until together they change the motion visibly, and each does alone.
 
@@ -126,18 +127,20 @@ def draw_visible(
         cfg: The plant.
         base: The truth to add to; None draws one.
         joints: Which joints have the effects, a regular expression.
+        smallest: Smallest change that counts as visible [rad]; None for three times the noise.
 
     Raises:
         ValueError: If an effect is unknown, or stays invisible.
     """
     cfg = cfg or PlantCfg()
     where = joints_of(robot, joints)
+    smallest = VISIBLE * cfg.noise if smallest is None else smallest
     truth = base or Truth(base=draw_base(robot, rng))
     plain = simulate_truths(robot, runs, [truth], cfg)[0]
     result = Drawn(truth=truth, recordings=tuple(plain), size=0.0)
     chosen: dict[str, dict[str, dict[str, float]]] = {}
     for name in names:
-        alone = _visible_alone(name, robot, runs, truth, plain, where, rng, cfg)
+        alone = _visible_alone(name, robot, runs, truth, plain, where, rng, cfg, smallest)
         chosen[name] = {p: dict(v) for p, v in alone.truth.effects[name].items()}  # type: ignore[arg-type]
         result = alone
     if len(names) > 1:
@@ -156,23 +159,24 @@ def _visible_alone(
     where: Sequence[str],
     rng: np.random.Generator,
     cfg: PlantCfg,
+    smallest: float,
 ) -> Drawn:
     motion = float(np.sqrt(np.mean([r.dof_pos.var() for r in plain])))
     largest = 0.0
     for round_ in range(_ROUNDS):
-        draws = [draw_effect(name, robot, rng, where, _BOOST**round_) for _ in range(_DRAWS if round_ else 2)]
-        truths = [replace(truth, effects={**truth.effects, name: values}) for values in draws]
-        for one in truths if round_ else [truths[0], *truths[1:]]:
+        for _ in range(_DRAWS):
+            values = draw_effect(name, robot, rng, where, _BOOST**round_)
+            one = replace(truth, effects={**truth.effects, name: values})
             try:
                 made = simulate_truths(robot, runs, [one], cfg)[0]
             except ValueError:  # it diverges
                 continue
             size = motion_change(made, plain, where)
             largest = max(largest, size)
-            if VISIBLE * cfg.noise <= size <= motion and size > 0:
+            if smallest <= size <= motion and size > 0:
                 return Drawn(truth=one, recordings=tuple(made), size=size)
     raise ValueError(
-        f"{name} changes the motion by {largest:.2g} rad at most; expected {VISIBLE * cfg.noise:.2g} to {motion:.2g}. "
+        f"{name} changes the motion by {largest:.2g} rad at most; expected {smallest:.2g} to {motion:.2g}. "
         "Choose a motion that shows it, or less noise."
     )
 

@@ -42,24 +42,47 @@ def simulate_truths(
     task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
 ) -> list[list[Recording]]:
     """The same for several truths with the same effects and delay mode, with the same noise: [truth][run]."""
+    return [[motion.recording for motion in motions] for motions in simulate_motions(task, runs, truths, cfg)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """A recording, and what no encoder sees."""
+
+    recording: Recording
+    """What is written."""
+    position: np.ndarray
+    """Where the encoder's side of each joint is, (T, n) [rad]."""
+    torque: np.ndarray
+    """The motors' torque at the end of each control step, (T, n) [N m]."""
+
+
+def simulate_motions(
+    task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
+) -> list[list[Motion]]:
+    """The same with positions and torques: [truth][run]."""
     cfg = cfg or PlantCfg()
     robot = plant_robot(task) if isinstance(task, str) else task
     _check(robot, runs, truths)
-    logged, drives = _Session(robot, runs, truths, cfg).run()
+    logged, seen, torque, drives = _Session(robot, runs, truths, cfg).run()
     time = np.arange(len(runs[0].command)) * cfg.control_dt
     result = []
     for i, _ in enumerate(truths):
         rows = range(i * len(runs), (i + 1) * len(runs))
         result.append(
             [
-                Recording(
-                    name=run.name,
-                    joint_names=robot.joint_names,
-                    time=time,
-                    dof_pos=np.ascontiguousarray(logged[:, row]),
-                    des_dof_pos=run.command,
-                    drive=Drive(**{field: drives[field][row].copy() for field in DRIVE_FIELDS}),
-                    load=run.load,
+                Motion(
+                    recording=Recording(
+                        name=run.name,
+                        joint_names=robot.joint_names,
+                        time=time,
+                        dof_pos=np.ascontiguousarray(logged[:, row]),
+                        des_dof_pos=run.command,
+                        drive=Drive(**{field: drives[field][row].copy() for field in DRIVE_FIELDS}),
+                        load=run.load,
+                    ),
+                    position=seen[:, row],
+                    torque=torque[:, row],
                 )
                 for row, run in zip(rows, runs, strict=True)
             ]
@@ -89,8 +112,8 @@ class _Session:
     truths: Sequence[Truth]
     cfg: PlantCfg
 
-    def run(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Logged positions, (T, R, n) [rad], and the drive's stated gains and limits, {field: (R, n)}."""
+    def run(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Logged and true positions [rad], torques [N m], each (T, R, n); stated gains and limits, {field: (R, n)}."""
         stated = self._stated_drive()
         drives = self._drives(stated)
         effects = self._effects()
@@ -98,9 +121,12 @@ class _Session:
             effect.prepare(drives)
         loads = [run.load for _ in self.truths for run in self.runs]
         body = RigidBody(self.robot, loads, drives.model)
-        return self._play(drives, body, effects), stated
+        logged, seen, torque = self._play(drives, body, effects)
+        return logged, seen, torque, stated
 
-    def _play(self, drives: Drives, body: RigidBody, effects: list[HiddenEffect]) -> np.ndarray:
+    def _play(
+        self, drives: Drives, body: RigidBody, effects: list[HiddenEffect]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cfg, dt = self.cfg, self.cfg.control_dt
         issued = np.concatenate([np.stack([run.command for run in self.runs], axis=1)] * len(self.truths), axis=1)
         steps, rows, n = issued.shape
@@ -110,7 +136,7 @@ class _Session:
         noise = self._noise(steps + beyond, n)
         stages = _overriders(effects)
         targets, torques = np.empty((steps + beyond, rows, n)), np.empty((steps + beyond, rows, n))
-        seen, speed = np.empty_like(targets), np.empty_like(targets)
+        seen, speed, applied = np.empty_like(targets), np.empty_like(targets), np.empty_like(targets)
 
         dynamics = Dynamics(drives, body, effects, self._start(stages["measure"], issued[0] + drives.encoder_bias))
         for k in range(steps + beyond):
@@ -134,10 +160,11 @@ class _Session:
             torque = _delayed(torques, k, drives.effort_delay / dt)
             for _ in range(substeps):
                 dynamics.step(torque, h)
+            applied[k] = dynamics.state.torque
             if k % 100 == 0:
                 self._check_finite(dynamics.q, k)
         self._check_finite(dynamics.q, steps)
-        return self._log(seen, speed, drives, noise, steps)
+        return self._log(seen, speed, drives, noise, steps), seen[:steps], applied[:steps]
 
     def _log(self, seen: np.ndarray, speed: np.ndarray, drives: Drives, noise: np.ndarray, steps: int) -> np.ndarray:
         """What is written: positions at the instants of the log's clock, with the loop's noise, (T, R, n)."""

@@ -135,7 +135,7 @@ def effect_named(name: str) -> type[HiddenEffect]:
         ValueError: If there is none.
     """
     if name not in EFFECTS:
-        close = difflib.get_close_matches(name, EFFECTS, n=1)
+        close = difflib.get_close_matches(name, EFFECTS, n=1, cutoff=0.4)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"There is no hidden effect {name!r}.{hint} Available: {', '.join(sorted(EFFECTS))}.")
     return EFFECTS[name]

@@ -70,7 +70,7 @@ class JointElasticity(HiddenEffect):
     draws = draws_of(
         k=Draw(unit="N m/rad", low=120.0, high=1500.0, log=True, role="inverse", torque=True, null=np.inf),
         c=Draw(unit="N m s/rad", low=0.1, high=1.0, role="shape", torque=True),
-        encoder_on_link=Draw(unit="0 or 1", low=0.0, high=0.8, role="shape", integer=True),
+        encoder_on_link=Draw(unit="1", low=0.0, high=0.8, role="shape", integer=True),
     )
 
     def prepare(self, drives: Drives) -> None:
@@ -87,7 +87,7 @@ class Backlash(HiddenEffect):
         gap=Draw(unit="rad", low=0.004, high=0.03),
         k=Draw(unit="N m/rad", low=3000.0, high=8000.0, role="shape", torque=True, null=np.inf),
         c=Draw(unit="N m s/rad", low=2.0, high=8.0, role="shape", torque=True),
-        encoder_on_link=Draw(unit="0 or 1", low=0.0, high=0.8, role="shape", integer=True),
+        encoder_on_link=Draw(unit="1", low=0.0, high=0.8, role="shape", integer=True),
     )
 
     def prepare(self, drives: Drives) -> None:
@@ -108,6 +108,8 @@ class MountCompliance(HiddenEffect):
 
     def prepare(self, drives: Drives) -> None:
         """Loosen the mount; a recording has one, taken from its softest joint's value."""
+        if not np.isfinite(self.k).any():
+            return
         softest = np.argmin(self.k, axis=1)[:, None]
         drives.model.mount_stiffness = np.take_along_axis(self.k, softest, axis=1)
         drives.model.mount_damping = np.take_along_axis(self.c, softest, axis=1)
