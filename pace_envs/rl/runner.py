@@ -13,6 +13,8 @@ from rsl_rl.runners import OnPolicyRunner
 from pace_envs.mdp import UniformVelocityCommand
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 
+_MOST_THREADS = 8  # for networks this small
+
 
 class PaceOnPolicyRunner(OnPolicyRunner):
     """Trains a policy.
@@ -27,10 +29,10 @@ class PaceOnPolicyRunner(OnPolicyRunner):
     def __init__(
         self, env: RslRlVecEnvWrapper, train_cfg: dict, log_dir: str | None = None, learning_threads: int | None = None
     ):
-        """Build the networks; ``learning_threads`` defaults to the number of processors."""
+        """Build the networks; ``learning_threads`` defaults to the number of processors, up to 8."""
         super().__init__(env, train_cfg, log_dir, device=str(env.device))
         self.logger.git_status_repos.clear()  # no copy of somebody's uncommitted work in every run
-        self.learning_threads = learning_threads or os.cpu_count() or 1
+        self.learning_threads = learning_threads or min(os.cpu_count() or 1, _MOST_THREADS)
         self.alg.update = _with_threads(self.alg.update, self.learning_threads)
 
     def save(self, path: str, infos: dict | None = None) -> None:
