@@ -1,9 +1,13 @@
 """Train a policy with rsl-rl."""
 
+import os
 import sys
 
-from pace_envs.rl import RunSettings, resume, train
-from pace_optim.cli import import_task, make_parser, run_cli
+# Before torch is imported: threads that wait for work must not keep the cores from the physics, or from other programs.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from pace_envs.rl import RunSettings, resume, train  # noqa: E402
+from pace_optim.cli import import_task, make_parser, run_cli  # noqa: E402
 
 
 def main() -> None:

@@ -21,7 +21,8 @@ class PaceOnPolicyRunner(OnPolicyRunner):
 
     Two kinds of work take turns on the same cores. While samples are collected the physics has a thread per core, and
     torch's tensors are so small that one thread is fastest; while the networks learn the physics rests and torch takes
-    ``learning_threads``.
+    ``learning_threads``. Set ``OMP_WAIT_POLICY=PASSIVE`` before torch is imported: threads that spin while they wait
+    make an update ten times slower where other programs want the cores, too.
     """
 
     env: RslRlVecEnvWrapper
