@@ -22,15 +22,15 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as scripts/train.py does
 
-import gymnasium as gym  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from mujoco import batch  # noqa: E402
+import gymnasium as gym
+import mujoco
+import numpy as np
+import torch
+from mujoco import batch
 
-from pace_envs.rl import PaceOnPolicyRunner, RunSettings, make_env  # noqa: E402
-from pace_envs.rl.training import load_cfg  # noqa: E402
-from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper  # noqa: E402
+from pace_envs.rl import PaceOnPolicyRunner, RunSettings, make_env
+from pace_envs.rl.training import load_cfg
+from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 
 NOISE = 0.3  # standard deviation of the actions: the robots sway on their feet
 

@@ -6,8 +6,8 @@ import sys
 # Before torch is imported: threads that wait for work must not keep the cores from the physics, or from other programs.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from pace_envs.rl import RunSettings, resume, train  # noqa: E402
-from pace_optim.cli import import_task, make_parser, run_cli  # noqa: E402
+from pace_envs.rl import RunSettings, resume, train
+from pace_optim.cli import import_task, make_parser, run_cli
 
 
 def main() -> None:
