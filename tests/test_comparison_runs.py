@@ -125,6 +125,15 @@ def test_other_recordings_are_simulated_with_their_own_load(bench):
     assert first["rmse"]["train"] == pytest.approx(own["rmse"]["train"], rel=1e-6)
 
 
+@pytest.mark.slow
+def test_the_robots_own_sample_named_again_is_known_to_have_been_trained_on(tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "write_report", lambda folder: None)
+        _, run = fit(FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path)))
+    again = compare([run], data=[str(ROOT / "assets" / "test_bench" / "chirp.npz")])
+    assert again["recordings"][0]["trained_share"] == pytest.approx(0.7)
+
+
 def test_a_finer_physics_step_is_simulated_anew(bench):
     run, _ = bench
     coarse, fine = compare([run]), compare([run], physics_dt=0.00125)

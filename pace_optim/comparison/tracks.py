@@ -179,11 +179,12 @@ def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
     """For files named anew, which samples the run was trained on: those of its own recordings, by their digests."""
     if not data or not (folder / "best_trajectory.pt").is_file():
         return []
-    settings, digests = FitSettings.load(folder / "settings.json")
-    own = [digests.get(path) for path in (*settings.data, *settings.validation)]
+    _, digests = FitSettings.load(folder / "settings.json")  # in the order of the recordings
     entries = _best_trajectory(folder)["recordings"]
+    if len(digests) != len(entries):
+        return []
     known = {
-        digest: np.asarray(entry["train"]).astype(bool) for digest, entry in zip(own, entries, strict=False) if digest
+        digest: np.asarray(entry["train"]).astype(bool) for digest, entry in zip(digests.values(), entries, strict=True)
     }
     return [known.get(file_digest(path), np.zeros(0, dtype=bool)) for path in data]
 

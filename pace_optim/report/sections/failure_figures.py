@@ -173,6 +173,8 @@ def _response(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     if said:
         text = f"The model is off by at most {' and '.join(said)}, where command and position are coherent."
     frequency = _numbers(content["frequency"])
+    if len(frequency) < 3:
+        text += " The command holds hardly more than one frequency: record a chirp to see the response."
     traces = [
         {"x": frequency, "y": _numbers(content[of][key])}
         for key in ("magnitude_db", "phase_deg", "coherence")
@@ -186,7 +188,7 @@ def _response_traces() -> list[dict[str, Any]]:
     for i, unit in enumerate((" dB", "°", "")):
         on = {
             "mode": "lines+markers",
-            "marker": {"size": 4},
+            "marker": {"size": 5},
             "yaxis": f"y{i + 1 if i else ''}",
             "showlegend": i == 0,
             "hovertemplate": f"%{{y:.3g}}{unit}",
