@@ -10,11 +10,16 @@ from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_e
 COPPER_LOSS = {".*_(hip|thigh)_joint": 0.45, ".*_calf_joint": 0.2}
 """R / (r² k²) [W/(N m)²]: R 0.3 ohm, k 0.128 N m/A, r 6.33 and 9.6. Assumed, of the right size; put in your motor's."""
 
+ARMATURE = 0.01
+"""Rotor inertia at the joint [kg m^2], of the usual size for this robot."""
+
 
 def go2_velocity_env_cfg() -> VelocityEnvCfg:
     """The task."""
     robot = go2_cfg()
-    robot.actuators = {name: replace(drive, stiffness=25.0, damping=1.0) for name, drive in robot.actuators.items()}
+    robot.actuators = {
+        name: replace(drive, stiffness=25.0, damping=1.0, armature=ARMATURE) for name, drive in robot.actuators.items()
+    }
     cfg = velocity_env_cfg(
         robot, feet=".._foot", base="base_trunk", knees=".._thigh", action_scale=0.25, minimum_height=0.16
     )
