@@ -33,7 +33,7 @@ class Case:
     kind: Kind = "battery"
     """Which recordings."""
     background: float = 0.0
-    """RMS change of the motion by about twenty other small effects [rad]; 0 for none."""
+    """RMS change of the motion by about twenty other small effects, as a share of the effect's own; 0 for none."""
     harmonic_drive: bool = False
     """A 20:1 harmonic drive with a resonance above 0 dB at 4 to 8 Hz, in place of a drawn elasticity."""
     noise: float = 1e-4
@@ -69,6 +69,8 @@ def make_case(case: Case) -> tuple[Suite, Drawn]:
     """
     for name in case.effects:
         effect_named(name)
+    if case.background and not (case.effects or case.harmonic_drive):
+        raise ValueError("A background is a share of an effect's size, and the case has no effect. Name one.")
     robot = plant_robot(case.task)
     key = sum(ord(c) * 31**i for i, c in enumerate("+".join(case.effects))) % 2**31
     rng = np.random.default_rng([case.seed, key])
@@ -79,7 +81,7 @@ def make_case(case: Case) -> tuple[Suite, Drawn]:
     else:
         drawn = draw_visible(robot, suite.runs, case.effects, rng, cfg=cfg, joints=case.joints)
     if case.background:
-        drawn = with_background(robot, suite.runs, drawn, rng, size=case.background, cfg=cfg)
+        drawn = with_background(robot, suite.runs, drawn, rng, size=case.background * drawn.size, cfg=cfg)
     return suite, drawn
 
 

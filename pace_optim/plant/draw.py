@@ -208,7 +208,7 @@ def with_background(
     others = [n for n in library_effects() if n not in drawn.truth.effects and n not in _NOT_IN_BACKGROUND]
     names = sorted(rng.permutation(others)[:count].tolist())
     values = {name: draw_effect(name, robot, rng) for name in names}
-    scale, made, change = 0.03, list(drawn.recordings), 0.0
+    scale, made, change = 0.05 * size / max(drawn.size, size), list(drawn.recordings), 0.0
     truth = drawn.truth
     for _ in range(5):
         small = {name: scaled(name, values[name], scale) for name in names}

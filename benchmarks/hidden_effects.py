@@ -1,0 +1,87 @@
+"""Does the diagnosis name what an independent plant hid? Many seeded cases, resumable.
+
+python benchmarks/hidden_effects.py --cases effects,clean --seeds 5 --workers 2
+python benchmarks/hidden_effects.py --table
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from hidden_effects_cases import GROUPS, ROBOTS, Job, make_jobs, run_job
+from hidden_effects_table import make_table
+
+from pace_envs.simulation import SimulationCfg
+
+
+def start_worker() -> None:
+    """One thread for each worker process: tensors and physics alike."""
+    torch.set_num_threads(1)
+    SimulationCfg.__init__.__kwdefaults__["num_threads"] = 1  # its default is one per processor
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """The finished cases; of a case that ran again, the last."""
+    if not path.is_file():
+        return []
+    lines = (json.loads(text) for text in path.read_text(encoding="utf-8").splitlines() if text.strip())
+    return list({line["case"]: line for line in lines}.values())
+
+
+def run_all(jobs: list[Job], results: Path, workers: int) -> None:
+    """Run what is not done and add a line for each; an interrupted run goes on where it was."""
+    done = {line["case"] for line in read_results(results) if "error" not in line}
+    left = [job for job in jobs if job.case.name not in done]
+    print(f"{len(jobs)} cases, {len(jobs) - len(left)} done before")
+    results.parent.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    with multiprocessing.get_context("spawn").Pool(workers, start_worker) as pool, results.open("a") as file:
+        for i, line in enumerate(pool.imap_unordered(run_job, left), start=1):
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            told = line.get("error") or f"{line.get('verdict', 'fitted')} {' + '.join(line.get('added', []))}"
+            print(f"{i}/{len(left)} {time.perf_counter() - start:6.0f} s  {line['case']}: {told[:160]}", flush=True)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", default="effects,clean,outside,pairs,harmonic", help=f"of {', '.join(GROUPS)}")
+    parser.add_argument("--seeds", type=int, default=5, help="cases of each kind")
+    parser.add_argument("--recordings", choices=("battery", "chirp"), default="battery")
+    parser.add_argument("--robot", choices=tuple(ROBOTS), default="bench")
+    parser.add_argument("--workers", type=int, default=2, help="processes, one thread each")
+    parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
+    parser.add_argument("--physics_dt", type=float, default=0.0005, help="of the model [s]")
+    parser.add_argument("--fits_only", action="store_true", help="no diagnosis: only the base and the true model")
+    parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")
+    parser.add_argument("--table", action="store_true", help="only print what the results say")
+    args = parser.parse_args()
+    results = args.folder / f"{args.robot}_{args.recordings}{'_fits' if args.fits_only else ''}.jsonl"
+    if not args.table:
+        try:
+            jobs = make_jobs(
+                args.cases.split(","),
+                args.seeds,
+                args.robot,
+                args.recordings,
+                args.folder / f"{args.robot}_{args.recordings}",
+                physics_dt=args.physics_dt,
+                max_effects=args.max_effects,
+                fits_only=args.fits_only,
+            )
+        except ValueError as error:
+            sys.exit(f"error: {error}")
+        run_all(jobs, results, args.workers)
+    print(make_table(read_results(results)))
+
+
+if __name__ == "__main__":
+    main()
