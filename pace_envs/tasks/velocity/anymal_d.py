@@ -11,8 +11,8 @@ COPPER_LOSS = 0.008
 """R / (r² k²) [W/(N m)²]: R 0.2 ohm, r 50, k 0.1 N m/A. Assumed, of the right size; put in your motor's."""
 
 ARMATURE = 0.06
-"""Rotor inertia at the joint [kg m^2], the middle of what arXiv 2509.06342 identified. Without any, a free leg overshoots
-the torque-speed curve at steps of 5 ms, up to twice the no-load speed."""
+"""Rotor inertia at the joint [kg m^2], the middle of what arXiv 2509.06342 identified. Without any, a free leg
+overshoots the torque-speed curve at steps of 5 ms, up to twice the no-load speed."""
 
 
 def anymal_d_velocity_env_cfg() -> VelocityEnvCfg:
