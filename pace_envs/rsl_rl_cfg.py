@@ -70,10 +70,9 @@ class RslRlMlpModelCfg:
     """Distribution of the actions; ``None`` for a critic."""
 
 
-def _gaussian_actor() -> RslRlMlpModelCfg:
-    return RslRlMlpModelCfg(
-        distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
-    )
+def gaussian(init_std: float) -> dict[str, Any]:
+    """Normally distributed actions with a learned standard deviation, which starts at ``init_std``."""
+    return {"class_name": "GaussianDistribution", "init_std": init_std, "std_type": "scalar"}
 
 
 @dataclass(kw_only=True)
@@ -89,7 +88,7 @@ class RslRlOnPolicyRunnerCfg:
     num_steps_per_env: int = 24
     """Environment steps per iteration."""
 
-    max_iterations: int = 500
+    max_iterations: int = 600
     """Iterations of a training."""
 
     save_interval: int = 50
@@ -101,7 +100,7 @@ class RslRlOnPolicyRunnerCfg:
     clip_actions: float | None = 100.0
     """Actions are clipped to plus and minus this; ``None`` for no clipping."""
 
-    actor: RslRlMlpModelCfg = field(default_factory=_gaussian_actor)
+    actor: RslRlMlpModelCfg = field(default_factory=lambda: RslRlMlpModelCfg(distribution_cfg=gaussian(1.0)))
     """The policy."""
 
     critic: RslRlMlpModelCfg = field(default_factory=RslRlMlpModelCfg)

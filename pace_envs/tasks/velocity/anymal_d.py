@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from pace_envs.robots import anymal_d_cfg
-from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
+from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg, gaussian
 from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
 from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
 
@@ -26,4 +26,5 @@ def anymal_d_velocity_env_cfg() -> VelocityEnvCfg:
     cfg.reward_sets = {"velocity": velocity_rewards(), "energy": energy_rewards(COPPER_LOSS)}
     cfg.rewards = cfg.reward_sets["velocity"]
     cfg.runner = RslRlOnPolicyRunnerCfg(experiment_name="anymal_d_velocity")
+    cfg.runner.actor.distribution_cfg = gaussian(init_std=0.6)  # of 0.5 rad: with 1 a robot falls before it learns
     return cfg
