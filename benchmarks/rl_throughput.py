@@ -63,9 +63,14 @@ def stance(env: RslRlVecEnvWrapper) -> np.ndarray:
     return env.unwrapped.sim.qpos[0].numpy().copy()
 
 
+def plain_model(env: RslRlVecEnvWrapper) -> mujoco.MjModel:
+    """The model of environment 0, with what the drives have written to it."""
+    return env.unwrapped.sim.batch.get_model(0)
+
+
 def time_bare(env: RslRlVecEnvWrapper, law: PdLaw, start: np.ndarray, actions: np.ndarray, decimation: int) -> float:
     """Seconds of the bare loop."""
-    bare = batch.Batch(env.unwrapped.sim.model, env.num_envs)
+    bare = batch.Batch(plain_model(env), env.num_envs)
     q, v, torque = bare.bind("qpos"), bare.bind("qvel"), bare.bind("qfrc_applied")
     q[:] = start
     bare.forward()
@@ -132,9 +137,9 @@ def async_rate(
     env: RslRlVecEnvWrapper, law: PdLaw, start: np.ndarray, decimation: int, count: int, steps: int
 ) -> float:
     """Environment steps per second of ``AsyncVectorEnv`` with ``count`` processes."""
-    size = mujoco.mj_sizeModel(env.unwrapped.sim.model)
-    buffer = np.empty(size, np.uint8)
-    mujoco.mj_saveModel(env.unwrapped.sim.model, None, buffer)
+    model = plain_model(env)
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
     data = buffer.tobytes()
     vector = gym.vector.AsyncVectorEnv([lambda: SingleEnv(data, law, start, decimation) for _ in range(count)])
     vector.reset(seed=0)

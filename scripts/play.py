@@ -15,7 +15,7 @@ def main() -> None:
     )
     parser.add_argument("--checkpoint", required=True, metavar="FILE", help="model_<n>.pt, or a run for its last one")
     parser.add_argument("--task", help="registered environment (default: that of the run)")
-    parser.add_argument("--num_envs", type=int, default=64, help="robots that are judged (default 64)")
+    parser.add_argument("--num_envs", type=int, default=256, help="robots that are judged (default 256)")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long (default 20)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--command", type=float, nargs=3, metavar=("VX", "VY", "WZ"), help="one command for all robots")

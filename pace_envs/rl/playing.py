@@ -33,7 +33,7 @@ class PlaySettings:
     task: str | None = None
     """Registered environment; ``None`` means the one that the checkpoint's run was trained in."""
 
-    num_envs: int = 64
+    num_envs: int = 256
     """Number of robots that are judged."""
 
     seconds: float = 20.0
