@@ -15,11 +15,11 @@ from rsl_rl.env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pace_envs.registration import load_env_cfg
-from pace_envs.rl import PlaySettings, RunSettings, latest_checkpoint, make_env, play, resume, train
+from pace_envs.rl import PlaySettings, RunSettings, evaluate, latest_checkpoint, make_env, play, resume, train
 from pace_envs.rl.training import load_cfg
 from pace_envs.rl.video import check_video_path, write_video
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
-from pace_envs.tasks.velocity import VelocityEnvCfg
+from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command, play_cfg
 
 ROOT = Path(__file__).parents[1]
 TASKS = ["Pace-AnymalD-Velocity-v0", "Pace-Go2-Velocity-v0"]
@@ -89,6 +89,26 @@ def test_only_batched_environments_can_be_wrapped():
 def test_unusable_settings_are_answered_with_what_there_is(settings, message):
     with pytest.raises(ValueError, match=message):
         load_cfg(RunSettings(**settings))
+
+
+def test_a_robot_that_stands_is_judged_as_one_that_stands():
+    cfg = load_cfg(RunSettings(task=TASKS[0], num_envs=4))
+    play_cfg(cfg)
+    fix_command(cfg, (0.5, 0.0, 0.3))
+    env = make_env(cfg)
+    result = evaluate(env, lambda obs: torch.zeros(4, 12), steps=150)
+    assert result.velocity_error == pytest.approx(0.5, abs=0.05)
+    assert result.yaw_rate_error == pytest.approx(0.3, abs=0.05)
+    assert result.falls_per_episode == 0.0 and result.speed < 0.1
+    weight = 9.81 * float(env.unwrapped.sim.model.body_mass.sum())
+    assert result.cost_of_transport == pytest.approx(result.power / (weight * result.speed))
+
+
+def test_falls_are_counted_per_20_seconds():
+    cfg = load_cfg(RunSettings(task=TASKS[0], num_envs=4))
+    cfg.terminations["base_height"].params["minimum_height"] = 10.0  # everyone falls at every step
+    env = make_env(cfg)
+    assert evaluate(env, lambda obs: torch.zeros(4, 12), steps=5).falls_per_episode == pytest.approx(1000.0)
 
 
 @pytest.fixture(scope="module")
