@@ -129,6 +129,13 @@ def test_the_time_since_a_reversal_of_a_sine():
     assert np.mean(motion.direction == np.sign(np.cos(2 * np.pi * TIME)))[()] > 0.97
 
 
+def test_a_reversal_is_where_the_speed_is_zero_although_noise_hides_it_for_a_while():
+    motion = motion_of(0.5 * np.sin(2 * np.pi * 0.5 * TIME), DT, 3e-3)
+    assert motion.standstill > 0.2  # of a top speed of 1.6 rad/s
+    middle = slice(1000, 7000)
+    assert np.quantile(np.abs(motion.since_reversal - (TIME + 0.5) % 1.0)[middle], 0.97) < 2 * DT
+
+
 def test_a_joint_that_stands_has_never_turned():
     motion = motion_of(1e-4 * rng().standard_normal(4000), DT, 1e-4)
     assert np.isinf(motion.since_reversal).mean() > 0.9
@@ -173,6 +180,11 @@ def test_an_error_at_one_frequency_is_said_to_be_in_its_band():
     place = compared.content["places"][0]
     assert place["by"] == ["frequency"] and place["share_of_error"] > 0.95
     assert "between 7.9 and 9.9 Hz" in place["sentence"]
+
+
+def test_noise_does_not_count_in_the_spectrum_either():
+    compared = compare_joint("knee", 0, [track(2e-4 * np.sin(2 * np.pi * 9.0 * TIME + 0.3))])
+    assert max(compared.content["where"]["frequency"]["error"]) > 0.85  # two thirds, were noise counted
 
 
 def test_an_error_at_high_speed_is_said_to_be_there():
