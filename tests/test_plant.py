@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problems import BENCH, env_cfg, make_problem
+from problems import BENCH, env_cfg
 
 from pace_optim.cli import run_cli
+from pace_optim.dataset import make_dataset
+from pace_optim.parameter_space import ParameterSpace
 from pace_optim.plant import (
     BENCH_LOAD,
     EFFECTS,
@@ -23,6 +25,7 @@ from pace_optim.plant import (
     draw_effect,
     joints_of,
     library_effects,
+    make_case,
     motion_change,
     outside_effects,
     plant_robot,
@@ -32,7 +35,7 @@ from pace_optim.plant import (
     write_case,
 )
 from pace_optim.plant.friction_solver import friction_impulse
-from pace_optim.recording import Drive, Load, load_recording
+from pace_optim.recording import Drive, Load, conform_recording, load_recording
 from pace_optim.rollout import Rollout
 
 ROOT = Path(__file__).parents[1]
@@ -150,15 +153,19 @@ def test_without_effects_the_model_converges_to_the_plant(delay_mode):
     truth = Truth(base=BASE, delay_mode=delay_mode)
     no_curve = Drive(velocity_limit=np.array([1e6]))  # the model may hold its torque-speed limit over a control step
     recording = positions(truth, [run_of(chirp(amplitude=0.4), drive=no_curve)])[0]
-    problem = make_problem(recording, delay_mode=delay_mode)
+    space = ParameterSpace.of(env_cfg().sim2real)
+    conformed = conform_recording(recording, joint_order=("servo",), control_dt=DT, accepts_load=True)
+    dataset = make_dataset([conformed], train_fraction=1)
     values = {name: getattr(BASE, name) for name in ("armature", "viscous_friction", "friction", "encoder_bias")}
-    x = problem.space.from_dict({**values, "delay": BASE.delay / DT})
-    simulated = {ratio: _replay(problem, x, ratio, delay_mode) - 0.02 for ratio in (8, 16)}  # of first order at worst
+    x = space.from_dict({**values, "delay": BASE.delay / DT})
+    simulated = {
+        ratio: _replay(dataset, space, x, ratio, delay_mode) - 0.02 for ratio in (8, 16)
+    }  # of first order at worst
     limit = 2 * simulated[16] - simulated[8]
     assert np.sqrt(np.mean((limit - recording.dof_pos[:, 0]) ** 2)) < 2e-5, "a fifth of the usual noise"
 
 
-def _replay(problem, x, ratio, delay_mode):
+def _replay(dataset, space, x, ratio, delay_mode):
     from pace_envs import ManagerBasedRLEnv
     from pace_envs.registration import set_physics_dt
 
@@ -167,8 +174,8 @@ def _replay(problem, x, ratio, delay_mode):
     for actuator in cfg.scene.robot.actuators.values():
         actuator.delay_mode = delay_mode
     set_physics_dt(cfg, DT / ratio)
-    rollout = Rollout(ManagerBasedRLEnv(cfg), problem.dataset, problem.space)
-    rollout.start(x[None], problem.dataset.sampled)
+    rollout = Rollout(ManagerBasedRLEnv(cfg), dataset, space)
+    rollout.start(x[None], dataset.sampled)
     result = np.array([float(q[0, 0]) for q, _ in rollout])
     rollout.env.close()
     return result
@@ -275,6 +282,17 @@ def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path):
     assert recordings[7].load.added_mass == {"load": 0.8} and recordings[0].load.load_mass == 2.0
     truth = json.loads(files.truth.read_text())
     assert list(truth["effects"]) == ["torque_ripple"] and truth["size"] >= 3e-4
+
+
+@pytest.mark.slow
+def test_the_harmonic_drive_resonates_above_0_db_within_4_to_8_hz():
+    suite, drawn = make_case(Case(harmonic_drive=True, seed=1))
+    small = drawn.recordings[0]
+    frequency = 0.1 + 9.9 * small.time / 10.0
+    band = (frequency > 4.0) & (frequency < 6.0)
+    assert suite.train[0].name == "chirp_small"
+    assert small.dof_pos[band].std() > 1.4 * small.des_dof_pos[band].std()
+    assert [float(r.drive.stiffness[0]) for r in drawn.recordings[5:7]] == [300.0, 450.0]
 
 
 def collect(*args):

@@ -47,6 +47,7 @@ def make_suite(
     duration: float | None = None,
     known_mass: dict[str, float] | None = None,
     load: Load | None = None,
+    gains: tuple[float, float] | None = None,
 ) -> Suite:
     """The usual recordings of a robot.
 
@@ -61,30 +62,35 @@ def make_suite(
         duration: Of each recording [s]; None for the usual.
         known_mass: What is added for one recording, {body: kg}; None for the robot's usual (0.8 kg on the bench,
             0.5 kg on each last link elsewhere).
+        gains: kp [N m/rad] and kd [N m s/rad] of all joints; None for the robot's.
         load: What all recordings carry; None for the robot's usual (the bench's pendulum of 0.30 kg m^2, 8 N m).
     """
     bench = robot.name == "test_bench"
     load = load or (BENCH_LOAD if bench else Load())
     known_mass = known_mass or (_BENCH_MASS if bench else _last_links(robot))
     small = 0.6 if bench else 0.75
+    drive, stiffness = Drive(), robot.drive["stiffness"]
+    if gains is not None:
+        stiffness = np.full(robot.num_joints, gains[0])
+        drive = Drive(stiffness=stiffness, damping=np.full(robot.num_joints, gains[1]))
     if kind == "chirp":
         span = 20.0 if duration is None else duration
-        train = [("chirp", _motions(robot, "chirp", span, seed, bench, 0.5 / 0.8 if bench else 1.0)[0], Drive(), load)]
-        validation = [("multisine", _motions(robot, "multisine", span, seed + 1, bench, small)[0], Drive(), load)]
+        train = [("chirp", _motions(robot, "chirp", span, seed, bench, 0.5 / 0.8 if bench else 1.0)[0], drive, load)]
+        validation = [("multisine", _motions(robot, "multisine", span, seed + 1, bench, small)[0], drive, load)]
     elif kind == "battery":
         span = 10.0 if duration is None else duration
         six = _motions(robot, "battery", span, seed, bench, 1.0)
         if bench:
             wide = _motions(robot, "battery", span, seed, bench, _BENCH_STAIRCASE / _BENCH_SCALE)
             six = [wide[i] if t.name == "staircase" else t for i, t in enumerate(six)]
-        train = [(t.name, t, Drive(), load) for t in six]
+        train = [(t.name, t, drive, load) for t in six]
         medium = next(t for t in six if t.name == "chirp_medium")
-        stiff = Drive(stiffness=robot.drive["stiffness"] * _KP_FACTOR)
+        stiff = replace(drive, stiffness=stiffness * _KP_FACTOR)
         train.append(("chirp_stiff", medium, stiff, load))
-        train.append(("chirp_mass", medium, Drive(), replace(load, added_mass=known_mass)))
+        train.append(("chirp_mass", medium, drive, replace(load, added_mass=known_mass)))
         validation = [
-            ("multisine", _motions(robot, "multisine", span, seed + 1, bench, small)[0], Drive(), load),
-            ("other_steps", _motions(robot, "steps", span, seed + 2, bench, small)[0], Drive(), load),
+            ("multisine", _motions(robot, "multisine", span, seed + 1, bench, small)[0], drive, load),
+            ("other_steps", _motions(robot, "steps", span, seed + 2, bench, small)[0], drive, load),
         ]
     else:
         raise ValueError(f"There is no kind of suite {kind!r}. Available: battery, chirp.")
