@@ -1,6 +1,6 @@
 """How fast a training environment is, and where a training's time goes.
 
-    python benchmarks/rl_throughput.py --num_envs 1024
+    python benchmarks/rl_throughput.py --num_envs 512
 
 Steps Pace-AnymalD-Velocity-v0 (--task) through ``env.step`` and, in turns with it, a bare ``mujoco.batch`` loop over
 the same model, contacts and targets, whose torques are one NumPy expression; then Gymnasium's ``AsyncVectorEnv`` of
@@ -215,7 +215,7 @@ def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="Pace-AnymalD-Velocity-v0")
-    parser.add_argument("--num_envs", type=int, default=1024)
+    parser.add_argument("--num_envs", type=int, default=512)
     parser.add_argument("--steps", type=int, default=25, help="environment steps a repetition")
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--async_envs", type=int, nargs="*", default=[2, 8, 32], help="processes of AsyncVectorEnv")

@@ -59,7 +59,7 @@ def velocity_env_cfg(
     """
     return VelocityEnvCfg(
         scene=InteractiveSceneCfg(
-            num_envs=1024,
+            num_envs=512,
             robot=robot,
             terrain=TerrainCfg(collision_geoms=(feet, base, knees), impratio=1.0),
             contact_sensors={
