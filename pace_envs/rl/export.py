@@ -8,8 +8,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import onnx
-
 from pace_envs.mdp import JointPositionAction
 from pace_envs.rl.runner import PaceOnPolicyRunner
 
@@ -19,6 +17,8 @@ def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
 
     Both take the observation (batch, dim), normalise it themselves, and give the mean action (batch, joints).
     """
+    import onnx  # heavy, and only needed here
+
     folder.mkdir(parents=True, exist_ok=True)
     log = logging.getLogger("torch.onnx")
     level = log.level
