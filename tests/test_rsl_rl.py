@@ -15,7 +15,17 @@ from rsl_rl.env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pace_envs.registration import load_env_cfg
-from pace_envs.rl import PlaySettings, RunSettings, evaluate, latest_checkpoint, make_env, play, resume, train
+from pace_envs.rl import (
+    PaceOnPolicyRunner,
+    PlaySettings,
+    RunSettings,
+    evaluate,
+    latest_checkpoint,
+    make_env,
+    play,
+    resume,
+    train,
+)
 from pace_envs.rl.training import load_cfg
 from pace_envs.rl.video import check_video_path, write_video
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
@@ -164,6 +174,22 @@ def test_a_training_goes_on_where_it_stopped(run):
     assert latest_checkpoint(run).name == "model_2.pt" and RunSettings.read(run).max_iterations == 3
     with pytest.raises(ValueError, match="ends after 3 iterations"):
         resume(run)
+
+
+def test_the_curriculum_goes_on_where_it_stopped_and_a_judge_has_none(run, tmp_path):
+    cfg = load_cfg(RunSettings.read(run))
+    env = make_env(cfg)
+    command = env.unwrapped.command_manager.get_term("base_velocity")
+    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
+    command.scale = 0.8
+    runner.save(str(tmp_path / "model_0.pt"))
+    command.scale = 0.5
+    runner.load(str(tmp_path / "model_0.pt"))
+    assert command.scale == 0.8 and runner.current_learning_iteration == 1
+    play_cfg(cfg)
+    env = make_env(cfg)
+    PaceOnPolicyRunner(env, cfg.runner.to_dict()).load(str(tmp_path / "model_0.pt"))
+    assert env.unwrapped.command_manager.get_term("base_velocity").scale == 1.0
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])

@@ -78,8 +78,6 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
             runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
         runner.load(str(path))
-        for name in env.unwrapped.command_manager.active_terms:
-            env.unwrapped.command_manager.get_term(name).scale = 1.0  # type: ignore[attr-defined]
         policy = runner.get_inference_policy()
         if settings.export is not None:
             export_policy(runner, Path(settings.export))

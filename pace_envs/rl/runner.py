@@ -58,16 +58,18 @@ class PaceOnPolicyRunner(OnPolicyRunner):
             first = str(error).splitlines()[0]
             raise ValueError(f"{path} is no checkpoint of this task's networks ({first}). Check --task.") from None
         self.current_learning_iteration += 1
-        for name, scale in (infos or {}).get("env", {}).get("command_scale", {}).items():
-            term = self.env.unwrapped.command_manager.get_term(name)
-            if isinstance(term, UniformVelocityCommand):
-                term.scale = scale
+        if self.env.unwrapped.curriculum_manager.active_terms:
+            for name, scale in (infos or {}).get("env", {}).get("command_scale", {}).items():
+                self._velocity_commands()[name].scale = scale
         return infos
 
     def _env_state(self) -> dict[str, Any]:
+        return {"command_scale": {name: term.scale for name, term in self._velocity_commands().items()}}
+
+    def _velocity_commands(self) -> dict[str, UniformVelocityCommand]:
         manager = self.env.unwrapped.command_manager
         terms = {name: manager.get_term(name) for name in manager.active_terms}
-        return {"command_scale": {n: t.scale for n, t in terms.items() if isinstance(t, UniformVelocityCommand)}}
+        return {name: term for name, term in terms.items() if isinstance(term, UniformVelocityCommand)}
 
 
 def _with_threads(update: Callable[[], dict], threads: int) -> Callable[[], dict]:
