@@ -155,7 +155,7 @@ class PaceDCMotor:
         self._speed_slope: torch.Tensor | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
-        self.applied_effort = torch.zeros_like(self.stiffness)
+        self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
         delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
         self._delay_buffers = {
             name: DelayBuffer(cfg.max_delay, num_envs, self._device, cfg.delay_interpolation) for name in delayed
@@ -215,9 +215,12 @@ class PaceDCMotor:
             effort = self.transmitted_effort(effort)
             self.effects.state.time += self.effects.dt
             self._step_begun = False
-        self.applied_effort = effort
+        self.applied_effort = self._held_effort = effort
         if self._speed_slope is not None:
-            self._held_effort = torch.addcmul(effort, self._speed_slope, joint_vel)
+            if self.effects is not None and self.effects.changes_passive:  # the line is in it
+                self.applied_effort = torch.addcmul(effort, self._speed_slope, joint_vel, value=-1)
+            else:
+                self._held_effort = torch.addcmul(effort, self._speed_slope, joint_vel)
         return dataclasses.replace(
             control_action, joint_positions=None, joint_velocities=None, joint_efforts=self.applied_effort
         )
@@ -276,12 +279,12 @@ class PaceDCMotor:
             s.speed_slope.zero_()
             self.effects.run("drive")
             asked, slope = s.effort, s.speed_slope
-        effort = clip_effort(asked, joint_vel, self.saturation_effort, self.effort_limit, self.velocity_limit)
+        speed = joint_vel if self.effects is None else self.effects.state.motor_vel
+        effort = clip_effort(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
         if self.holds_line:
             line = self.saturation_effort / self.velocity_limit
-            unchanged = effort == asked
             free = effort.abs() < self.effort_limit
-            self._speed_slope = torch.where(unchanged, 0.0 if slope is None else slope, line * free)
+            self._speed_slope = torch.where(effort == asked, 0.0 if slope is None else slope, line * free)
         if self.torque_enable is not None:
             effort = effort * self.torque_enable
             if self._speed_slope is not None:
@@ -302,7 +305,12 @@ class PaceDCMotor:
         if stack is None or not stack.changes_passive:
             return effort
         s = stack.state
-        s.effort, s.friction, s.viscous_friction = effort, self.friction, self.viscous_friction
+        s.motor_effort, s.effort = effort, effort
+        s.friction, s.viscous_friction = self.friction, self.viscous_friction
+        s.implicit_damping.zero_()
+        if self._speed_slope is not None:
+            s.effort += self._speed_slope * s.motor_vel
+            s.viscous_friction += self._speed_slope
         stack.run("friction")
         stack.run("transmission")
         torch.clamp(s.friction, min=0.0, out=s.friction)
@@ -315,7 +323,7 @@ class PaceDCMotor:
 
         ``applied_effort``, unless ``holds_line``: then the torque that the line has at standstill.
         """
-        return self.applied_effort if self._speed_slope is None else self._held_effort
+        return self._held_effort
 
     @property
     def joint_armature(self) -> torch.Tensor:
@@ -332,8 +340,15 @@ class PaceDCMotor:
     def joint_viscous_friction(self) -> torch.Tensor:
         """Viscous friction that the simulator is to apply until the next call [N m s/rad], (num_envs, num_joints)."""
         stack = self.effects
-        own = stack.state.viscous_friction if stack is not None and stack.changes_passive else self.viscous_friction
-        return own if self._speed_slope is None else own + self._speed_slope
+        if stack is not None and stack.changes_passive:
+            return stack.state.viscous_friction
+        return self.viscous_friction if self._speed_slope is None else self.viscous_friction + self._speed_slope
+
+    @property
+    def joint_implicit_damping(self) -> torch.Tensor | None:
+        """More viscous friction, which must act on the speed at the end of the step [N m s/rad]; ``None`` if none."""
+        stack = self.effects
+        return stack.state.implicit_damping if stack is not None and stack.changes_passive else None
 
     @property
     def changes_passive(self) -> bool:
@@ -465,7 +480,7 @@ class PaceDCMotor:
         if stack is None or self._step_begun:
             return
         s = stack.state
-        s.joint_pos, s.joint_vel = joint_pos, joint_vel
+        s.joint_pos, s.joint_vel, s.motor_vel = joint_pos, joint_vel, joint_vel
         stack.run("advance")
         self._step_begun = True
 

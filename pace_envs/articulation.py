@@ -9,6 +9,7 @@ import mujoco
 import torch
 
 from pace_actuators import ActuatorActions, PaceDCMotor, match_names, resolve_joint_values
+from pace_actuators.effects import Effect
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.link_model import LinkModel
@@ -86,6 +87,7 @@ class Articulation:
             )
         self._effort = sim.qfrc_applied[:, self._dof_view] if self._side_by_side else None
         self._link_model: LinkModel | None = None
+        self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=torch.float64)
         self._build_actuators()
         self.reset()
 
@@ -197,6 +199,15 @@ class Articulation:
         """Write Coulomb friction [N m], (len(env_ids), len(joint_ids)) or broadcastable."""
         self._write_parameter("friction", "dof_frictionloss", joint_friction_coeff, joint_ids, env_ids)
 
+    def add_body_mass(self, name_keys: str | Sequence[str], mass: float, env_ids: EnvIds = None) -> None:
+        """Add a known mass to bodies, at their centres of mass [kg]; effects on the model do not scale it."""
+        rows, (ids, _) = _indices(env_ids), self.find_bodies(name_keys)
+        _assign(self._added_mass, rows, torch.tensor(ids), self._added_mass[rows][:, ids] + mass)
+        _assign(
+            self._sim.expand("body_mass"), rows, torch.tensor(ids), self._sim.expand("body_mass")[rows][:, ids] + mass
+        )
+        self._sim.constants_changed()
+
     def set_joint_position_target(
         self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
     ) -> None:
@@ -246,8 +257,7 @@ class Articulation:
             if actuator.changes_passive:
                 columns = self._columns_of(actuator)
                 self._sim.qfrc_applied[:, columns] = actuator.held_effort
-                self._sim.expand("dof_frictionloss")[:, columns] = actuator.joint_friction
-                self._sim.expand("dof_damping")[:, columns] = actuator.joint_viscous_friction
+                self._write_friction(actuator, columns)
 
     def update(self) -> None:
         """Read the state after a physics step."""
@@ -256,7 +266,7 @@ class Articulation:
     @property
     def load_effort(self) -> torch.Tensor:
         """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
-        return -self._sim.bind("qfrc_bias")[:, self._dof_columns]
+        return -self._sim.qfrc_bias[:, self._dof_columns]
 
     @property
     def effects(self) -> list[str]:
@@ -302,13 +312,15 @@ class Articulation:
             if actuator.effects is None or effect not in [e.name for e in actuator.effects.effects]:
                 continue
             found = True
+            here = actuator.effects.find(effect)
             own = self._joint_list(actuator)
             pairs = [(own.index(j), k) for k, j in enumerate(wanted) if j in own]
             if pairs:
                 local, chosen = zip(*pairs, strict=True)
-                here = actuator.effects.find(effect)
                 here.set_parameter(parameter, values[here.rows][:, list(chosen)], joints=torch.tensor(local))
             self._write_passive(actuator)
+            if here.overrides("write_model"):
+                self._write_model(actuator, here)
         if not found:
             raise ValueError(f"No drive has the effect {effect!r}. Present: {', '.join(self.effects) or 'none'}.")
 
@@ -319,19 +331,25 @@ class Articulation:
     def _columns_of(self, actuator: PaceDCMotor) -> torch.Tensor:
         return self._dof_columns[actuator.joint_indices]
 
+    def _write_model(self, actuator: PaceDCMotor, effect: Effect) -> None:
+        """Write an effect on the rigid bodies; loads have been written before."""
+        self._link_model = self._link_model or LinkModel(self._sim, self.joint_names, self._added_mass)
+        for local, joint in enumerate(self._joint_list(actuator)):
+            effect.write_model(self._link_model.of(effect.rows, joint), local)
+        self._sim.note_model_effect(effect, self._columns_of(actuator))
+        self._sim.constants_changed()
+
+    def _write_friction(self, actuator: PaceDCMotor, columns: torch.Tensor) -> None:
+        self._sim.write_passive(
+            columns, actuator.joint_friction, actuator.joint_viscous_friction, actuator.joint_implicit_damping
+        )
+
     def _write_passive(self, actuator: PaceDCMotor) -> None:
         """Write what the simulator carries of a drive: rotor inertia, friction, the link's rigid body."""
         actuator.update_effects()
         columns = self._columns_of(actuator)
         self._sim.expand("dof_armature")[:, columns] = actuator.joint_armature
-        self._sim.expand("dof_damping")[:, columns] = actuator.joint_viscous_friction
-        self._sim.expand("dof_frictionloss")[:, columns] = actuator.joint_friction
-        stack = actuator.effects
-        for effect in stack.effects if stack is not None else ():
-            if effect.overrides("write_model"):
-                self._link_model = self._link_model or LinkModel(self._sim, self.joint_names)
-                for local, joint in enumerate(self._joint_list(actuator)):
-                    effect.write_model(self._link_model.of(effect.rows, joint), local)
+        self._write_friction(actuator, columns)
         self._sim.constants_changed()
 
     def _find_joints_in_model(self, model: mujoco.MjModel) -> None:
@@ -402,8 +420,10 @@ class Articulation:
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
-            actuator.holds_line = self._sim.cfg.substeps > 1
-            actuator.centred = actuator.cfg.control_decimation > 1
+            actuator.holds_line = self._sim.cfg.substeps > 1 or actuator.cfg.control_decimation > 1
+            actuator.centred = actuator.cfg.control_decimation > 1 and not self._sim.is_trapezoidal
+            if actuator.effects is not None:
+                actuator.effects.is_trapezoidal = self._sim.is_trapezoidal
             driven = actuator.joint_indices
             self.write_joint_armature_to_sim(actuator.armature, driven)
             self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)

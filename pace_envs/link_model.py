@@ -16,13 +16,15 @@ _FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "
 class LinkModel:
     """The links of a robot as they were when this was made; changes are relative to that."""
 
-    def __init__(self, sim: Simulation, joint_names: Sequence[str]):
+    def __init__(self, sim: Simulation, joint_names: Sequence[str], added_mass: torch.Tensor):
         """Remember the links.
 
         Args:
             sim: The simulation; loads have been written to it already.
             joint_names: The joints, in the order of the articulation.
+            added_mass: What was added to bodies as a known load, (num_envs, nbody) [kg]: it is not scaled.
         """
+        self.added_mass = added_mass.clone()
         self.sim = sim
         self._original = {field: sim.expand(field).clone() for field in _FIELDS}
         model = sim.model
@@ -71,7 +73,9 @@ class Link:
     def scale_mass(self, factor: torch.Tensor) -> None:
         """Multiply mass and inertia of the link, and of all that is fixed to it, by (rows,)."""
         for body in self.model.bodies(self.joint):
-            self._write("body_mass", body, self.model.original("body_mass", self.rows, body) * factor)
+            added = self.model.added_mass[self.rows, body]
+            own = self.model.original("body_mass", self.rows, body) - added
+            self._write("body_mass", body, own * factor + added)
             self._write("body_inertia", body, self.model.original("body_inertia", self.rows, body) * factor[:, None])
 
     def rotate_mass(self, angle: torch.Tensor) -> None:
@@ -107,5 +111,3 @@ def _rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     w, u = q[:, :1], q[:, 1:]
     t = 2 * torch.linalg.cross(u, v.expand_as(u))
     return v + w * t + torch.linalg.cross(u, t)
-
-

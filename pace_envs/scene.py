@@ -59,7 +59,7 @@ class InteractiveScene:
             _add_terrain(spec, cfg.terrain)
         for name, sensor in cfg.contact_sensors.items():
             add_contact_sensor(spec, name, sensor)
-        self.sim = Simulation(sim_cfg, spec, cfg.num_envs)
+        self.sim = (sim_cfg.class_type or Simulation)(sim_cfg, spec, cfg.num_envs)
         self.articulations = {"robot": Articulation(cfg.robot, self.sim)}
         self.sensors = {name: ContactSensor(c, name, self.sim) for name, c in cfg.contact_sensors.items()}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import torch
 from mujoco import batch
+
+from pace_actuators.effects import Effect
 
 EnvIds = Sequence[int] | torch.Tensor | np.ndarray | slice | None
 
@@ -53,9 +55,15 @@ class SimulationCfg:
     num_threads: int = 0
     """Threads of the physics; 0 means one per processor. Results do not depend on it."""
 
+    class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None
+    """What builds the simulation; ``None`` means :class:`Simulation`."""
+
 
 class Simulation:
     """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (float64, no copies)."""
+
+    is_trapezoidal = False
+    """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
         """Compile the model and start the thread pool.
@@ -86,6 +94,7 @@ class Simulation:
         self.qpos = self.bind("qpos")
         self.qvel = self.bind("qvel")
         self.qfrc_applied = self.bind("qfrc_applied")
+        self.qfrc_bias = self.bind("qfrc_bias")
         self._constants_changed = False
 
     def bind(self, field: str) -> torch.Tensor:
@@ -103,6 +112,23 @@ class Simulation:
         Call :meth:`constants_changed` after writing.
         """
         return torch.from_numpy(self.batch.expand(field))
+
+    def write_passive(
+        self, columns: torch.Tensor, friction: torch.Tensor, viscous: torch.Tensor, implicit: torch.Tensor | None
+    ) -> None:
+        """Write what drives leave to the simulation until the next step, (num_envs, len(columns)).
+
+        Args:
+            columns: Degrees of freedom.
+            friction: Coulomb friction [N m].
+            viscous: Viscous friction [N m s/rad].
+            implicit: Viscous friction that must act on the speed at the end of the step [N m s/rad].
+        """
+        self.expand("dof_frictionloss")[:, columns] = friction
+        self.expand("dof_damping")[:, columns] = viscous if implicit is None else viscous + implicit
+
+    def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
+        """Note that an effect has written to the bodies of joints with these degrees of freedom."""
 
     def constants_changed(self) -> None:
         """Note that model fields were written: what derives from them is computed before the next step."""

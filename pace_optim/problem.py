@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -13,6 +13,7 @@ import torch
 
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.dataset import Dataset, make_dataset
 from pace_optim.evaluator import Evaluator
@@ -28,7 +29,10 @@ class Problem:
     """One identification problem."""
 
     task: str
+    plain_cfg: PaceSim2realEnvCfg
+    """The environment before effects and a finer physics step."""
     env_cfg: PaceSim2realEnvCfg
+    """The environment with them."""
     dataset: Dataset
     space: ParameterSpace
     trees: list[list[str]]
@@ -51,11 +55,22 @@ class Problem:
         """The effects whose parameters are identified, as on the command line."""
         return [cfg.label for cfg in effect_cfgs(self.env_cfg.sim2real.effects)]
 
-    def make_env(self, num_envs: int) -> ManagerBasedRLEnv:
-        """Build the environment."""
+    def make_env(self, num_envs: int, simulation: Callable[..., Simulation] | None = None) -> ManagerBasedRLEnv:
+        """Build the environment.
+
+        Args:
+            num_envs: Number of environments.
+            simulation: What builds its simulation; ``None`` keeps the configuration's.
+        """
         cfg = copy.deepcopy(self.env_cfg)
         cfg.scene.num_envs = num_envs
+        cfg.sim.class_type = simulation or cfg.sim.class_type
         return ManagerBasedRLEnv(cfg)
+
+    def with_effects(self, effects: Sequence[EffectCfg | str]) -> Problem:
+        """The same recordings with these effects instead of its own."""
+        cfg = _configured(self.plain_cfg, self.physics_dt, effects)
+        return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""
@@ -95,10 +110,6 @@ def load_problem(
     if delay_mode is not None and delay_mode not in DELAY_MODES:
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
     control_dt = cfg.sim.dt * cfg.decimation
-    if effects:
-        cfg.set_effects(effects)
-    if physics_dt is not None:
-        set_physics_dt(cfg, physics_dt)
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
@@ -116,12 +127,14 @@ def load_problem(
                 f"{drive.max_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
     cfg.scene.num_envs = 1
+    plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     paths = [Path(path) for path in data] or [Path(cfg.sim2real.data_dir)]
     recordings = [_load(path, env, control_dt) for path in paths]
     held_out = [_load(Path(path), env, control_dt) for path in validation]
     problem = Problem(
         task=task,
+        plain_cfg=plain,
         env_cfg=cfg,
         dataset=make_dataset(recordings, held_out),
         space=ParameterSpace.of(cfg.sim2real),
@@ -131,6 +144,16 @@ def load_problem(
     )
     env.close()
     return problem
+
+
+def _configured(
+    plain: PaceSim2realEnvCfg, physics_dt: float | None, effects: Sequence[EffectCfg | str]
+) -> PaceSim2realEnvCfg:
+    cfg = copy.deepcopy(plain)
+    cfg.set_effects(effects)
+    if physics_dt is not None:
+        set_physics_dt(cfg, physics_dt)
+    return cfg
 
 
 def _load(path: Path, env: ManagerBasedRLEnv, control_dt: float) -> Recording:

@@ -120,7 +120,7 @@ class Rollout:
         steps = self.duration_steps
         lag = self._observation_lag(steps)
         if lag is None:
-            yield from enumerate(self._simulated(steps))
+            yield from enumerate(self.simulated(steps))
             return
         # a sample of step k is taken at k - lag: some steps are simulated ahead, some are remembered
         ahead = max(0, math.ceil(-float(lag.min()))) + 2
@@ -128,7 +128,7 @@ class Rollout:
         length = ahead + behind + 1
         seen = torch.zeros(length, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
         rate = (lag[-1] - lag[0]) / max(1, steps - 1)  # lags are linear in time
-        for j, position in enumerate(self._simulated(steps + ahead)):
+        for j, position in enumerate(self.simulated(steps + ahead)):
             seen[j % length] = position
             if j == 0:
                 seen[:] = position
@@ -148,8 +148,8 @@ class Rollout:
                     total[row][:, actuator.joint_indices] = actuator.effects.observation_lag(time) / dt
         return total if found else None
 
-    def _simulated(self, steps: int) -> Iterator[torch.Tensor]:
-        """Sensed positions at every control step."""
+    def simulated(self, steps: int) -> Iterator[torch.Tensor]:
+        """Simulate that many control steps; yields the sensed positions at each, (num_envs, n) [rad]."""
         data, enable = self.dataset, self.dataset.torque_enable
         last = len(data.command) - 1
         for j in range(steps):
@@ -199,9 +199,7 @@ class Rollout:
         if load and apply_load is not None:
             apply_load(self.env, rows, load)
         for body, mass in recording.load.added_mass.items():
-            ids, _ = self.robot.find_bodies(body)
-            self.env.sim.expand("body_mass")[rows, ids] += mass
-            self.env.sim.constants_changed()
+            self.robot.add_body_mass(body, mass, rows)
 
 
 def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:

@@ -148,6 +148,7 @@ def make_problem(
     ]
     problem = Problem(
         task="test",
+        plain_cfg=cfg,
         env_cfg=cfg,
         dataset=make_dataset(conformed[: len(recordings)], conformed[len(recordings) :], train_fraction),
         space=ParameterSpace.of(cfg.sim2real),

@@ -165,7 +165,8 @@ def test_between_control_steps_the_torque_is_held():
         env.sim.step()
         env.scene.update()
         seen.append(robot.data.applied_torque.item())
-    assert len(set(seen[:5])) == 1 and len(set(seen[5:])) == 1 and seen[0] != seen[5]
+    assert len(set(seen[:5])) == 1 and len(set(seen[6:])) == 1 and seen[0] != seen[6]
+    assert seen[5] == pytest.approx(0.5 * (seen[0] + seen[6]))  # a torque acts half a physics step early, else
 
 
 @pytest.mark.parametrize("physics_dt", [0.001, 0.005, 0.0, -0.0025, math.nan, math.inf])

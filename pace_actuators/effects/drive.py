@@ -220,7 +220,7 @@ class TorqueSpeedLimit(Effect):
 
     def drive(self, s: DriveState) -> None:
         """Clip by quadrant."""
-        clipped = clip_effort(s.effort, s.joint_vel, self._stall, self.effort, self.velocity)
+        clipped = clip_effort(s.effort, s.motor_vel, self._stall, self.effort, self.velocity)
         on_the_line = self._on & (clipped != s.effort) & (clipped.abs() < self.effort)
         s.speed_slope = torch.where(on_the_line, self._stall / self.velocity, s.speed_slope)
         s.effort = torch.where(self._on, clipped, s.effort)

@@ -14,9 +14,12 @@ _WRITABLE = (
     "speed_slope",
     "friction",
     "viscous_friction",
+    "implicit_damping",
     "armature",
     "joint_pos",
     "joint_vel",
+    "motor_vel",
+    "motor_effort",
     "load_effort",
     "base_friction",
     "base_viscous_friction",
@@ -37,11 +40,14 @@ class DriveState:
         effort: The torque on its way to the joint [N m].
         speed_slope: How fast a limit in force lets the torque fall with the speed [N m s/rad], ≥ 0.
         friction: Level of Coulomb friction that the simulator is to apply [N m]; it holds a joint that sticks.
-        viscous_friction: What the simulator is to apply [N m s/rad]; it is integrated implicitly.
+        viscous_friction: What the simulator is to apply [N m s/rad].
+        implicit_damping: More of it, which must act on the speed at the end of the step [N m s/rad].
         armature: Rotor inertia that the simulator carries [kg m²].
 
     What effects read:
         joint_pos, joint_vel: True joint position [rad] and speed [rad/s].
+        motor_vel: Speed of the motor at the joint [rad/s]; other than the joint's where the transmission gives way.
+        motor_effort: The motor's torque [N m]; ``effort`` may be split up between a torque and a friction.
         load_effort: Torque of gravity and load on the joint [N m]; zero where the simulator does not give it.
         base_friction, base_viscous_friction, base_armature: The identified base parameters.
         time: Since the session began [s].

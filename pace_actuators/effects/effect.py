@@ -66,6 +66,7 @@ class Effect:
         rows: Which environments it acts on; the others never see it.
         dt: Time between two calls of the drive (the physics step) [s].
         control_dt: Time between two control steps [s].
+        is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
     """
 
     name: ClassVar[str]
@@ -120,6 +121,7 @@ class Effect:
         self.rows = rows
         self.shape = (len(range(*rows.indices(num_envs))), num_joints)
         self.dt, self.control_dt, self.delay_mode = dt, control_dt, delay_mode
+        self.is_trapezoidal = False
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null

@@ -38,7 +38,7 @@ class StribeckFriction(Effect):
 
     def friction(self, s: DriveState) -> None:
         """Raise the level near standstill."""
-        s.friction += self.effort * torch.exp(-((s.joint_vel / self.velocity) ** 2))
+        s.friction += self.effort * torch.exp(-((s.motor_vel / self.velocity) ** 2))
 
 
 @register_effect
@@ -60,7 +60,7 @@ class LoadDependentFriction(Effect):
 
     def friction(self, s: DriveState) -> None:
         """Raise the level with the load."""
-        s.friction += self.coefficient * (s.effort - s.load_effort).abs()
+        s.friction += self.coefficient * (s.motor_effort - s.load_effort).abs()
 
 
 @register_effect
@@ -105,7 +105,7 @@ class QuadraticFriction(Effect):
 
     def friction(self, s: DriveState) -> None:
         """Change the viscous friction, which the simulator integrates implicitly."""
-        s.viscous_friction += self.coefficient * s.joint_vel.abs()
+        s.viscous_friction += self.coefficient * s.motor_vel.abs()
 
 
 @register_effect
@@ -197,6 +197,8 @@ class PreslidingFriction(Effect):
         self._position = s.joint_pos.clone()
         slope = self._sigma * (1 - self._sigma * self._bristle * torch.sign(s.joint_vel) / level).clamp(0.0, 1.0)
         implicit = slope * (0.3 * self.dt)
-        s.effort += torch.where(self._on, implicit * s.joint_vel - self._sigma * self._bristle, 0.0)
-        s.viscous_friction += implicit
+        # towards the mean position of the step: Newmark's average acceleration, as two_mass has it
+        ahead = (-0.25 * self.dt if self.is_trapezoidal else 0.3 * self.dt) * slope
+        s.effort += torch.where(self._on, ahead * s.joint_vel - self._sigma * self._bristle, 0.0)
+        s.implicit_damping += implicit
         s.friction = torch.where(self._on, 0.0, s.friction)

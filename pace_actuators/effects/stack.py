@@ -56,6 +56,7 @@ class EffectStack:
         Raises:
             ValueError: If joints or values do not fit.
         """
+        self._is_trapezoidal = False
         self.state = DriveState.zeros(num_envs, len(joint_names), device, dtype)
         self._joint_names = list(joint_names)
         self._num_envs = num_envs
@@ -90,6 +91,17 @@ class EffectStack:
             effect.overrides("friction") or effect.overrides("transmission") for effect in self.effects
         )
         """Whether the torque of gravity and load must be given."""
+
+    @property
+    def is_trapezoidal(self) -> bool:
+        """Whether the simulator moves positions with the mean of the old and the new speed."""
+        return self._is_trapezoidal
+
+    @is_trapezoidal.setter
+    def is_trapezoidal(self, value: bool) -> None:
+        self._is_trapezoidal = value
+        for effect in self.effects:
+            effect.is_trapezoidal = value
 
     def has(self, stage: str) -> bool:
         """Whether an effect acts at a stage."""

@@ -6,8 +6,9 @@ The simulator keeps the link; the effect keeps the motor (angle θ, armature J, 
 
 Both are integrated together with Newmark's average acceleration: with v the link's speed and ₊ the next step,
 
-    f = f_e + K (θ̇₊ - v₊)    f_e = k δ + (c/2 - k h/4)(θ̇ - v)    K = k h/4 + c/2
+    f = f_e + K (θ̇₊ - v₊)    f_e = k δ + (c/2 ∓ k h/4)(θ̇ - v)    K = k h/4 + c/2
 
+(- where the simulator moves positions with the new speed, + where it moves them with the mean of old and new).
 The motor's equation gives θ̇₊ as a function of v₊, so that f = f₀ - D v₊: the link gets the torque f₀, and D as
 viscous friction, which the simulator integrates implicitly. No stiffness is too large for the step, whatever the
 link's inertia; for k -> ∞, D -> J/h, which is the rigid drive's armature.
@@ -91,12 +92,14 @@ class _TwoMass(Effect):
         speed = (self._drive + self._coupling * s.joint_vel) / total
         # friction brakes, it does not push; 0 in direction: the motor stuck
         speed = torch.where(speed * self._direction > 0, speed, 0.0)
+        moving = 0.5 * (self._speed + speed) if self.is_trapezoidal else speed
+        self._angle = self._angle + self.dt * moving
         self._speed = speed
-        self._angle = self._angle + self.dt * speed
         if bool(self._fresh.any()):
             self._angle = torch.where(self._fresh, s.joint_pos + self.rest_deflection(s), self._angle)
             self._speed = torch.where(self._fresh, s.joint_vel, self._speed)
             self._fresh[:] = False
+        s.motor_vel = torch.where(self._on, self._speed, s.joint_vel)
 
     def measurement(self, s: DriveState) -> None:
         """An encoder on the motor sees the motor."""
@@ -117,10 +120,12 @@ class _TwoMass(Effect):
         torque = torque - k * (0.5 * h * relative)  # looked ahead for contact only
         c = self.damping_of(k, s) + (_NUMERICAL_DAMPING * h) * k
         coupling = 0.25 * h * k + 0.5 * c
-        explicit = torque + (0.5 * c - 0.25 * h * k) * relative
+        ahead = (0.25 if self.is_trapezoidal else -0.25) * h * k
+        explicit = torque + (0.5 * c + ahead) * relative
         momentum = s.base_armature.clamp(min=_SMALLEST_ARMATURE) / h
-        inertia = momentum + s.viscous_friction
-        push = momentum * self._speed + s.effort - explicit
+        drag = 0.5 * s.viscous_friction
+        inertia = momentum + drag
+        push = (momentum - drag) * self._speed + s.effort - explicit
         free = push + coupling * s.joint_vel
         stuck = free.abs() <= s.friction
         direction = torch.where(stuck, 0.0, torch.sign(free))
@@ -130,7 +135,8 @@ class _TwoMass(Effect):
         on = self._on
         self._drive, self._coupling, self._inertia, self._direction = push, coupling, inertia, direction
         s.effort = torch.where(on, explicit + share * push, s.effort)
-        s.viscous_friction = torch.where(on, coupling * (1 - share), s.viscous_friction)
+        s.viscous_friction = torch.where(on, 0.0, s.viscous_friction)
+        s.implicit_damping = torch.where(on, coupling * (1 - share), s.implicit_damping)
         s.friction = torch.where(on, 0.0, s.friction)
 
 
@@ -189,6 +195,7 @@ class Backlash(_TwoMass):
         EffectParameter(
             name="stiffness", unit="N m/rad", lower=300.0, upper=2e4, null=None, start=5000.0, scale="log", meaning="k"
         ),
+        EffectParameter(name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=5.0, meaning="c"),
         _SIDE,
     )
     equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"
@@ -198,7 +205,7 @@ class Backlash(_TwoMass):
     separates = "several amplitudes, and a 1.5 times larger proportional gain"
     gap: torch.Tensor
     stiffness: torch.Tensor
-    _DAMPING_RATIO = 0.3
+    damping: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where there is a gap."""
@@ -211,8 +218,8 @@ class Backlash(_TwoMass):
         return k * torch.sign(deflection) * beyond, k
 
     def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
-        """Of a contact that bounces little, c = 2 ζ √(k J)."""
-        return 2 * self._DAMPING_RATIO * torch.sqrt(stiffness * s.base_armature)
+        """Only in contact."""
+        return torch.where(stiffness > 0, self.damping, 0.0)
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """-τ_g / k beyond the gap, on the side that the load presses on."""

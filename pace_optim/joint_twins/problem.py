@@ -1,0 +1,57 @@
+"""The identification problem with joints simulated alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+
+from pace_actuators.effects import EffectCfg
+from pace_envs import ManagerBasedRLEnv
+from pace_optim.dataset import Dataset
+from pace_optim.evaluator import Evaluator
+from pace_optim.joint_twins.path import ReferencePath
+from pace_optim.joint_twins.simulation import TwinSimulation
+from pace_optim.problem import Problem
+
+
+@dataclass(kw_only=True, eq=False)
+class TwinProblem(Problem):
+    """A problem whose joints are simulated alone along a path; each is a tree of its own."""
+
+    path: ReferencePath
+    """Of the same recordings."""
+
+    def evaluator(self) -> Evaluator:
+        """An evaluator of candidates on all recordings."""
+        return self._evaluator(self.dataset, self.path)
+
+    def training_evaluator(self) -> Evaluator:
+        """An evaluator of candidates on the recordings that are trained on."""
+        trained = self.dataset.trained()
+        return self._evaluator(self.dataset.select(trained), self.path.select(trained))
+
+    def with_effects(self, effects: Sequence[EffectCfg | str]) -> TwinProblem:
+        """The same with these effects instead of its own."""
+        return _with_path(super().with_effects(effects), self.path)
+
+    def _evaluator(self, dataset: Dataset, path: ReferencePath) -> Evaluator:
+        def make_env(num_envs: int) -> ManagerBasedRLEnv:
+            return self.make_env(num_envs, simulation=partial(TwinSimulation, path=path))
+
+        return Evaluator(make_env, dataset, self.space)
+
+
+def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:
+    """The same recordings and parameters, each joint a tree of its own.
+
+    Args:
+        problem: The problem of the whole robot.
+        path: A reference simulation on the same recordings.
+    """
+    return _with_path(problem, path)
+
+
+def _with_path(problem: Problem, path: ReferencePath) -> TwinProblem:
+    content = {field.name: getattr(problem, field.name) for field in fields(Problem)}
+    return TwinProblem(**{**content, "trees": [[name] for name in problem.joint_names]}, path=path)
