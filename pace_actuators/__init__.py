@@ -6,6 +6,7 @@ Needs torch alone.
 from pace_actuators.actions import ActuatorActions
 from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.identified import IdentifiedAt, IdentifiedDrives
 from pace_actuators.joint_values import JointValue, match_names, resolve_joint_values
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -13,6 +14,8 @@ from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 __all__ = [
     "ActuatorActions",
     "DelayBuffer",
+    "IdentifiedAt",
+    "IdentifiedDrives",
     "JointValue",
     "PaceDCMotor",
     "PaceDCMotorCfg",

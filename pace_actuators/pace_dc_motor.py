@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
+from pace_actuators.identified import delay_in_steps, step_notes
 from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
@@ -157,12 +159,15 @@ class PaceDCMotor:
         self.computed_effort = torch.zeros_like(self.stiffness)
         self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
         delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
+        delay, max_delay = delay_in_steps(cfg, cfg.physics_dt or physics_dt)
+        for note in step_notes(cfg, cfg.physics_dt or physics_dt):
+            warnings.warn(note, stacklevel=2)
         self._delay_buffers = {
-            name: DelayBuffer(cfg.max_delay, num_envs, self._device, cfg.delay_interpolation) for name in delayed
+            name: DelayBuffer(max_delay, num_envs, self._device, cfg.delay_interpolation) for name in delayed
         }
         self._silent: set[str] = set()  # commands that were not given at the last control step
         self._calls_until_control = 0
-        self.update_time_lags(cfg.delay)
+        self.update_time_lags(delay)
         self.effects = self._make_effects(cfg.physics_dt or physics_dt)
         self.update_effects()
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from pace_actuators.effects import EffectCfg
 from pace_actuators.joint_values import JointValue
 
 if TYPE_CHECKING:
+    from pace_actuators.identified import IdentifiedAt
     from pace_actuators.pace_dc_motor import PaceDCMotor
 
 DelayMode = Literal["command", "effort"]
@@ -59,6 +61,9 @@ class PaceDCMotorCfg:
     delay: float = 0.0
     """Delay of every environment at the start [control steps], from 0 to ``max_delay``."""
 
+    delay_s: float | None = None
+    """Delay [s] in place of ``delay``: the drive converts it to its own control steps, and raises ``max_delay``."""
+
     max_delay: float = 10.0
     """Largest delay that can be set later [control steps]."""
 
@@ -76,3 +81,28 @@ class PaceDCMotorCfg:
 
     physics_dt: float | None = None
     """Time between two calls of ``compute`` [s]; effects need it, an environment gives its own."""
+
+    identified: IdentifiedAt | None = None
+    """Time steps of the identification that the values come from: the drive warns where its own are too different."""
+
+    @classmethod
+    def from_result(
+        cls, path: str | Path, joint_names_expr: str | Sequence[str] | None = None, **overrides: Any
+    ) -> PaceDCMotorCfg:
+        """The drive that a fit identified.
+
+        Sets armature, viscous and Coulomb friction, encoder bias, delay (in seconds), delay mode and every effect; and
+        the gains and limits that were in force in all recordings, where the result says them.
+
+        Args:
+            path: ``result.json``, or the run's folder.
+            joint_names_expr: Which of its joints; ``None`` means all.
+            overrides: Further fields, such as ``stiffness`` of the policy's controller; they win.
+
+        Raises:
+            ValueError: If the file is missing or unusable, names no such joint, or holds an unknown effect.
+        """
+        from pace_actuators.identified import IdentifiedDrives
+
+        drives = IdentifiedDrives.load(path)
+        return cls(**drives.cfg_fields(joint_names_expr) | overrides)

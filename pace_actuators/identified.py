@@ -1,0 +1,275 @@
+"""What an identification found, as drives of another environment: reading ``result.json``, and what its steps mean.
+
+Delays travel in seconds, because a control step is another time in every environment.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pace_actuators.effects import EffectCfg
+from pace_actuators.joint_values import match_names
+
+if TYPE_CHECKING:
+    from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+
+VERSION = 1
+ALL = "all"
+"""Key of a value that all joints share."""
+
+BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
+"""Parameters of the base model per joint, named as in ``PaceDCMotorCfg``."""
+
+DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+"""Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
+
+_FARTHEST = 2.0
+"""Ratio of two physics steps from where on the values are called into question."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifiedAt:
+    """Time steps of an identification."""
+
+    control_dt: float
+    """Time between two control steps [s]."""
+
+    physics_dt: float
+    """Time between two physics steps [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifiedDrives:
+    """The content of ``result.json`` that a drive needs."""
+
+    path: Path
+    """Where it was read."""
+
+    task: str
+    """The environment of the identification."""
+
+    joint_names: tuple[str, ...]
+    """The joints, in order."""
+
+    delay_mode: str
+    """What the delay delays, ``"command"`` or ``"effort"``."""
+
+    delay_s: float
+    """Delay [s]."""
+
+    at: IdentifiedAt
+    """Time steps of the identification."""
+
+    parameters: Mapping[str, Mapping[str, float]]
+    """Value by parameter and joint (or ``"all"``), in the units of ``units``."""
+
+    std: Mapping[str, Mapping[str, float | None]]
+    """Standard deviations of the same shape; ``None`` where there is none."""
+
+    correlation: Mapping[str, Any]
+    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
+
+    effects: tuple[EffectCfg, ...]
+    """The effects, without values."""
+
+    drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Gains and limits per joint that were in force in every recording, as far as known."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> IdentifiedDrives:
+        """Read ``result.json``, or that of a run's folder.
+
+        Raises:
+            ValueError: If it is missing, damaged, of another version, or holds an unknown effect.
+        """
+        path = Path(path)
+        path = path / "result.json" if path.is_dir() else path
+        if not path.is_file():
+            raise ValueError(f"{path} does not exist. Name a run's folder or its result.json.")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is no JSON ({error}). Name the result.json of a fit.") from None
+        if not isinstance(content, dict) or content.get("version") != VERSION:
+            raise ValueError(f"{path} is no fit result of version {VERSION}. Fit again with this version.")
+        try:
+            parameters = content["parameters"]
+            physics_dt, delay_s = float(content["physics_dt"]), float(content["delay_s"])
+            control_dt = float(content.get("control_dt") or _control_dt(parameters, delay_s, physics_dt))
+            result = cls(
+                path=path,
+                task=content["task"],
+                joint_names=tuple(content["joint_names"]),
+                delay_mode=content["delay_mode"],
+                delay_s=delay_s,
+                at=IdentifiedAt(control_dt=control_dt, physics_dt=physics_dt),
+                parameters=parameters,
+                std=content.get("std") or {},
+                correlation=content.get("correlation") or {},
+                effects=tuple(_parsed(path, label) for label in content["effects"]),
+                drive=content.get("drive") or {},
+            )
+            result._check()
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"{path} is no complete fit result ({type(error).__name__}: {error}). Fit again."
+            ) from None
+        return result
+
+    def values(self, name: str, joints: Sequence[str]) -> dict[str, float]:
+        """Value per joint of a parameter, for those of some joints that have one."""
+        entries = self.parameters[name]
+        if ALL in entries:
+            return dict.fromkeys(joints, float(entries[ALL]))
+        return {joint: float(entries[joint]) for joint in joints if joint in entries}
+
+    def find_joints(self, joint_names_expr: str | Sequence[str] | None) -> list[str]:
+        """Its joints that match, in order; all for ``None``.
+
+        Raises:
+            ValueError: If an expression matches none.
+        """
+        if joint_names_expr is None:
+            return list(self.joint_names)
+        found = {i for group in match_names(joint_names_expr, self.joint_names) for i in group}
+        return [name for i, name in enumerate(self.joint_names) if i in found]
+
+    def cfg_fields(self, joint_names_expr: str | Sequence[str] | None = None) -> dict[str, Any]:
+        """Fields of a ``PaceDCMotorCfg`` of some joints.
+
+        Args:
+            joint_names_expr: Which joints; ``None`` means all.
+
+        Raises:
+            ValueError: If an expression matches no joint.
+        """
+        joints = self.find_joints(joint_names_expr)
+        fields: dict[str, Any] = {
+            "joint_names_expr": tuple(re.escape(joint) for joint in joints),
+            "delay_s": self.delay_s,
+            "delay_mode": self.delay_mode,
+            "identified": self.at,
+            "effects": tuple(self._effects_of(joints)),
+        }
+        for name in BASE_FIELDS:
+            fields[name] = _by_pattern(self.values(name, joints))
+        for name in DRIVE_FIELDS:
+            known = self.drive.get(name) or {}
+            if all(joint in known for joint in joints):
+                fields[name] = _by_pattern({joint: float(known[joint]) for joint in joints})
+        return fields
+
+    def _effects_of(self, joints: Sequence[str]) -> list[EffectCfg]:
+        """The effects with their values on those of some joints that have them."""
+        result = []
+        for cfg in self.effects:
+            own = [joint for joint in cfg.joints(self.joint_names) if joint in joints]
+            if own:
+                name = cfg.effect_class.name
+                values = {
+                    p.name: _by_pattern(self.values(f"{name}.{p.name}", own)) for p in cfg.effect_class.parameters
+                }
+                patterns = tuple(re.escape(joint) for joint in own)
+                result.append(replace(cfg, joint_names_expr=patterns, values=values))
+        return result
+
+    def _check(self) -> None:
+        if self.delay_mode not in ("command", "effort"):
+            raise ValueError(f"{self.path}: delay_mode is {self.delay_mode!r}, expected 'command' or 'effort'.")
+        expected = {name: self.joint_names for name in BASE_FIELDS}
+        for cfg in self.effects:
+            for parameter in cfg.effect_class.parameters:
+                expected[f"{cfg.effect_class.name}.{parameter.name}"] = tuple(cfg.joints(self.joint_names))
+        for name, joints in expected.items():
+            known = self.values(name, joints)
+            if missing := [joint for joint in joints if joint not in known]:
+                raise ValueError(f"{self.path}: {name} has no value for {', '.join(missing)}. Fit again.")
+            if bad := [joint for joint, value in known.items() if not math.isfinite(value)]:
+                raise ValueError(f"{self.path}: {name} of {bad[0]} is {known[bad[0]]}, expected a finite number.")
+        if not (math.isfinite(self.delay_s) and self.delay_s >= 0 and self.at.control_dt > 0 < self.at.physics_dt):
+            raise ValueError(f"{self.path}: delay_s, control_dt and physics_dt must be finite and > 0. Fit again.")
+
+
+def delay_in_steps(cfg: PaceDCMotorCfg, physics_dt: float | None) -> tuple[float, float]:
+    """Delay and largest delay of a drive [control steps].
+
+    Args:
+        cfg: The drive.
+        physics_dt: Time between two of its calls [s].
+
+    Raises:
+        ValueError: If the delay is given in seconds, and the time of a step is not known.
+    """
+    if cfg.delay_s is None:
+        return cfg.delay, cfg.max_delay
+    if physics_dt is None:
+        raise ValueError(
+            f"The delay is given in seconds (delay_s = {cfg.delay_s:g}), and the time between two calls is not known: "
+            "set physics_dt [s] in the actuator's configuration."
+        )
+    steps = round(cfg.delay_s / (physics_dt * cfg.control_decimation), 9)
+    return steps, max(cfg.max_delay, math.ceil(steps))
+
+
+def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
+    """What the time steps of a drive change about values that were identified with others, in words.
+
+    Args:
+        cfg: The drive.
+        physics_dt: Time between two of its calls [s]; ``None`` says nothing.
+    """
+    if cfg.identified is None or physics_dt is None:
+        return []
+    notes, at, control_dt = [], cfg.identified, physics_dt * cfg.control_decimation
+    if cfg.delay_s is not None:
+        steps, delay = delay_in_steps(cfg, physics_dt)[0], f"{1e3 * cfg.delay_s:.3g} ms"
+        whole = abs(steps - round(steps)) < 1e-6
+        if cfg.delay_interpolation == "hold" and not whole:
+            notes.append(
+                f"The delay of {delay} is {steps:.3g} control steps, and delay_interpolation 'hold' makes it "
+                f"{math.ceil(steps)} ({1e3 * math.ceil(steps) * control_dt:.3g} ms)."
+            )
+        elif not whole and control_dt > at.control_dt * (1 + 1e-6):
+            notes.append(
+                f"The delay of {delay} is {steps:.3g} control steps of {1e3 * control_dt:g} ms. Between steps it is a "
+                f"linear mix of two samples, which smooths more than at the {1e3 * at.control_dt:g} ms of the "
+                "identification. Train at that step for the identified delay."
+            )
+        if steps > cfg.max_delay:
+            notes.append(
+                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.max_delay:g}: it was "
+                f"raised to {math.ceil(steps)}."
+            )
+    ratio = max(physics_dt / at.physics_dt, at.physics_dt / physics_dt)
+    if ratio > _FARTHEST * (1 + 1e-6):
+        notes.append(
+            f"The drive was identified with physics steps of {1e3 * at.physics_dt:g} ms, which are "
+            f"{1e3 * physics_dt:g} ms here. The errors of the step went into its values: identify again with steps "
+            "nearer to these, or replay the recording here to see what it costs (scripts/play.py --replay)."
+        )
+    return notes
+
+
+def _parsed(path: Path, label: str) -> EffectCfg:
+    try:
+        return EffectCfg.parse(label)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error} Import the module that registers it before reading the result.") from None
+
+
+def _by_pattern(values: Mapping[str, float]) -> dict[str, float] | float:
+    """By regular expression of the joint; one number where all are alike."""
+    alike = set(values.values())
+    return alike.pop() if len(alike) == 1 else {re.escape(joint): value for joint, value in values.items()}
+
+
+def _control_dt(parameters: Mapping[str, Mapping[str, float]], delay_s: float, physics_dt: float) -> float:
+    """What a result without it implies."""
+    delay = parameters["delay"][ALL]
+    return delay_s / delay if delay else physics_dt
