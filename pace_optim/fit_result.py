@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from pace_actuators import match_names, resolve_joint_values
+from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.atomic import write_json
 from pace_optim.evaluator import Residuals
 from pace_optim.parameter_space import ParameterSpace
@@ -50,6 +52,7 @@ class FitResult:
     stop_reasons: list[str]
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    drive: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write the file atomically."""
@@ -99,6 +102,26 @@ def correlation_matrix(space: ParameterSpace, uncertainty: Uncertainty) -> dict[
     return {"labels": list(space.labels), "matrix": rows}
 
 
+def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
+    """Gains and limits per joint that were in force in every recording; one that differed is left out."""
+    joints, found = list(problem.joint_names), {}
+    recordings = problem.dataset.recordings
+    for name in DRIVE_FIELDS:
+        configured: dict[str, float] = {}
+        for cfg in problem.env_cfg.scene.robot.actuators.values():
+            own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
+            if (value := getattr(cfg, name)) is not None:
+                configured |= dict(zip(own, resolve_joint_values(value, own, field=name).tolist(), strict=True))
+        stated = [getattr(recording.drive, name) for recording in recordings]
+        values = {
+            joint: {float(each[i]) if each is not None else configured.get(joint) for each in stated}
+            for i, joint in enumerate(joints)
+        }
+        known = {joint: next(iter(each)) for joint, each in values.items() if len(each) == 1}
+        found[name] = {j: v for j, v in known.items() if v is not None and math.isfinite(v)}
+    return {name: values for name, values in found.items() if values}
+
+
 def make_result(
     problem: Problem,
     x: torch.Tensor,
@@ -141,5 +164,6 @@ def make_result(
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
         notes=[f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
+        drive=drive_in_force(problem),
         **facts,
     )

@@ -6,6 +6,7 @@ from pace_envs.mdp.contact_rewards import feet_air_time, feet_slide, undesired_c
 from pace_envs.mdp.curriculums import command_range_by_tracking
 from pace_envs.mdp.energy import electrical_power, motor_power
 from pace_envs.mdp.events import push_by_setting_velocity, reset_joints_by_offset, reset_root_state_uniform
+from pace_envs.mdp.identified import randomize_identified_drives
 from pace_envs.mdp.observations import (
     base_ang_vel,
     base_lin_vel,
@@ -72,6 +73,7 @@ __all__ = [
     "push_by_setting_velocity",
     "randomize_body_mass",
     "randomize_friction",
+    "randomize_identified_drives",
     "reset_joints_by_offset",
     "reset_root_state_uniform",
     "root_height_below_minimum",

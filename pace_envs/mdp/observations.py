@@ -28,9 +28,9 @@ def joint_pos_rel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> t
 
 
 def encoder_pos_rel(env: ManagerBasedEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
-    """What the drives' encoders show relative to the defaults, q - bias - q_default [rad]."""
+    """What the drives' encoders show relative to the defaults, q - bias - q_default without effects [rad]."""
     robot = env.scene[asset_cfg.name]
-    position = robot.data.joint_pos - robot.data.default_joint_pos
+    position = robot.sensed_joint_pos() - robot.data.default_joint_pos
     for actuator in robot.actuators.values():
         position[:, actuator.joint_indices] -= actuator.encoder_bias
     return position[:, asset_cfg.joint_ids]

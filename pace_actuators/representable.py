@@ -1,0 +1,69 @@
+"""What of an identified drive another world can hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pace_actuators.identified import IdentifiedDrives
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """What a simulator offers to drives."""
+
+    name: str
+    """What it is called in messages."""
+
+    bodies: bool = True
+    """Whether a drive can change the rigid body that its joint moves."""
+
+    friction_per_step: bool = True
+    """Whether a drive can change the joint's friction at every physics step."""
+
+    friction_hook: str = ""
+    """What the user must add for that, in words; empty if nothing."""
+
+
+HERE = World(name="the environments of pace_envs")
+MJLAB = World(
+    name="mjlab",
+    bodies=False,
+    friction_hook="add events['drive_friction'] = drive_friction_event() of pace_actuators.mjlab to the environment",
+)
+ISAACLAB = World(
+    name="Isaac Lab",
+    bodies=False,
+    friction_hook="set ArticulationCfg.class_type to a class of DriveFrictionMixin (pace_actuators.isaaclab) and "
+    "isaaclab.assets.Articulation; it copies friction to the CPU at every physics step, which is slow",
+)
+
+
+def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[str]:
+    """What a world cannot represent of identified drives, or only with help, in words.
+
+    Args:
+        drives: What was identified.
+        world: Where it is to be used.
+
+    Raises:
+        ValueError: If an effect changes friction at every step, and the world has no way to do so.
+    """
+    notes = []
+    for cfg in drives.effects:
+        kind = cfg.effect_class
+        if kind.stage == "recording":
+            notes.append(f"{kind.name} is about the recording's time stamps: it has no influence on a policy.")
+        if kind.overrides("write_model") and not world.bodies:
+            notes.append(
+                f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
+                "use the model that scripts/export.py --format mjcf writes, which has it."
+            )
+        if kind.overrides("friction") or kind.overrides("transmission"):
+            if not world.friction_per_step:
+                raise ValueError(
+                    f"{kind.name} changes the joint's friction at every physics step, which {world.name} cannot do. "
+                    "Fit again without it, or train elsewhere."
+                )
+            if world.friction_hook:
+                notes.append(f"{kind.name} changes the joint's friction at every physics step: {world.friction_hook}.")
+    return notes

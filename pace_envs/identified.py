@@ -1,0 +1,92 @@
+"""Putting identified drives into an environment's robot."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names
+from pace_actuators.effects import effect_cfgs
+from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.representable import HERE, check_representable
+from pace_envs import mdp
+from pace_envs.articulation import load_robot_spec
+from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.manager_based_env import ManagerBasedEnvCfg
+from pace_envs.managers import EventTermCfg
+
+_DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def use_identified(
+    cfg: ManagerBasedEnvCfg, path: str | Path, *, randomize_std: float | None = None, gains: bool = False
+) -> list[str]:
+    """Give the robot of an environment the drives that a fit identified.
+
+    Armature, frictions, encoder bias, delay, delay mode and effects become the identified ones. Gains and limits stay
+    the environment's: they are the policy's controller.
+
+    Args:
+        cfg: The environment; it is changed.
+        path: ``result.json``, or the run's folder.
+        randomize_std: Draw every environment's drives with this many standard deviations around the identified values;
+            ``None`` does not.
+        gains: Also take over the gains and limits of the recordings, as far as the result says them.
+
+    Returns:
+        What the environment cannot represent, in words.
+
+    Raises:
+        ValueError: If the result is unusable, or its joints are not the robot's.
+    """
+    drives = IdentifiedDrives.load(path)
+    notes = check_representable(drives, HERE)
+    cfg.scene.robot.actuators = _identified_groups(cfg.scene.robot, drives, gains)
+    if randomize_std is not None:
+        cfg.events = {
+            **cfg.events,
+            "identified_drives": EventTermCfg(
+                func=mdp.randomize_identified_drives,
+                mode="startup",
+                params={"drives": drives, "scale": randomize_std},
+            ),
+        }
+    return notes
+
+
+def _identified_groups(robot: ArticulationCfg, drives: IdentifiedDrives, gains: bool) -> dict[str, PaceDCMotorCfg]:
+    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
+    result, used = {}, set()
+    for group, drive in robot.actuators.items():
+        own = [names[i] for found in match_names(drive.joint_names_expr, names) for i in found]
+        identified = [joint for joint in drives.joint_names if joint in own]
+        if not identified:
+            result[group] = drive
+            continue
+        if missing := [joint for joint in own if joint not in identified]:
+            raise ValueError(
+                f"{drives.path} has no values for {', '.join(missing)} of the actuator group {group!r}. Put joints "
+                "that were not identified into a group of their own."
+            )
+        used |= set(identified)
+        result[group] = _merged(drive, drives, identified, gains)
+    if left := [joint for joint in drives.joint_names if joint not in used]:
+        raise ValueError(
+            f"{drives.path} is of another robot: it has {', '.join(left)}, and the robot has {', '.join(names)}. "
+            "Use the result of a fit of this robot."
+        )
+    return result
+
+
+def _merged(drive: PaceDCMotorCfg, drives: IdentifiedDrives, joints: list[str], gains: bool) -> PaceDCMotorCfg:
+    fields: dict[str, Any] = drives.cfg_fields([re.escape(joint) for joint in joints])
+    del fields["joint_names_expr"]
+    if not gains:
+        fields = {name: value for name, value in fields.items() if name not in DRIVE_FIELDS}
+    found = {effect.effect_class.name for effect in fields["effects"]}
+    kept = [effect for effect in effect_cfgs(drive.effects) if effect.effect_class.name not in found]
+    return replace(drive, **fields | {"delay": 0.0, "effects": (*kept, *fields["effects"])})

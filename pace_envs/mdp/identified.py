@@ -1,0 +1,84 @@
+"""Events that vary identified drives: ``(env, env_ids, **params)``, at startup."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_actuators import IdentifiedDrives
+from pace_actuators.identified import ALL, BASE_FIELDS, delay_in_steps
+from pace_actuators.identified_draws import draw, in_control_steps, labels_with_std
+from pace_envs.managers import SceneEntityCfg
+
+if TYPE_CHECKING:
+    from pace_envs.articulation import Articulation
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+_ROBOT = SceneEntityCfg()
+
+
+def randomize_identified_drives(
+    env: ManagerBasedEnv,
+    env_ids: torch.Tensor,
+    drives: IdentifiedDrives,
+    scale: float = 1.0,
+    asset_cfg: SceneEntityCfg = _ROBOT,
+) -> None:
+    """Draw each environment's drives around the identified ones, by their error bars and correlations.
+
+    Args:
+        env: The environment; its robot has the identified drives.
+        env_ids: All environments.
+        drives: What was identified.
+        scale: Multiplies the standard deviations.
+        asset_cfg: The robot.
+
+    Raises:
+        ValueError: If it is not run for all environments at once (mode ``"startup"``).
+    """
+    if len(env_ids) != env.num_envs:
+        raise ValueError("randomize_identified_drives draws all environments at once: use mode 'startup'.")
+    robot = env.scene[asset_cfg.name]
+    column = {name: i for i, name in enumerate(robot.joint_names)}
+    drawn = draw(drives, env.uniform((env.num_envs, len(labels_with_std(drives)))), scale)
+    for name, entries in drawn.items():
+        joints = _joints_of(drives, name) if ALL in entries else list(entries)
+        ids = [column[joint] for joint in joints]
+        values = torch.stack([entries[ALL if ALL in entries else joint] for joint in joints], dim=1)
+        if name == "armature":
+            robot.write_joint_armature_to_sim(values, ids)
+        elif name == "friction":
+            robot.write_joint_friction_coefficient_to_sim(values, ids)
+        elif name == "viscous_friction":
+            robot.write_joint_viscous_friction_coefficient_to_sim(values, ids)
+        elif name in (*BASE_FIELDS, "delay"):
+            _write_to_drives(env, robot, name, values, ids, drives)
+        else:
+            effect, _, parameter = name.partition(".")
+            robot.write_effect_parameter_to_sim(effect, parameter, values, ids)
+
+
+def _joints_of(drives: IdentifiedDrives, name: str) -> list[str]:
+    """The joints that share a parameter."""
+    for cfg in drives.effects:
+        if cfg.effect_class.name == name.partition(".")[0]:
+            return cfg.joints(drives.joint_names)
+    return list(drives.joint_names)
+
+
+def _write_to_drives(
+    env: ManagerBasedEnv, robot: Articulation, name: str, values: torch.Tensor, ids: list[int], drives: IdentifiedDrives
+) -> None:
+    whole = torch.full((env.num_envs, robot.num_joints), torch.nan, dtype=torch.float64)
+    whole[:, ids] = values
+    for actuator in robot.actuators.values():
+        own = whole[:, actuator.joint_indices]
+        if bool(own.isnan().all()):
+            continue
+        if name == "encoder_bias":
+            actuator.update_encoder_bias(torch.where(own.isnan(), actuator.encoder_bias, own))
+        else:
+            dt = env.cfg.sim.dt
+            steps = in_control_steps(drives, own[:, :1], dt * actuator.cfg.control_decimation)
+            actuator.update_time_lags(steps.clamp(max=delay_in_steps(actuator.cfg, dt)[1]))
