@@ -58,6 +58,44 @@ def use_identified(
     return notes
 
 
+def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
+    """Let physics and drives of an environment run at another time step; the policy keeps its rate.
+
+    Args:
+        cfg: The environment; it is changed.
+        dt: Time step [s].
+
+    Raises:
+        ValueError: If the time of an environment step is no multiple of it.
+    """
+    step_dt = cfg.sim.dt * cfg.decimation
+    decimation = round(step_dt / dt) if dt > 0 else 0
+    if decimation < 1 or abs(decimation * dt - step_dt) > 1e-9:
+        raise ValueError(
+            f"The time step is {dt:g} s, expected a whole fraction of the environment's step of {step_dt:g} s, such as "
+            f"{step_dt / 8:g}."
+        )
+    cfg.sim.dt, cfg.decimation = dt, decimation
+
+
+def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None:
+    """Let physics and drives run at the control step of an identification: its values hold the errors of that step.
+
+    Args:
+        cfg: The environment; it is changed, unless its step is as fine already, or no multiple of that step.
+        path: ``result.json``, or the run's folder.
+
+    Returns:
+        What was changed, in words.
+    """
+    dt, before = IdentifiedDrives.load(path).at.control_dt, cfg.sim.dt
+    whole = cfg.sim.dt * cfg.decimation / dt
+    if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
+        return None
+    set_step(cfg, dt)
+    return f"physics and drives run at {1e3 * dt:g} ms, as in the identification, not at {1e3 * before:g} ms"
+
+
 def _identified_groups(robot: ArticulationCfg, drives: IdentifiedDrives, gains: bool) -> dict[str, PaceDCMotorCfg]:
     names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
     result, used = {}, set()

@@ -22,6 +22,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--reward", default="velocity", help="reward set: velocity (default) or energy")
     parser.add_argument("--randomize", action="store_true", help="train with pushes, over many frictions and loads")
+    parser.add_argument("--identified", metavar="FILE", help="train with the drives of this fit: its result.json")
+    parser.add_argument(
+        "--randomize_identified", type=float, metavar="K", help="drives within K of their error bars (usually 1)"
+    )
+    parser.add_argument("--physics_dt", type=float, metavar="S", help="step of physics and drives (default: the fit's)")
     parser.add_argument("--log_dir", default="logs/rsl_rl", metavar="DIR", help="where runs are kept")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted or finished run")
     args = vars(parser.parse_args())

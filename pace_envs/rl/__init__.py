@@ -5,7 +5,7 @@ from pace_envs.rl.export import export_policy
 from pace_envs.rl.playing import PlaySettings, play
 from pace_envs.rl.run_folder import RunSettings, latest_checkpoint
 from pace_envs.rl.runner import PaceOnPolicyRunner
-from pace_envs.rl.training import make_env, resume, train
+from pace_envs.rl.training import load_cfg, make_env, resume, train
 
 __all__ = [
     "Evaluation",
@@ -15,6 +15,7 @@ __all__ = [
     "evaluate",
     "export_policy",
     "latest_checkpoint",
+    "load_cfg",
     "make_env",
     "play",
     "resume",

@@ -45,6 +45,9 @@ class PlaySettings:
     command: tuple[float, float, float] | None = None
     """One command for all: forward, left [m/s], yaw rate [rad/s]; ``None`` draws them as in training."""
 
+    identified: str | None = None
+    """A fit's ``result.json``: let the policy walk on these drives; ``None`` means those that it was trained with."""
+
     video: str | None = None
     """A film of the first robot, ``.mp4`` or ``.gif``."""
 
@@ -117,4 +120,5 @@ def _run_settings(checkpoint: Path, settings: PlaySettings) -> RunSettings:
         raise ValueError(f"There is no {SETTINGS_FILE} beside {checkpoint}: say with --task what it was trained for.")
     run.task = settings.task or run.task
     run.num_envs, run.seed, run.randomize = settings.num_envs, settings.seed, False
+    run.randomize_identified, run.identified = None, settings.identified or run.identified
     return run

@@ -10,6 +10,8 @@ from datetime import datetime
 from pathlib import Path
 
 SETTINGS_FILE = "settings.json"
+IDENTIFIED_FILE = "identified.json"
+"""Copy of the fit's result that a training took its drives from."""
 
 
 @dataclass(kw_only=True)
@@ -34,6 +36,15 @@ class RunSettings:
     randomize: bool = False
     """Whether friction and mass are randomised and the robot is pushed."""
 
+    identified: str | None = None
+    """``result.json`` of the fit that identified the drives, or its run's folder; ``None`` keeps the task's drives."""
+
+    randomize_identified: float | None = None
+    """Draw each robot's drives with this many standard deviations around the identified ones; ``None`` does not."""
+
+    physics_dt: float | None = None
+    """Time step of physics and drives [s]; ``None`` means the identification's, or the task's."""
+
     log_dir: str = "logs/rsl_rl"
     """Where runs are kept."""
 
@@ -55,9 +66,13 @@ class RunSettings:
             raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**{field.name: data[field.name] for field in fields(cls)})
+            added = {"identified": None, "randomize_identified": None, "physics_dt": None}  # not in older runs
+            settings = cls(**{field.name: (added | data)[field.name] for field in fields(cls)})
         except (json.JSONDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}).") from None
+        if settings.identified is not None and (folder / IDENTIFIED_FILE).is_file():
+            settings.identified = str(folder / IDENTIFIED_FILE)
+        return settings
 
 
 def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from pace_actuators import IdentifiedDrives
+from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg
 from pace_envs.rl.export import export_policy
-from pace_envs.rl.run_folder import RunSettings, latest_checkpoint, new_run_folder
+from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, latest_checkpoint, new_run_folder
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
@@ -38,6 +41,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
     use_rewards(cfg, settings.reward)
     if settings.randomize:
         add_randomization(cfg)
+    _use_drives(cfg, settings)
     if settings.num_envs is not None:
         cfg.scene.num_envs = settings.num_envs
     cfg.seed = cfg.runner.seed = settings.seed
@@ -48,6 +52,23 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
     if edit is not None:
         edit(cfg)
     return cfg
+
+
+def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
+    """Physics step and drives as the settings say; prints what a reader should know of it."""
+    if settings.physics_dt is not None:
+        set_step(cfg, settings.physics_dt)
+    if settings.identified is None:
+        if settings.randomize_identified is not None:
+            raise ValueError(
+                "randomize_identified needs identified drives: name a fit's result.json with --identified."
+            )
+        return
+    notes = [set_identified_step(cfg, settings.identified)] if settings.physics_dt is None else []
+    notes += use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
+    for note in notes:
+        if note:
+            print(f"identified drives: {note}")
 
 
 def make_env(cfg: VelocityEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
@@ -66,6 +87,8 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
     cfg = load_cfg(settings, edit)
     folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
     settings.write(folder)
+    if settings.identified is not None:
+        shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
     return _learn(cfg, folder, checkpoint=None)
 
 
