@@ -485,7 +485,8 @@ class PaceDCMotor:
         if stack is None or self._step_begun:
             return
         s = stack.state
-        s.joint_pos, s.joint_vel, s.motor_vel = joint_pos, joint_vel, joint_vel
+        s.joint_pos, s.joint_vel = joint_pos, joint_vel
+        s.motor_pos, s.motor_vel = joint_pos, joint_vel
         stack.run("advance")
         self._step_begun = True
 

@@ -73,9 +73,10 @@ class Link:
     def scale_mass(self, factor: torch.Tensor) -> None:
         """Multiply mass and inertia of the link, and of all that is fixed to it, by (rows,)."""
         for body in self.model.bodies(self.joint):
+            whole = self.model.original("body_mass", self.rows, body)
             added = self.model.added_mass[self.rows, body]
-            own = self.model.original("body_mass", self.rows, body) - added
-            self._write("body_mass", body, own * factor + added)
+            scaled = torch.where(factor == 1, whole, (whole - added) * factor + added)
+            self._write("body_mass", body, scaled)
             self._write("body_inertia", body, self.model.original("body_inertia", self.rows, body) * factor[:, None])
 
     def rotate_mass(self, angle: torch.Tensor) -> None:

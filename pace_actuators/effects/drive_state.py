@@ -18,6 +18,7 @@ _WRITABLE = (
     "armature",
     "joint_pos",
     "joint_vel",
+    "motor_pos",
     "motor_vel",
     "motor_effort",
     "load_effort",
@@ -46,7 +47,8 @@ class DriveState:
 
     What effects read:
         joint_pos, joint_vel: True joint position [rad] and speed [rad/s].
-        motor_vel: Speed of the motor at the joint [rad/s]; other than the joint's where the transmission gives way.
+        motor_pos, motor_vel: Position [rad] and speed [rad/s] of the motor at the joint; other than the joint's where
+            the transmission gives way.
         motor_effort: The motor's torque [N m]; ``effort`` may be split up between a torque and a friction.
         load_effort: Torque of gravity and load on the joint [N m]; zero where the simulator does not give it.
         base_friction, base_viscous_friction, base_armature: The identified base parameters.

@@ -89,6 +89,8 @@ class Effect:
     """Whether it is one for the whole robot by its nature."""
     every_physics_step: ClassVar[bool] = False
     """Whether it has fast dynamics of its own, so that the drive must be called at every physics step."""
+    parts_motor_and_link: ClassVar[bool] = False
+    """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     separates: ClassVar[str] = ""

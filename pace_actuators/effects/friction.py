@@ -80,7 +80,7 @@ class FrictionAsymmetry(Effect):
 
     def transmission(self, s: DriveState) -> None:
         """Brake one way, help the other, while sliding: -(F_c + a sgn v) sgn v = -F_c sgn v - a."""
-        square = s.joint_vel**2
+        square = s.motor_vel**2
         s.effort -= self.effort * (square / (square + _SLIDING_SPEED**2))
 
 
@@ -184,21 +184,21 @@ class PreslidingFriction(Effect):
         """
         if bool(self._fresh.any()):
             self._bristle = torch.where(self._fresh, 0.0, self._bristle)
-            self._position = torch.where(self._fresh, s.joint_pos, self._position)
+            self._position = torch.where(self._fresh, s.motor_pos, self._position)
             self._fresh[:] = False
         level = s.friction.clamp(min=1e-9)
-        moved = s.joint_pos - self._position
+        moved = s.motor_pos - self._position
         direction = torch.sign(moved)
         limit = direction * level / self._sigma.clamp(min=1e-9)
         decay = torch.exp(-self._sigma * moved.abs() / level)
         bent = torch.where(moved == 0, self._bristle, limit + (self._bristle - limit) * decay)
         furthest = level / self._sigma.clamp(min=1e-9)
         self._bristle = torch.clamp(bent, -furthest, furthest)
-        self._position = s.joint_pos.clone()
-        slope = self._sigma * (1 - self._sigma * self._bristle * torch.sign(s.joint_vel) / level).clamp(0.0, 1.0)
+        self._position = s.motor_pos.clone()
+        slope = self._sigma * (1 - self._sigma * self._bristle * torch.sign(s.motor_vel) / level).clamp(0.0, 1.0)
         implicit = slope * (0.3 * self.dt)
         # towards the mean position of the step: Newmark's average acceleration, as two_mass has it
         ahead = (-0.25 * self.dt if self.is_trapezoidal else 0.3 * self.dt) * slope
-        s.effort += torch.where(self._on, ahead * s.joint_vel - self._sigma * self._bristle, 0.0)
+        s.effort += torch.where(self._on, ahead * s.motor_vel - self._sigma * self._bristle, 0.0)
         s.implicit_damping += implicit
         s.friction = torch.where(self._on, 0.0, s.friction)

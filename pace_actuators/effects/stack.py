@@ -84,6 +84,7 @@ class EffectStack:
             stage: [(effect, self._view[effect]) for effect in self.effects if effect.overrides(stage)]
             for stage in _STAGES
         }
+        self._at["transmission"].sort(key=lambda pair: _side(pair[0]))
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
         """Whether friction or viscous friction change from step to step."""
         self.lags = [effect for effect in self.effects if effect.overrides("observation_lag")]
@@ -165,3 +166,10 @@ class EffectStack:
             values = resolve_joint_values(value, names, field=f"{effect.name}.{name}")
             effect.set_parameter(name, values, joints=joints)
         effect.prepare()
+
+
+def _side(effect: Effect) -> int:
+    """From motor to link: friction, what parts the two, torques on the link."""
+    if effect.parts_motor_and_link:
+        return 1
+    return 0 if effect.stage == "friction" else 2

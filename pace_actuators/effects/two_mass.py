@@ -18,14 +18,13 @@ Source: Newmark 1959; Spong 1987 for the flexible joint.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, off
 from pace_actuators.effects.registry import register_effect
-
-_NUMERICAL_DAMPING = 0.05
-"""Part of k h that is added to c: what is too fast for the step dies out, a resonance inside the band does not."""
 
 _SMALLEST_ARMATURE = 1e-6
 """A motor without inertia would have no state [kg m²]."""
@@ -47,6 +46,9 @@ class _TwoMass(Effect):
     stage = "transmission"
     every_physics_step = True
     two_sided = False
+    parts_motor_and_link = True
+    numerical_damping: ClassVar[float] = 0.05
+    """Part of k h that is added to c: what is too fast for the step dies out, a resonance inside the band does not."""
     encoder_side: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
@@ -99,12 +101,14 @@ class _TwoMass(Effect):
             self._angle = torch.where(self._fresh, s.joint_pos + self.rest_deflection(s), self._angle)
             self._speed = torch.where(self._fresh, s.joint_vel, self._speed)
             self._fresh[:] = False
-        s.motor_vel = torch.where(self._on, self._speed, s.joint_vel)
+        s.motor_pos = torch.where(self._on, self._angle, s.motor_pos)
+        s.motor_vel = torch.where(self._on, self._speed, s.motor_vel)
 
     def measurement(self, s: DriveState) -> None:
-        """An encoder on the motor sees the motor."""
+        """An encoder on the motor sees the motor; before the first step it is where the link is."""
         if self._any:
-            s.encoder_pos += torch.where(self._on, self.encoder_side * (self._angle - s.joint_pos), 0.0)
+            seen = self._on & ~self._fresh
+            s.encoder_pos += torch.where(seen, self.encoder_side * (self._angle - s.joint_pos), 0.0)
 
     def sensed_velocity(self, s: DriveState) -> None:
         """And its speed."""
@@ -118,13 +122,13 @@ class _TwoMass(Effect):
         h, relative = self.dt, self._speed - s.joint_vel
         torque, k = self.spring(self._angle - s.joint_pos + 0.5 * h * relative)
         torque = torque - k * (0.5 * h * relative)  # looked ahead for contact only
-        c = self.damping_of(k, s) + (_NUMERICAL_DAMPING * h) * k
+        c = self.damping_of(k, s) + (self.numerical_damping * h) * k
         coupling = 0.25 * h * k + 0.5 * c
         ahead = (0.25 if self.is_trapezoidal else -0.25) * h * k
         explicit = torque + (0.5 * c + ahead) * relative
         momentum = s.base_armature.clamp(min=_SMALLEST_ARMATURE) / h
         drag = 0.5 * s.viscous_friction
-        inertia = momentum + drag
+        inertia = momentum + drag + s.implicit_damping
         push = (momentum - drag) * self._speed + s.effort - explicit
         free = push + coupling * s.joint_vel
         stuck = free.abs() <= s.friction
@@ -203,6 +207,7 @@ class Backlash(_TwoMass):
     source = "Nordin, Gutman 2002, dead-zone model"
     probes = tuple({"gap": g, "encoder_side": e} for g in (0.002, 0.008, 0.025) for e in (0.0, 1.0))
     separates = "several amplitudes, and a 1.5 times larger proportional gain"
+    numerical_damping = 0.3  # a contact shorter than a few steps would push harder on the way out than on the way in
     gap: torch.Tensor
     stiffness: torch.Tensor
     damping: torch.Tensor

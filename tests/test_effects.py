@@ -1,0 +1,301 @@
+"""Each effect is its closed form; names, parameters and bad input."""
+
+import math
+
+import pytest
+import torch
+from effect_envs import EFFECTS
+
+from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators.effects import (
+    Effect,
+    EffectCfg,
+    EffectParameter,
+    available_effects,
+    effect_cfgs,
+    get_effect,
+    probe_points,
+    register_effect,
+)
+
+DT = 0.0025
+
+
+class Drive:
+    """One drive with effects, called by hand: Kp 100, Kd 1, no delay, no limits."""
+
+    def __init__(self, effects, values=None, *, num_envs=1, joints=("j",), dtype=torch.float64, **changes):
+        cfg = {
+            "joint_names_expr": ".*",
+            "stiffness": 100.0,
+            "damping": 1.0,
+            "armature": 0.1,
+            "friction": 0.5,
+            "viscous_friction": 2.0,
+            "max_delay": 8.0,
+            "effects": effects,
+            "physics_dt": DT,
+        }
+        names = list(joints)
+        self.motor = PaceDCMotor(PaceDCMotorCfg(**{**cfg, **changes}), names, slice(None), num_envs, dtype=dtype)
+        self.zeros = torch.zeros(num_envs, len(names), dtype=dtype)
+        for key, value in (values or {}).items():
+            effect, _, parameter = key.partition(".")
+            self.motor.effects.find(effect).set_parameter(parameter, value)
+        self.motor.update_effects()
+
+    def __call__(self, target=0.0, q=0.0, v=0.0):
+        """The torque at the joint."""
+        full = self.zeros
+        action = ActuatorActions(full + target, None, None)
+        return self.motor.compute(action, full + q, full + v).joint_efforts
+
+    def one(self, *args, **kwargs):
+        return float(self(*args, **kwargs)[0, 0])
+
+
+def test_the_library_holds_what_it_should():
+    assert {
+        "stribeck_friction", "load_dependent_friction", "friction_asymmetry", "quadratic_friction",
+        "presliding_friction", "friction_drift", "torque_offset", "parallel_spring", "torque_gain",
+        "proportional_gain", "derivative_gain", "drive_bandwidth", "velocity_filter", "torque_limit",
+        "torque_speed_limit", "command_rate_limit", "torque_ripple", "joint_elasticity", "backlash", "payload",
+        "com_offset", "encoder_scale", "encoder_eccentricity", "other_delay", "measurement_delay", "clock_skew",
+    } <= set(EFFECTS)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_says_what_it_is(name):
+    effect = get_effect(name)
+    assert effect.equation and effect.looks and effect.source and effect.separates
+    assert effect.__doc__
+    assert all(twin in available_effects() for twin in effect.twins)
+    for point in probe_points(effect):
+        assert set(point) == {p.name for p in effect.parameters}
+        assert all(p.lower <= point[p.name] <= p.upper for p in effect.parameters)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_keeps_type_and_shape_and_acts_on_its_joints_only(name, dtype):
+    start = {p.name: p.start for p in get_effect(name).parameters}
+    cfg = EffectCfg(effect=name, joint_names_expr="b|c", values=start)
+    drive = Drive([cfg], num_envs=2, joints=("a", "b", "c"), dtype=dtype)
+    plain = Drive([], num_envs=2, joints=("a", "b", "c"), dtype=dtype)
+    for i in range(20):
+        torque = drive(0.3, 0.01 * i, 0.2)
+        expected = plain(0.3, 0.01 * i, 0.2)
+        assert torque.dtype == dtype and torque.shape == (2, 3)
+        assert bool(torque.isfinite().all())
+        assert torch.equal(torque[:, 0], expected[:, 0])
+    for p in get_effect(name).parameters:
+        value = getattr(drive.motor.effects.find(name), p.name)
+        assert value.dtype == dtype
+        assert value[0, 1:].tolist() == pytest.approx([p.start] * 2)
+
+
+def test_a_lag_of_first_order_steps_as_the_closed_form():
+    time_constant = 0.01
+    drive = Drive(["drive_bandwidth"], {"drive_bandwidth.time_constant": time_constant})
+    assert drive.one(0.0) == 0.0
+    for k in range(20):  # the mean over each step of 100 (1 - exp(-t/T))
+        mean = 100 * (1 - time_constant / DT * math.exp(-k * DT / time_constant) * -math.expm1(-DT / time_constant))
+        assert drive.one(1.0) == pytest.approx(mean, rel=1e-12)
+
+
+def test_the_controllers_speed_is_filtered():
+    drive = Drive(["velocity_filter"], {"velocity_filter.time_constant": 0.01})
+    assert drive.one(v=0.0) == 0.0
+    for k in range(1, 10):
+        assert drive.one(v=1.0) == pytest.approx(math.expm1(-k * DT / 0.01))
+
+
+def test_friction_laws():
+    drive = Drive(["stribeck_friction"], {"stribeck_friction.effort": 1.5, "stribeck_friction.velocity": 0.2})
+    for v in (0.0, 0.1, -0.2, 3.0):
+        drive(v=v)
+        assert float(drive.motor.joint_friction) == pytest.approx(0.5 + 1.5 * math.exp(-((v / 0.2) ** 2)))
+    drive = Drive(["load_dependent_friction"], {"load_dependent_friction.coefficient": 0.1})
+    drive.motor.set_load_effort(torch.tensor([[-4.0]], dtype=torch.float64))
+    assert drive.one(0.06) == pytest.approx(6.0)
+    assert float(drive.motor.joint_friction) == pytest.approx(0.5 + 0.1 * abs(6.0 + 4.0))
+    drive = Drive(["quadratic_friction"], {"quadratic_friction.coefficient": 0.7})
+    drive(v=-3.0)
+    assert float(drive.motor.joint_viscous_friction) == pytest.approx(2.0 + 0.7 * 3)
+    drive.motor.effects.find("quadratic_friction").set_parameter("coefficient", -1.0)
+    drive(v=-3.0)
+    assert float(drive.motor.joint_viscous_friction) == 0.0  # never drives
+    drive = Drive(["friction_asymmetry"], {"friction_asymmetry.effort": 0.4})
+    assert [drive.one(v=v) + v for v in (2.0, -2.0)] == pytest.approx([-0.4, -0.4], rel=1e-4)
+    assert drive.one(v=0.0) == 0.0
+
+
+def test_friction_drifts_over_the_session():
+    values = {"friction_drift.ratio": 0.6, "friction_drift.time_constant": 20.0}
+    drive = Drive(["friction_drift"], values)
+    drive.motor.set_session_time(torch.full((1, 1), 40.0, dtype=torch.float64))
+    drive()
+    factor = 1 + 0.6 * (1 - math.exp(-2))
+    assert float(drive.motor.joint_friction) == pytest.approx(0.5 * factor)
+    assert float(drive.motor.joint_viscous_friction) == pytest.approx(2.0 * factor)
+    for _ in range(400):
+        drive()
+    drive.motor.reset()  # the session goes on
+    drive()
+    factor = 1 + 0.6 * (1 - math.exp(-(40 + 401 * DT) / 20))
+    assert float(drive.motor.joint_friction) == pytest.approx(0.5 * factor, rel=1e-6)
+
+
+def test_a_bristle_is_a_spring_that_gives_way_at_the_friction_level():
+    stiffness, level = 400.0, 0.5
+    drive = Drive(["presliding_friction"], {"presliding_friction.stiffness": stiffness}, stiffness=0.0, damping=0.0)
+    assert drive.one(q=0.0) == 0.0
+    moved = 1e-5
+    assert drive.one(q=moved) == pytest.approx(-stiffness * moved, rel=0.01)
+    torques = [drive.one(q=moved * i) for i in range(2000)]
+    x = moved * 1999
+    assert torques[-1] == pytest.approx(-level * (1 - math.exp(-stiffness * x / level)), rel=1e-3)
+    # after the turn the slope is twice as steep: the bristle pulls the other way
+    assert drive.one(q=x - moved) - torques[-1] == pytest.approx(2 * stiffness * moved, rel=0.02)
+    assert float(drive.motor.joint_friction) == 0.0
+
+
+def test_limits_of_the_drive():
+    drive = Drive(["command_rate_limit"], {"command_rate_limit.velocity": 2.0})
+    assert drive.one(0.0) == 0.0
+    assert [drive.one(1.0) for _ in range(3)] == pytest.approx([100 * 2.0 * DT * k for k in (1, 2, 3)])
+    assert drive.one(3.5 * 2.0 * DT) == pytest.approx(100 * 3.5 * 2.0 * DT)  # reached
+    drive = Drive(["torque_limit"], {"torque_limit.effort": 3.0})
+    assert [drive.one(x) for x in (1.0, -1.0, 0.02)] == pytest.approx([3.0, -3.0, 2.0])
+    values = {"torque_speed_limit.velocity": 10.0, "torque_speed_limit.effort": 20.0}
+    drive = Drive(["torque_speed_limit"], values, damping=0.0)
+    assert drive.one(1.0, v=4.0) == pytest.approx(20 * (1 - 4 / 10))
+    assert drive.one(-1.0, v=4.0) == pytest.approx(-20.0)
+
+
+def test_gains_torques_and_encoders():
+    assert Drive(["torque_gain"], {"torque_gain.gain": 0.2}).one(0.1) == pytest.approx(12.0)
+    assert Drive(["proportional_gain"], {"proportional_gain.gain": 0.2}).one(0.1, v=1.0) == pytest.approx(11.0)
+    assert Drive(["derivative_gain"], {"derivative_gain.gain": 0.2}).one(0.1, v=1.0) == pytest.approx(8.8)
+    assert Drive(["torque_offset"], {"torque_offset.effort": -0.7}).one(0.1) == pytest.approx(9.3)
+    spring = Drive(["parallel_spring"], {"parallel_spring.stiffness": 5.0, "parallel_spring.rest": 0.1})
+    assert spring.one(0.3, q=0.3) == pytest.approx(-5.0 * 0.2)
+    ripple = Drive(
+        ["torque_ripple"], {"torque_ripple.sine": 1.0, "torque_ripple.cosine": 2, "torque_ripple.periods": 7}
+    )
+    assert ripple.one(0.3, q=0.3) == pytest.approx(math.sin(2.1) + 2 * math.cos(2.1))
+    scale = Drive(["encoder_scale"], {"encoder_scale.error": 0.05})
+    assert scale.one(0.0, q=0.2, v=2.0) == pytest.approx(-1.05 * (20 + 2))
+    off_centre = {"encoder_eccentricity.sine": 0.03, "encoder_eccentricity.cosine": 0.02}
+    ring = Drive(["encoder_eccentricity"], off_centre)
+    error = 0.03 * math.sin(0.4) + 0.02 * math.cos(0.4)
+    slope = 0.03 * math.cos(0.4) - 0.02 * math.sin(0.4)
+    assert ring.one(0.4, q=0.4, v=2.0) == pytest.approx(-100 * error - 2 * (1 + slope))
+    for drive in (scale, ring):  # the log shows what the controller sees
+        q = torch.tensor([[0.7]], dtype=torch.float64)
+        shown = drive.motor.sensed_position(q).clone()
+        assert drive.one(0.0, q=0.7) == pytest.approx(-100 * float(shown), abs=1e-9)
+        assert torch.allclose(drive.motor.position_that_shows(shown), q, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["command", "effort"])
+def test_the_other_delay_is_the_path_that_the_base_does_not_have(mode):
+    targets = [0.0, 0.1, 0.4, 0.2, 0.0, 0.0, 0.0]
+    positions = [0.0, 0.01, 0.02, 0.05, 0.03, 0.01, 0.0]
+    drive = Drive(["other_delay"], {"other_delay.delay": 1.5 * DT}, delay_mode=mode)
+
+    def late(values, k):
+        return 0.5 * (values[max(k - 1, 0)] + values[max(k - 2, 0)])
+
+    torques = [100 * (t - q) for t, q in zip(targets, positions, strict=True)]
+    for k in range(len(targets)):
+        expected = late(torques, k) if mode == "command" else 100 * (late(targets, k) - positions[k])
+        assert drive.one(targets[k], q=positions[k]) == pytest.approx(expected, abs=1e-9), k
+
+
+def test_rows_and_resets():
+    rows = [
+        EffectCfg(effect="torque_offset", env_rows=slice(0, 2), values={"effort": 1.0}),
+        EffectCfg(effect="torque_offset", env_rows=slice(2, 3), values={"effort": -2.0}),
+        EffectCfg(effect="drive_bandwidth", env_rows=slice(1, 4), values={"time_constant": 0.01}),
+    ]
+    drive = Drive(rows, num_envs=4)
+    assert drive()[:, 0].tolist() == [1.0, 1.0, -2.0, 0.0]
+    assert drive(1.0)[0, 0] == 101.0
+    drive(1.0)
+    drive.motor.reset(torch.tensor([2]))  # its next torque counts as settled
+    torque = drive(1.0)[:, 0]
+    assert float(torque[2]) == pytest.approx(98.0)
+    assert float(torque[1]) < 60 and float(torque[3]) < 60
+
+
+def test_names_and_places_are_read():
+    cfg = EffectCfg.parse("stribeck_friction@.*_KFE")
+    assert (cfg.effect, cfg.joint_names_expr, cfg.shared) == ("stribeck_friction", ".*_KFE", False)
+    assert cfg.joints(["LF_HAA", "LF_KFE", "RF_KFE"]) == ["LF_KFE", "RF_KFE"]
+    assert EffectCfg.parse("torque_gain@shared").shared
+    assert EffectCfg.parse("clock_skew").shared
+    assert not EffectCfg.parse("torque_gain").shared
+    for text in ("torque_gain", "torque_gain@a|b", "torque_gain@shared", "clock_skew"):
+        assert EffectCfg.parse(text).label == text
+    own = get_effect("test_effects:CableDrag")
+    assert own.name == "cable_drag_of_test" and get_effect(own.name) is own
+
+
+class CableDrag(Effect):
+    """An effect of one's own."""
+
+    name = "cable_drag_of_test"
+    stage = "transmission"
+    parameters = (EffectParameter(name="effort", unit="N m", lower=-2, upper=2, null=0.0, start=0.1),)
+
+    def transmission(self, s):
+        s.effort -= self.effort * torch.tanh(s.joint_pos)
+
+
+def test_an_effect_of_ones_own_acts():
+    drive = Drive(["test_effects:CableDrag"], {"cable_drag_of_test.effort": 1.5})
+    assert drive.one(0.3, q=0.3) == pytest.approx(-1.5 * math.tanh(0.3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: get_effect("stribek_friction"), "no effect 'stribek_friction'. Did you mean 'stribeck_friction'?"),
+        (lambda: get_effect("no_such_module:X"), "cannot be imported"),
+        (lambda: get_effect("math:pi"), "is no effect"),
+        (lambda: EffectCfg.parse("torque_gain@"), "names no joints after '@'"),
+        (lambda: effect_cfgs(["torque_gain@a", "torque_gain@b"]), "named twice"),
+        (lambda: Drive([EffectCfg(effect="torque_gain", values={"gane": 1.0})]), "no parameter 'gane'"),
+        (lambda: Drive(["torque_gain"], {"torque_gain.gane": 1.0}), "no parameter 'gane'. Available: gain"),
+        (lambda: Drive(["torque_gain"], {"backlash.gap": 1.0}), "no effect 'backlash'. It has: torque_gain"),
+        (lambda: Drive(["torque_gain"], physics_dt=None), "need to know the time between two calls"),
+    ],
+)
+def test_what_is_wrong_is_said(call, message):
+    with pytest.raises(ValueError, match=message.replace("?", r"\?")):
+        call()
+
+
+GOOD = {"name": "x", "unit": "1", "lower": 0.0, "upper": 1.0, "null": 0.0, "start": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("declaration", "message"),
+    [
+        ({"name": ""}, "has no name"),
+        ({"parameters": ()}, "has no parameters"),
+        ({"name": "torque_gain"}, "registered already"),
+        ({"probes": ({"y": 1.0},)}, "names 'y'"),
+        ({"parameters": (EffectParameter(**{**GOOD, "lower": 2.0}),)}, "lower < upper"),
+        ({"parameters": (EffectParameter(**{**GOOD, "scale": "log"}),)}, "expected > 0"),
+        ({"parameters": (EffectParameter(**{**GOOD, "start": 3.0}),)}, "starts at 3.0"),
+        ({"parameters": (EffectParameter(**{**GOOD, "null": None}),)}, "no parameter with a null value"),
+        ({"parameters": (EffectParameter(**{**GOOD, "name": "drive"}),)}, "needs another name"),
+    ],
+)
+def test_a_wrong_declaration_is_refused(declaration, message):
+    content = {"name": "wrong", "stage": "drive", "parameters": (EffectParameter(**GOOD),), **declaration}
+    with pytest.raises(ValueError, match=message):
+        register_effect(type("Wrong", (Effect,), content))
+    assert "wrong" not in available_effects()

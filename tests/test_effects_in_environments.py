@@ -1,0 +1,317 @@
+"""Effects in simulated robots: nothing at their null, finite at their bounds, no energy out of nothing."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from effect_envs import EFFECTS, Bench, long_chirp, rms
+from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp
+
+from pace_actuators.effects import EffectCfg, get_effect
+
+MOVING = chirp(1.0, high=8.0, amplitude=0.7)
+HEAVY = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.33}
+STIFF = ("joint_elasticity", "backlash", "presliding_friction")
+ENERGY = {
+    "stribeck_friction": [{"effort": 4.0, "velocity": 0.01}, {"effort": 1.0, "velocity": 0.3}],
+    "load_dependent_friction": [{"coefficient": 0.5}, {"coefficient": 0.05}],
+    "quadratic_friction": [{"coefficient": 3.0}, {"coefficient": -1.0}, {"coefficient": -0.05}],
+    "friction_drift": [{"ratio": -0.8, "time_constant": 1.0}, {"ratio": 0.8, "time_constant": 1.0}],
+    "presliding_friction": [{"stiffness": k} for k in (10.0, 300.0, 3000.0)],
+    "joint_elasticity": [{"stiffness": k, "damping": c} for k in (80.0, 1e3, 2e4) for c in (0.0, 0.5, 20.0)],
+    "backlash": [{"gap": g, "stiffness": k, "damping": 0.0} for g in (0.004, 0.05) for k in (300.0, 2e4)],
+}
+"""Friction and transmission effects that only store or spend energy; the others are torques of their own."""
+
+
+def bounds_corners(name):
+    """All combinations of lower and upper bounds, {parameter: (corners,)}."""
+    parameters = get_effect(name).parameters
+    corners = list(itertools.product(*((p.lower, p.upper) for p in parameters)))
+    return {f"{name}.{p.name}": [c[i] for c in corners] for i, p in enumerate(parameters)}, len(corners)
+
+
+@pytest.mark.parametrize("calls", [1, 2])
+@pytest.mark.parametrize("delay_mode", ["command", "effort"])
+def test_at_their_null_all_effects_are_the_base_model_bit_for_bit(delay_mode, calls):
+    options = {"base": CALM, "delay_mode": delay_mode, "calls": calls, "load": HEAVY}
+    targets = MOVING[200:300]
+    expected = Bench(**options).follow(targets, sensed=True)
+    for effects in [[name] for name in EFFECTS] + [list(EFFECTS)]:
+        assert torch.equal(Bench(effects, **options).follow(targets, sensed=True), expected), effects
+
+
+def test_a_payload_of_nothing_keeps_a_loaded_robot_bit_for_bit():
+    """0.7 + 0.1 - 0.1 is not 0.7."""
+    masses = []
+    for effects in ((), ("payload", "com_offset")):
+        bench = Bench(load={"load_mass": 0.7})
+        bench = Bench(effects, load={"load_mass": 0.7}) if effects else bench
+        bench.robot.add_body_mass("load", 0.1)
+        bench.robot._link_model = None
+        if effects:
+            bench.robot.write_effect_parameter_to_sim("payload", "ratio", torch.zeros(1, 1, dtype=torch.float64))
+        masses.append(bench.env.sim.expand("body_mass").clone())
+        bench.env.close()
+    assert torch.equal(*masses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "base", [TRUTH, {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}]
+)
+def test_the_extremes_of_all_bounds_stay_finite_for_20_s(base):
+    cfgs, corners = [], []
+    for name in EFFECTS:  # side by side, each on its rows
+        values, count = bounds_corners(name)
+        begin = len(corners)
+        corners += [(name, {key: v[i] for key, v in values.items()}) for i in range(count)]
+        cfgs.append(EffectCfg(effect=name, env_rows=slice(begin, len(corners))))
+    bench = Bench(cfgs, num_envs=len(corners), base=base)
+    (actuator,) = bench.robot.actuators.values()
+    for effect in bench.effects.effects:
+        for key in (p.name for p in effect.parameters):
+            values = [corner[f"{effect.name}.{key}"] for _, corner in corners[effect.rows]]
+            effect.set_parameter(key, torch.tensor(values, dtype=torch.float64)[:, None])
+        bench.robot._write_passive(actuator)
+        if effect.overrides("write_model"):
+            bench.robot._write_model(actuator, effect)
+    reached = bench.follow(long_chirp(20.0))[:, :, 0]
+    for i, corner in enumerate(corners):
+        assert bool(reached[:, i].isfinite().all()), corner
+        assert float(reached[:, i].abs().max()) < 10.0, corner
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STIFF)
+def test_the_extremes_stay_finite_on_a_robot_with_legs(name):
+    values, count = bounds_corners(name)
+    targets = legs_chirp(env_cfg(ANYMAL), 3.0)
+    base = {"armature": 0.1, "viscous_friction": 1.0, "friction": 1.0, "encoder_bias": 0.0, "delay": 1.0}
+    reached = Bench([name], values, num_envs=count, task=ANYMAL, base=base).follow(targets)
+    assert bool(reached.isfinite().all())
+    assert float((reached - torch.as_tensor(targets)[:, None]).abs().max()) < 3.0
+
+
+def mechanical_energy(bench, load, base):
+    """Of link, motor and spring, (num_envs,) [J]."""
+    mass, length, arm = load["load_mass"], load["load_length"], load["arm_mass"]
+    inertia = mass * length**2 + arm * length**2 / 3
+    weight = 9.81 * length * (mass + arm / 2)
+    q, v = bench.robot.data.joint_pos[:, 0], bench.robot.data.joint_vel[:, 0]
+    energy = 0.5 * inertia * v**2 + weight * (1 - torch.cos(q))
+    effect = bench.effects.effects[0]
+    if hasattr(effect, "spring"):
+        moved = effect._angle[:, 0] - q
+        torque, stiffness = effect.spring(effect._angle - bench.robot.data.joint_pos)
+        spring = torch.where(stiffness > 0, torque**2 / (2 * stiffness.clamp(min=1e-9)), 0.0)[:, 0]
+        assert bool((moved.abs() < 0.3).all())
+        return energy + 0.5 * base["armature"] * effect._speed[:, 0] ** 2 + spring
+    if hasattr(effect, "_bristle"):
+        energy = energy + 0.5 * effect._sigma[:, 0] * effect._bristle[:, 0] ** 2
+    return energy + 0.5 * base["armature"] * v**2
+
+
+@pytest.mark.parametrize("name", ENERGY)
+@pytest.mark.parametrize("calls", [1, 5])
+def test_a_free_swing_never_gains_energy(name, calls):
+    load = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.0}
+    base = {"armature": 0.1, "viscous_friction": 0.05, "friction": 0.1, "encoder_bias": 0.0, "delay": 0.0}
+    cases = ENERGY[name]
+    values = {f"{name}.{p}": [case[p] for case in cases] for p in cases[0]}
+    bench = Bench([name], values, num_envs=len(cases), base=base, calls=calls, load=load)
+    bench.disable()
+    bench.start(1.5)
+    for step in range(round(2.5 / DT)):
+        bench.robot.sensed_joint_pos()  # brings the motor to the present
+        energy = mechanical_energy(bench, load, base)
+        if step == 3:  # the spring has taken up the load
+            start = lowest = energy
+        elif step > 3:  # 0.3 % of 11 J is what steps of 2.5 ms leave at the stiffest contact
+            assert bool((energy - lowest < 0.03).all()), (step * DT, energy - lowest)
+            lowest = torch.minimum(lowest, energy)
+        bench.env.simulate(torch.zeros(len(cases), 1, dtype=torch.float64))
+    assert bool((energy < 0.9 * start).all())
+    bench.env.close()
+
+
+def test_an_effect_acts_only_on_its_rows_and_joints():
+    rows = EffectCfg(effect="torque_offset", env_rows=slice(1, 3), values={"effort": 2.0})
+    bench = Bench([rows], {"torque_offset.effort": 2.0}, num_envs=4)
+    reached = bench.follow(MOVING)
+    base = Bench(num_envs=1).follow(MOVING)
+    assert torch.equal(reached[:, [0, 3]], base.expand(-1, 2, -1))
+    assert float((reached[:, 1:3] - base).abs().max()) > 0.01
+    cfg = env_cfg(ANYMAL)
+    knees = [i for i, name in enumerate(cfg.sim2real.joint_order) if name.endswith("KFE")]
+    base_values = {"armature": 0.1, "viscous_friction": 1.0, "friction": 0.5, "encoder_bias": 0.0, "delay": 1.0}
+    targets = legs_chirp(cfg, 0.1)
+    bench = Bench(["torque_gain@.*KFE"], {"torque_gain.gain": 0.3}, task=ANYMAL, base=base_values)
+    assert [k for p in bench.space.parameters if "." in p.name for k in p.keys] == [
+        cfg.sim2real.joint_order[i] for i in knees
+    ]
+    gain = bench.effects.find("torque_gain").gain
+    assert set(gain[0].nonzero()[:, 0].tolist()) == set(knees)
+    bench.follow(targets)
+
+
+def test_environments_with_different_values_do_not_mix():
+    for name in ("stribeck_friction", "joint_elasticity", "drive_bandwidth", "other_delay", "payload"):
+        values, count = bounds_corners(name)
+        together = Bench([name], values, num_envs=count).follow(MOVING[:200])
+        for i in range(count):
+            alone = Bench([name], {key: v[i] for key, v in values.items()}).follow(MOVING[:200])
+            assert rms(together[:, i], alone[:, 0]) < 1e-12, (name, i)
+
+
+@pytest.mark.parametrize("name", [n for n in EFFECTS if get_effect(n).overrides("reset_state")])
+def test_the_reset_of_an_environment_forgets_its_history_only(name):
+    start = {f"{name}.{p.name}": p.start for p in get_effect(name).parameters}
+    bench = Bench([name], start, num_envs=3, base={**TRUTH, "delay": 0.0})
+    bench.start(0.0)
+    run = [torch.as_tensor(t) for t in MOVING[:150]]
+    for target in run[:70]:
+        bench.env.simulate(target.expand(3, 1))
+    fresh = Bench([name], start, base={**TRUTH, "delay": 0.0})
+    fresh.start(0.0)
+    bench.env.scene.reset(torch.tensor([1]))
+    bench.robot.write_joint_state_to_sim(torch.zeros(1, 1), torch.zeros(1, 1), env_ids=torch.tensor([1]))
+    bench.env.sim.forward()
+    for target in run[70:]:
+        bench.env.simulate(target.expand(3, 1))
+        fresh.env.simulate(target.expand(1, 1))
+    q = bench.robot.data.joint_pos
+    assert torch.equal(q[0], q[2])
+    assert float((q[1] - fresh.robot.data.joint_pos[0]).abs().max()) < 1e-9
+    assert float((q[1] - q[0]).abs().max()) > 1e-9
+    bench.env.close()
+    fresh.env.close()
+
+
+def test_payload_and_com_offset_are_a_hand_changed_model():
+    payload = Bench(["payload"], {"payload.ratio": 0.25}, load=HEAVY).follow(MOVING)
+    heavier = {**HEAVY, "load_mass": 2.0 * 1.25, "arm_mass": 0.33 * 1.25}
+    assert rms(payload, Bench(load=heavier).follow(MOVING)) < 1e-9
+    assert rms(payload, Bench(load=HEAVY).follow(MOVING)) > 1e-3
+    # turning the mass by α is a joint whose zero is elsewhere: q -> q + α in gravity alone
+    angle = 0.2
+    turned = Bench(["com_offset"], {"com_offset.angle": angle}, load=HEAVY)
+    turned.start(0.3)
+    plain = Bench(load=HEAVY)
+    plain.start(0.3 + angle)
+    assert torch.allclose(turned.robot.load_effort, plain.robot.load_effort, rtol=1e-9)
+    turned.env.close()
+    plain.env.close()
+
+
+def test_payload_does_not_scale_a_known_added_mass():
+    bench = Bench(["payload"], load=HEAVY)
+    bench.robot._link_model = None
+    bench.robot.add_body_mass("load", 0.8)
+    bench.robot.write_effect_parameter_to_sim("payload", "ratio", torch.full((1, 1), 0.5, dtype=torch.float64))
+    load = bench.env.sim.model.body("load").id
+    assert float(bench.env.sim.expand("body_mass")[0, load]) == pytest.approx(2.0 * 1.5 + 0.8)
+    bench.env.close()
+
+
+PAIRS = [
+    (
+        ("stribeck_friction", "backlash"),
+        {"stribeck_friction.effort": 1.0, "backlash.gap": 0.01, "backlash.encoder_side": 1.0},
+    ),
+    (("joint_elasticity", "torque_gain"), {"joint_elasticity.stiffness": 300.0, "torque_gain.gain": 0.2}),
+    (("encoder_scale", "encoder_eccentricity"), {"encoder_scale.error": 0.05, "encoder_eccentricity.cosine": 0.02}),
+    (
+        ("load_dependent_friction", "measurement_delay", "drive_bandwidth"),
+        {"load_dependent_friction.coefficient": 0.1, "drive_bandwidth.time_constant": 0.005},
+    ),
+    (
+        ("presliding_friction", "stribeck_friction"),
+        {"presliding_friction.stiffness": 30.0, "stribeck_friction.effort": 3.0, "stribeck_friction.velocity": 1.0},
+    ),
+    (("parallel_spring", "torque_offset"), {"parallel_spring.stiffness": 5.0, "torque_offset.effort": 1.0}),
+    (
+        ("friction_asymmetry", "quadratic_friction"),
+        {"friction_asymmetry.effort": 0.5, "quadratic_friction.coefficient": 0.5},
+    ),
+    (
+        ("joint_elasticity", "presliding_friction"),
+        {"joint_elasticity.stiffness": 300.0, "presliding_friction.stiffness": 10.0},
+    ),
+    (("joint_elasticity", "torque_offset"), {"joint_elasticity.stiffness": 300.0, "torque_offset.effort": 1.0}),
+    (
+        ("joint_elasticity", "friction_asymmetry"),
+        {"joint_elasticity.stiffness": 300.0, "friction_asymmetry.effort": 1.0},
+    ),
+]
+
+
+@pytest.mark.parametrize(("effects", "values"), PAIRS, ids=lambda x: "+".join(x))
+def test_effects_compose_in_any_order(effects, values):
+    one = Bench(effects, values).follow(MOVING, sensed=True)
+    other = Bench(effects[::-1], values).follow(MOVING, sensed=True)
+    assert bool(one.isfinite().all())
+    assert rms(one, other) < 1e-9
+    for name in effects:
+        own = {key: value for key, value in values.items() if key.startswith(name)}
+        if own:
+            assert rms(one, Bench([name], own).follow(MOVING, sensed=True)) > 1e-4, name
+
+
+def test_the_stiffest_transmission_is_the_rigid_drive_the_more_the_finer_the_step():
+    calm = 0.15 * MOVING
+    values = {"joint_elasticity.stiffness": 2e4, "joint_elasticity.damping": 20.0}
+    apart = [
+        rms(Bench(["joint_elasticity"], values, calls=n).follow(calm), Bench(calls=n).follow(calm)) for n in (1, 5)
+    ]
+    assert apart[0] < 1e-3
+    assert apart[1] < 0.4 * apart[0]
+
+
+@pytest.mark.parametrize(("calls", "tolerance"), [(1, 0.05), (5, 0.01)])
+def test_the_resonance_of_two_masses_has_its_frequency(calls, tolerance):
+    armature, stiffness = 0.1, 300.0
+    load = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.0}
+    inertia = 2.0 * 0.375**2
+    base = {"armature": armature, "viscous_friction": 0.0, "friction": 0.0, "encoder_bias": 0.0, "delay": 0.0}
+    values = {"joint_elasticity.stiffness": stiffness, "joint_elasticity.damping": 0.0}
+    bench = Bench(["joint_elasticity"], values, base=base, calls=calls, load=load)
+    bench.disable()
+    bench.start(0.0)
+    bench.env.sim.step()
+    bench.robot.sensed_joint_pos()
+    bench.robot.write_joint_state_to_sim(torch.zeros(1, 1), torch.full((1, 1), 0.5))
+    deflection = []
+    for _ in range(800):
+        bench.robot.sensed_joint_pos()
+        effect = bench.effects.effects[0]
+        deflection.append(float(effect._angle[0, 0] - bench.robot.data.joint_pos[0, 0]))
+        bench.env.simulate(torch.zeros(1, 1, dtype=torch.float64))
+    bench.env.close()
+    signal = np.array(deflection) - np.mean(deflection)
+    crossings = np.flatnonzero((signal[:-1] < 0) & (signal[1:] >= 0))
+    exact = crossings - signal[crossings] / (signal[crossings + 1] - signal[crossings])
+    frequency = 1 / (np.diff(exact).mean() * DT)
+    expected = np.sqrt(stiffness * (1 / armature + 1 / inertia)) / (2 * np.pi)
+    assert frequency == pytest.approx(expected, rel=tolerance)
+
+
+def test_the_gap_is_seen_at_a_reversal():
+    """Without load the motor crosses the gap before the link follows."""
+    gap = 0.03
+    base = {"armature": 0.1, "viscous_friction": 1.0, "friction": 0.2, "encoder_bias": 0.0, "delay": 0.0}
+    values = {"backlash.gap": gap, "backlash.stiffness": 2e4, "backlash.damping": 20.0}
+    bench = Bench(
+        ["backlash"], values, base=base, calls=5, load={"load_mass": 0.001, "load_length": 0.2, "arm_mass": 0.0}
+    )
+    bench.start(0.0)
+    t = np.arange(900) * DT
+    deflection = []
+    for target in 0.3 * np.sin(2 * np.pi * 0.5 * t):
+        bench.robot.sensed_joint_pos()
+        effect = bench.effects.effects[0]
+        deflection.append(float(effect._angle[0, 0] - bench.robot.data.joint_pos[0, 0]))
+        bench.env.simulate(torch.full((1, 1), target, dtype=torch.float64))
+    bench.env.close()
+    assert max(deflection) - min(deflection) == pytest.approx(gap, rel=0.1)
