@@ -70,8 +70,8 @@ class PaceDCMotor:
         encoder_bias: [rad], (num_envs, num_joints).
         torque_enable: Whether the drive gives torque, (num_envs, 1), or ``None`` when all do.
         holds_line: Whether, between two calls, the simulator holds a torque that runs along the torque-speed line
-            (``held_effort`` with its slope in ``joint_viscous_friction``) rather than one number. It should where it
-            takes several physics steps between two calls.
+            (``held_effort`` with its slope in ``joint_viscous_friction``) rather than one number: more exact, for
+            simulators that take both.
         centred: Whether the first call of a control step gives the mean of the old and the new torque. Where a
             simulator updates speeds before positions (semi-implicit Euler), a torque acts half a physics step early;
             with this it does not.

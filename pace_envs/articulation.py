@@ -324,6 +324,20 @@ class Articulation:
         if not found:
             raise ValueError(f"No drive has the effect {effect!r}. Present: {', '.join(self.effects) or 'none'}.")
 
+    def write_effect_to_sim(self, actuator: PaceDCMotor, effect: Effect, values: torch.Tensor) -> None:
+        """Write all parameters of an effect of a drive.
+
+        Args:
+            actuator: The drive.
+            effect: One of its effects.
+            values: In the order of its parameters, (rows of the effect, joints of the drive, parameters).
+        """
+        for parameter, value in zip(effect.parameters, values.unbind(dim=-1), strict=True):
+            effect.set_parameter(parameter.name, value)
+        self._write_passive(actuator)
+        if effect.overrides("write_model"):
+            self._write_model(actuator, effect)
+
     def _joint_list(self, actuator: PaceDCMotor) -> list[int]:
         ids = actuator.joint_indices
         return list(range(self.num_joints)) if isinstance(ids, slice) else torch.as_tensor(ids).tolist()
@@ -420,8 +434,8 @@ class Articulation:
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
-            actuator.holds_line = self._sim.cfg.substeps > 1 or actuator.cfg.control_decimation > 1
-            actuator.centred = actuator.cfg.control_decimation > 1 and not self._sim.is_trapezoidal
+            actuator.holds_line = actuator.cfg.control_decimation > 1
+            actuator.centred = actuator.holds_line and self._sim.is_semi_implicit
             if actuator.effects is not None:
                 actuator.effects.is_trapezoidal = self._sim.is_trapezoidal
             driven = actuator.joint_indices

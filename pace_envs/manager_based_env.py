@@ -105,7 +105,7 @@ class ManagerBasedEnv(gym.Env):
     @property
     def physics_dt(self) -> float:
         """Physics time step [s]."""
-        return self.cfg.sim.dt / self.cfg.sim.substeps
+        return self.cfg.sim.dt
 
     @property
     def step_dt(self) -> float:

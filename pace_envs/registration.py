@@ -116,8 +116,7 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
-    The drives are called as before, their torques held over the finer steps, which are Runge-Kutta's. With an effect
-    that has fast dynamics of its own, the drives are called at every physics step instead, and it stays implicit.
+    The finer steps are Runge-Kutta's, unless a drive has an effect with fast dynamics of its own, which must be implicit.
 
     Raises:
         ValueError: If the present time step is no multiple of the finer one.
@@ -130,14 +129,13 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
         )
     if ratio == 1:
         return
+    cfg.sim.dt /= ratio
+    cfg.decimation *= ratio
     drives = cfg.scene.robot.actuators.values()
-    if any(effect.effect_class.every_physics_step for drive in drives for effect in effect_cfgs(drive.effects)):
-        cfg.sim.dt /= ratio
-        cfg.decimation *= ratio
-        for drive in drives:
-            drive.control_decimation *= ratio
-    else:
-        cfg.sim.substeps, cfg.sim.integrator = ratio, "rk4"
+    for drive in drives:
+        drive.control_decimation *= ratio
+    if not any(effect.effect_class.is_stiff for drive in drives for effect in effect_cfgs(drive.effects)):
+        cfg.sim.integrator = "rk4"
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

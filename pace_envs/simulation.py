@@ -29,10 +29,7 @@ class SimulationCfg:
     """How the physics is stepped."""
 
     dt: float = 0.0025
-    """Time of a step [s]: the drives' torques are computed once for each."""
-
-    substeps: int = 1
-    """Physics steps that a step is divided into; torques are held meanwhile."""
+    """Physics time step [s]."""
 
     integrator: Literal["implicitfast", "implicit", "euler", "rk4"] = "implicitfast"
     """MuJoCo's integrator."""
@@ -41,7 +38,7 @@ class SimulationCfg:
     """Gravity [m/s^2]."""
 
     friction_timeconst: float | None = None
-    """Time constant of the joints' Coulomb friction [s]; ``None``: two physics steps, the stiffest stable one.
+    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps, the stiffest stable one.
 
     MuJoCo's default of 20 ms is soft: a stuck joint creeps.
     """
@@ -65,6 +62,11 @@ class Simulation:
     is_trapezoidal = False
     """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
 
+    @property
+    def is_semi_implicit(self) -> bool:
+        """Whether speeds are updated first, and positions move with the new ones."""
+        return self.cfg.integrator != "rk4"
+
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
         """Compile the model and start the thread pool.
 
@@ -80,8 +82,6 @@ class Simulation:
             raise ValueError(f"num_envs is {num_envs}, expected at least 1.")
         if not (np.isfinite(cfg.dt) and 0 < cfg.dt <= 0.1):
             raise ValueError(f"sim.dt is {cfg.dt} s, expected a time step in (0, 0.1] s.")
-        if not (isinstance(cfg.substeps, int) and cfg.substeps >= 1):
-            raise ValueError(f"sim.substeps is {cfg.substeps!r}, expected an integer >= 1.")
         if cfg.integrator not in _INTEGRATORS:
             raise ValueError(f"Unknown integrator {cfg.integrator!r}. Available: {', '.join(_INTEGRATORS)}.")
         self.cfg = cfg
@@ -135,15 +135,10 @@ class Simulation:
         self._constants_changed = True
 
     def step(self) -> None:
-        """Advance every simulation by ``dt``."""
+        """Advance every simulation by one physics step."""
         if self._constants_changed:
             self._update_constants()
-        self.batch.step(nstep=self.cfg.substeps)
-
-    @property
-    def physics_dt(self) -> float:
-        """Time of a physics step [s]."""
-        return self.cfg.dt / self.cfg.substeps
+        self.batch.step()
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
@@ -189,14 +184,14 @@ class Simulation:
         sensors = [s for s in spec.sensors if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
         for element in [*sensors, *spec.actuators, *spec.keys]:
             spec.delete(element)
-        spec.option.timestep = self.physics_dt
+        spec.option.timestep = self.cfg.dt
         spec.option.integrator = _INTEGRATORS[self.cfg.integrator]
         spec.option.gravity = self.cfg.gravity
         # a simulation that diverges must show it instead of starting again at rest
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if not self.cfg.contacts:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        timeconst = 2 * self.physics_dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
+        timeconst = 2 * self.cfg.dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
         impedance = self.cfg.friction_impedance
         for joint in spec.joints:
             joint.solref_friction = [timeconst, 1.0]

@@ -48,7 +48,7 @@ class Problem:
     @property
     def physics_dt(self) -> float:
         """Physics step [s]."""
-        return self.env_cfg.sim.dt / self.env_cfg.sim.substeps
+        return self.env_cfg.sim.dt
 
     @property
     def effects(self) -> list[str]:

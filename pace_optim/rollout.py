@@ -101,16 +101,15 @@ class Rollout:
         self.env.scene.reset()
         copies = {name: values.repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
         self.space.apply(self.env, self.physical, copies)
-        offset = 0.0 if initial_offset is None else initial_offset.repeat_interleave(count, dim=0)
-        self._set_initial_state(offset)
+        self.begin(0.0 if initial_offset is None else initial_offset.repeat_interleave(count, dim=0))
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
         data = self.dataset
         weights = self._where.double() / self._where.sum()
         counts = self._where.any(dim=1).tolist()
-        for self._step, sim_dof_pos in self._samples():
-            k = self._step
+        for k, sim_dof_pos in self._samples():
+            self._step = k
             if counts[k]:
                 self.weight = self._rows(weights[k, :, None])
                 yield sim_dof_pos, self._rows(data.measured[k])
@@ -170,7 +169,21 @@ class Rollout:
             return per_recording.expand(self.env.num_envs, -1)
         return per_recording.repeat(self.num_candidates, 1)
 
-    def _set_initial_state(self, offset: torch.Tensor | float) -> None:
+    def look_at(self, where: torch.Tensor) -> None:
+        """Say which samples count, (T, R) bool."""
+        self._where = where
+
+    def samples_at_every_step(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """As iterating, but at every control step up to the last sample that counts."""
+        for k, sim_dof_pos in self._samples():
+            yield sim_dof_pos, self._rows(self.dataset.measured[k])
+
+    def begin(self, offset: torch.Tensor | float = 0.0) -> None:
+        """Put every environment at its recording's first sample, with the parameters that it has.
+
+        Args:
+            offset: Added to the first positions, (num_envs, n) [rad].
+        """
         position = self._rows(self.dataset.measured[0]).clone()
         for actuator in self.robot.actuators.values():
             ids = actuator.joint_indices

@@ -87,7 +87,7 @@ def test_every_configuration_is_a_fresh_one():
     cfg = load_env_cfg("Pace-AnymalD-v0")
     assert cfg.scene.robot.actuators["legs"].stiffness == 85.0
     env = gym.make("Pace-AnymalD-v0", cfg=cfg, num_envs=7, physics_dt=0.0005, delay_mode="effort", seed=3)
-    assert env.unwrapped.num_envs == 7 and env.unwrapped.cfg.sim.substeps == 5
+    assert env.unwrapped.num_envs == 7 and env.unwrapped.cfg.decimation == 5
     assert env.unwrapped.scene["robot"].actuators["legs"].cfg.delay_mode == "effort"
     assert (cfg.scene.num_envs, cfg.decimation, cfg.seed) == (1, 1, None)
     assert cfg.scene.robot.actuators["legs"].delay_mode == "command"

@@ -87,8 +87,8 @@ class Effect:
     """Whether it can also act with the opposite sign of its probes."""
     shared: ClassVar[bool] = False
     """Whether it is one for the whole robot by its nature."""
-    every_physics_step: ClassVar[bool] = False
-    """Whether it has fast dynamics of its own, so that the drive must be called at every physics step."""
+    is_stiff: ClassVar[bool] = False
+    """Whether it has fast dynamics of its own, so that the simulation must be implicit."""
     parts_motor_and_link: ClassVar[bool] = False
     """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
     twins: ClassVar[tuple[str, ...]] = ()

@@ -160,7 +160,7 @@ class PreslidingFriction(Effect):
     source = "Dahl 1968; Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
     probes = ({"stiffness": 1000.0}, {"stiffness": 300.0}, {"stiffness": 100.0}, {"stiffness": 30.0})
     two_sided = False
-    every_physics_step = True
+    is_stiff = True
     separates = "a slow triangle of small amplitude"
     stiffness: torch.Tensor
 

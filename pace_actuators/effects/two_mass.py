@@ -44,7 +44,7 @@ class _TwoMass(Effect):
     """What elasticity and backlash share."""
 
     stage = "transmission"
-    every_physics_step = True
+    is_stiff = True
     two_sided = False
     parts_motor_and_link = True
     numerical_damping: ClassVar[float] = 0.05

@@ -50,6 +50,7 @@ def design_motion(
         drafts = draft_recordings(env, trajectories, drive, cfg.load)
         return Problem(
             task=cfg.task,
+            plain_cfg=env_cfg,
             env_cfg=env_cfg,
             dataset=make_dataset(drafts, train_fraction=1),
             space=space,

@@ -23,12 +23,13 @@ class TwinSimulation(Simulation):
     """
 
     is_trapezoidal = True
+    is_semi_implicit = False
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int, path: ReferencePath):
         """Set up the state.
 
         Args:
-            cfg: The configuration; time step and substeps count.
+            cfg: The configuration; the time step counts.
             spec: The robot's model.
             num_envs: Number of environments, a multiple of the path's recordings.
             path: The reference.
@@ -37,13 +38,13 @@ class TwinSimulation(Simulation):
         self.device = torch.device("cpu")
         self.model = self._compile(spec)
         self.batch = None
-        model, options = self.model, {"dtype": torch.float64}
+        model = self.model
         self._fields: dict[str, torch.Tensor] = {}
-        self.qpos = torch.zeros(num_envs, model.nq, **options)
-        self.qvel = torch.zeros(num_envs, model.nv, **options)
-        self.qfrc_applied = torch.zeros(num_envs, model.nv, **options)
-        self._implicit = torch.zeros(num_envs, model.nv, **options)
-        self._load = torch.zeros(num_envs, model.nv, **options)
+        self.qpos = torch.zeros(num_envs, model.nq, dtype=torch.float64)
+        self.qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self.qfrc_applied = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self._implicit = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self._load = torch.zeros(num_envs, model.nv, dtype=torch.float64)
         self._constants_changed = False
         self._steps = 0
         self._columns = path.columns
@@ -100,22 +101,18 @@ class TwinSimulation(Simulation):
         friction = self._get(self.expand("dof_frictionloss")).view(shape)
         implicit = self._get(self._implicit).view(shape)
         stiffness = path.stiffness[min(k, len(path.stiffness) - 1)]
-        h = self.physics_dt
+        h = self.cfg.dt
         total = inertia + self._armature.view(shape)
         resisting = total + h * (0.5 * damping + implicit)
-        drag = damping + implicit
-        push = effort + torque
+        end = path.position[k + 1]
+        reference = torch.lerp(path.position[k], end, (part + 0.5) / self._steps_per_interval)
+        bent = torch.add(q, v, alpha=0.5 * h).sub_(reference).mul_(stiffness)
+        push = bent.add_(effort + torque).addcmul_(damping + implicit, v, value=-1)
+        free = torch.addcdiv(v, push, resisting, value=h)
         stop = h * friction / resisting
-        pieces = self._steps_per_interval * self.cfg.substeps
-        start, end = path.position[k], path.position[k + 1]
-        for i in range(self.cfg.substeps):
-            where = (part * self.cfg.substeps + i + 0.5) / pieces
-            reference = torch.lerp(start, end, where)
-            bent = torch.add(q, v, alpha=0.5 * h).sub_(reference).mul_(stiffness)
-            free = torch.addcdiv(v, bent.add_(push).addcmul_(drag, v, value=-1), resisting, value=h)
-            new = free - torch.clamp(free, -stop, stop)
-            q = torch.add(q, v + new, alpha=0.5 * h)
-            v = new
+        new = free - torch.clamp(free, -stop, stop)
+        q = torch.add(q, v + new, alpha=0.5 * h)
+        v = new
         self._set(self.qpos, q.view(-1, n))
         self._set(self.qvel, v.view(-1, n))
         self._load[:, self._columns] = (torque + stiffness * (q - end)).view(-1, n)

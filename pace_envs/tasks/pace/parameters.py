@@ -121,6 +121,8 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     joints = tuple(cfg.joint_order)
     result = []
     for effect in effect_cfgs(cfg.effects):
+        if effect.env_rows is not None:  # only tried, side by side with others
+            continue
         own = tuple(effect.joints(joints))
         ids = [joints.index(joint) for joint in own]
         kind = effect.effect_class

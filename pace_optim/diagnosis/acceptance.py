@@ -1,0 +1,96 @@
+"""Whether a richer model pays, on recordings that it was not fitted to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy import stats
+
+_BLOCK_S = 1.0
+FIRST_RATIO = 1.10
+"""By how much the first effect must lower the validation RMSE."""
+NEXT_RATIO = 1.25
+"""And each further one."""
+LEVEL = 0.02
+"""Chance of a false alarm over all that was tried."""
+CLEAR_RATIO = 1.5
+"""A fall that is this large needs no more than ``CLEAR_T``."""
+CLEAR_T = 2.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockErrors:
+    """Mean square errors of n joints in B blocks of one second of validation."""
+
+    square: torch.Tensor
+    """(B, n) [rad²]."""
+    weight: torch.Tensor
+    """Samples of each block, (B,)."""
+
+    @property
+    def mse(self) -> torch.Tensor:
+        """Of each joint, (n,) [rad²]."""
+        return (self.square * self.weight[:, None]).sum(dim=0) / self.weight.sum()
+
+
+def block_errors(error: torch.Tensor, where: torch.Tensor, control_dt: float) -> BlockErrors:
+    """Cut errors into blocks.
+
+    Args:
+        error: (T, R, n) at every control step.
+        where: Which samples count, (T, R) bool.
+        control_dt: [s].
+    """
+    length = max(1, round(_BLOCK_S / control_dt))
+    squares, weights = [], []
+    for r in range(where.shape[1]):
+        at = where[:, r].nonzero()[:, 0]
+        if not len(at):
+            continue
+        # blocks of time, so that coarse sampling has the same ones
+        block = (at - at[0]) // length
+        for b in range(int(block[-1]) + 1):
+            own = at[block == b]
+            if len(own) * 2 >= (block == 0).sum():
+                squares.append(error[own, r].double().square().mean(dim=0))
+                weights.append(len(own))
+    return BlockErrors(square=torch.stack(squares), weight=torch.tensor(weights, dtype=torch.float64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """A candidate against the present model on one joint."""
+
+    ratio: float
+    """RMSE before / after."""
+    t: float
+    """t statistic of the blocks' log ratio."""
+    significant: bool
+
+
+def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first: bool) -> Judgement:
+    """Compare two models block by block.
+
+    Neighbouring samples are alike, blocks of one second hardly: the mean of the blocks' log(MSE before / MSE after)
+    is held against its scatter, and the threshold is Student's for the chance that the best of ``tried`` candidates
+    looks this good by luck.
+
+    Args:
+        before: The present model's errors.
+        after: The candidate's.
+        joint: Which joint.
+        tried: How many candidates were tried, over all joints.
+        first: Whether the present model has no effect yet.
+    """
+    ratio = math.sqrt(float(before.mse[joint]) / max(float(after.mse[joint]), 1e-300))
+    logs = (before.square[:, joint].clamp(min=1e-30) / after.square[:, joint].clamp(min=1e-30)).log()
+    count = len(logs)
+    if count < 4:
+        return Judgement(ratio=ratio, t=0.0, significant=False)
+    t = float(logs.mean() / (logs.std() / math.sqrt(count)).clamp(min=1e-12))
+    threshold = float(stats.t.isf(LEVEL / max(1, tried), count - 1))
+    least = FIRST_RATIO if first else NEXT_RATIO
+    enough = t > threshold or (ratio >= CLEAR_RATIO and t > CLEAR_T)
+    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)

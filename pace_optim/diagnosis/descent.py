@@ -1,0 +1,153 @@
+"""Levenberg–Marquardt of every joint of every model at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.model import JointModel
+from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.least_squares import bounded_step
+
+_STEP = 1e-4
+_TRIALS = (1.0, 30.0, 1e3)
+_ENOUGH = 3e-4
+"""A joint whose score falls by less than this part in an iteration has converged."""
+_STRIDE = 2
+"""Only every so many control steps count in a fit."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Fitted:
+    """A model fitted to the training recordings."""
+
+    model: JointModel
+    own: type[Effect] | None
+    x: torch.Tensor
+    """Normalised, (n, P)."""
+    score: torch.Tensor
+    """Mean square error of each joint, (n,) [rad²]."""
+    jacobian: torch.Tensor | None = None
+    """Derivatives of the errors at x (P, K, R, n) float32, where wanted."""
+    error: torch.Tensor | None = None
+    """At x, (K, R, n) float32, where wanted."""
+
+
+def fit_side_by_side(
+    problem: TwinProblem,
+    starts: Sequence[Fitted],
+    max_iteration: int = 12,
+    keep_jacobian: bool = False,
+) -> list[Fitted]:
+    """Fit several models from their present x, each joint by itself.
+
+    Every iteration simulates, for each model, the favoured step, its neighbours (for the next Jacobian) and steps
+    with more damping. Joints do not influence each other, so that one row serves all of them.
+
+    Args:
+        problem: The joints simulated alone.
+        starts: Models and where they start.
+        max_iteration: Largest number of iterations.
+        keep_jacobian: Whether the last Jacobian is kept.
+    """
+    slots = [Slot(model=s.model, own=s.own, rows=s.model.size + len(_TRIALS)) for s in starts]
+    batch = SideBySide(problem, slots, training=True)
+    where = batch.dataset.train
+    samples = float(where[where.any(dim=1)][::_STRIDE].sum())
+    ways = [_Way(start, samples, keep_jacobian) for start in starts]
+    for _ in range(max_iteration):
+        rows = [way.ask() for way in ways]
+        physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
+        errors = batch.split(batch.simulate(physical, where, _STRIDE))
+        for way, x, error in zip(ways, rows, errors, strict=True):
+            way.tell(x, error)
+        if all(way.finished for way in ways):
+            break
+    return [way.result() for way in ways]
+
+
+class _Way:
+    """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
+
+    def __init__(self, start: Fitted, samples: float, keep: bool):
+        self.model, self.own, self._samples, self._keep = start.model, start.own, samples, keep
+        n, size = start.x.shape
+        self.x = start.x.clone()
+        self.score = torch.full((n,), torch.inf, dtype=torch.float64)
+        self._damping = torch.full((n,), 1e-3, dtype=torch.float64)
+        self._hessian = torch.zeros(n, size, size, dtype=torch.float64)
+        self._gradient = torch.zeros(n, size, dtype=torch.float64)
+        self._known = torch.zeros(n, dtype=torch.bool)
+        self._still = torch.zeros(n, dtype=torch.long)
+        self._free = start.model.free
+        self._jacobian: torch.Tensor | None = None
+        self._error: torch.Tensor | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether no joint gets any better."""
+        return bool((self._still >= 2).all())
+
+    def ask(self) -> torch.Tensor:
+        """Normalised rows, (P + trials, n, P)."""
+        n, size = self.x.shape
+        trials = self.x.repeat(len(_TRIALS), 1, 1)
+        for j in range(n):
+            free = self._free[j]
+            if not bool(self._known[j]) or not bool(free.any()):
+                continue
+            at = free.nonzero()[:, 0]
+            hessian, gradient = self._hessian[j][at[:, None], at], self._gradient[j][at]
+            for t, factor in enumerate(_TRIALS):
+                trials[t, j, at] = bounded_step(self.x[j, at], hessian, gradient, float(self._damping[j]) * factor)
+        favoured = trials[0]
+        self._step = torch.where(favoured > 0, -_STEP, _STEP).to(favoured.dtype)
+        neighbours = favoured.repeat(size, 1, 1)
+        for p in range(size):
+            neighbours[p, :, p] += self._step[:, p]
+        return torch.cat([favoured[None], neighbours, trials[1:]])
+
+    def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
+        """Take the best row of each joint."""
+        size = self.x.shape[1]
+        scores = error.square().sum(dim=(1, 2), dtype=torch.float64) / self._samples
+        choice = [0, *range(1 + size, len(x))]
+        best = scores[choice].argmin(dim=0)
+        lowest = scores[choice].gather(0, best[None])[0]
+        better = lowest < self.score
+        # a joint whose Jacobian was not known has not moved: its favoured row is x itself
+        fresh = ~self._known
+        gain = (self.score - lowest) / self.score
+        self._still = torch.where(fresh | (gain > _ENOUGH), 0, self._still + 1)
+        chosen = x[choice].gather(0, best[None, :, None].expand(1, -1, size))[0]
+        moved = better & ~fresh
+        self.x = torch.where(moved[:, None], chosen, self.x)
+        self.score = torch.where(better, lowest, self.score)
+        factor = torch.tensor(_TRIALS, dtype=torch.float64)[best]
+        lowered = (self._damping * factor / 10).clamp(min=1e-9)
+        self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * 1e3))
+        at_favoured = fresh | (moved & (best == 0))
+        self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known))
+        if bool(at_favoured.any()):
+            difference = error[1 : 1 + size] - error[:1]
+            columns = difference / self._step.T[:, None, None, :].float()
+            hessian = torch.einsum("pkrj,skrj->jps", columns, columns).double() / self._samples
+            gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).double() / self._samples
+            self._hessian = torch.where(at_favoured[:, None, None], hessian, self._hessian)
+            self._gradient = torch.where(at_favoured[:, None], gradient, self._gradient)
+            if self._keep:
+                mask = at_favoured.float()
+                old_j = torch.zeros_like(columns) if self._jacobian is None else self._jacobian
+                old_e = torch.zeros_like(error[0]) if self._error is None else self._error
+                self._jacobian = columns * mask + old_j * (1 - mask)
+                self._error = error[0] * mask + old_e * (1 - mask)
+
+    def result(self) -> Fitted:
+        """Where it ended."""
+        return Fitted(
+            model=self.model, own=self.own, x=self.x, score=self.score, jacobian=self._jacobian, error=self._error
+        )

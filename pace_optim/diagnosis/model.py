@@ -1,0 +1,110 @@
+"""A model of each joint alone: base parameters, effects, and where each is free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.problem import Problem
+
+BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
+"""The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointModel:
+    """The parameters of n joints, each with the same P entries: base, then those of effects."""
+
+    effects: tuple[type[Effect], ...]
+    """Effects in the order of their entries."""
+    has: torch.Tensor
+    """Which joint has which effect, (effects, n) bool; a joint without it keeps its null values."""
+    lower: torch.Tensor
+    """(n, P), physical."""
+    upper: torch.Tensor
+    """(n, P), physical."""
+    log: torch.Tensor
+    """Which entries have a logarithmic scale, (P,) bool."""
+
+    @classmethod
+    def base(cls, problem: Problem) -> JointModel:
+        """The base model with the bounds of a problem."""
+        space, n = problem.space, len(problem.joint_names)
+        lower = [space.lower[space[name]].expand(n) for name in BASE]
+        upper = [space.upper[space[name]].expand(n) for name in BASE]
+        return cls(
+            effects=(),
+            has=torch.zeros(0, n, dtype=torch.bool),
+            lower=torch.stack(lower, dim=1),
+            upper=torch.stack(upper, dim=1),
+            log=torch.zeros(len(BASE), dtype=torch.bool),
+        )
+
+    @property
+    def size(self) -> int:
+        """Entries P of each joint."""
+        return len(self.log)
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.lower)
+
+    @property
+    def free(self) -> torch.Tensor:
+        """Which entries can be fitted, (n, P) bool."""
+        result = self.upper > self.lower
+        for effect, has in zip(self.effects, self.has, strict=True):
+            result[:, self.columns(effect)] &= has[:, None]
+        return result
+
+    def columns(self, effect: type[Effect]) -> slice:
+        """Where an effect's entries are."""
+        start = len(BASE)
+        for other in self.effects:
+            if other is effect:
+                break
+            start += len(other.parameters)
+        return slice(start, start + len(effect.parameters))
+
+    def with_effect(self, effect: type[Effect], has: torch.Tensor) -> JointModel:
+        """The same with one more effect on some joints, (n,) bool."""
+        n = self.num_joints
+        bounds = [
+            torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64).expand(n, -1)
+            for side in ("lower", "upper")
+        ]
+        return JointModel(
+            effects=(*self.effects, effect),
+            has=torch.cat([self.has, has[None]]),
+            lower=torch.cat([self.lower, bounds[0]], dim=1),
+            upper=torch.cat([self.upper, bounds[1]], dim=1),
+            log=torch.cat([self.log, torch.tensor([p.scale == "log" for p in effect.parameters])]),
+        )
+
+    def to_physical(self, x: torch.Tensor) -> torch.Tensor:
+        """Physical values of normalised ones (…, n, P)."""
+        low, high = self._ends()
+        value = low + (x + 1) / 2 * (high - low)
+        return torch.where(self.log, value.exp(), value).clamp(self.lower, self.upper)
+
+    def to_normalised(self, physical: torch.Tensor) -> torch.Tensor:
+        """Normalised values of physical ones (…, n, P); 0 where the bounds are equal."""
+        low, high = self._ends()
+        value = torch.where(self.log, physical.clamp(min=1e-300).log(), physical)
+        width = high - low
+        return torch.where(width > 0, (value - low) / width.clamp(min=1e-300) * 2 - 1, 0.0).clamp(-1.0, 1.0)
+
+    def _ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        low = torch.where(self.log, self.lower.clamp(min=1e-300).log(), self.lower)
+        high = torch.where(self.log, self.upper.clamp(min=1e-300).log(), self.upper)
+        return low, high
+
+
+def start_values(effect: type[Effect], values: dict[str, float]) -> torch.Tensor:
+    """Physical entries of an effect, (parameters,), inside their bounds."""
+    return torch.tensor(
+        [min(max(values.get(p.name, p.start), p.lower), p.upper) for p in effect.parameters], dtype=torch.float64
+    )

@@ -1,0 +1,171 @@
+"""Which effects could explain what is left: the score test through the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from pace_actuators.effects import Effect, probe_points
+from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.model import start_values
+from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.joint_twins.problem import TwinProblem
+
+_FOLDS = 5
+_BLOCK_S = 1.0
+_STRIDE = 2
+_AT_BOUND = 1e-3
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Probe:
+    """One effect at small values, and what it would explain of each joint's error."""
+
+    effect: type[Effect]
+    values: torch.Tensor
+    """Physical values, (n, parameters)."""
+    score: torch.Tensor
+    """Part of the joint's squared error that it explains beyond the base model, cross-validated, (n,)."""
+    size: torch.Tensor
+    """Multiple of the probe that fits best, (n,)."""
+
+
+def screen(
+    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+) -> list[Probe]:
+    """Look at each effect at its probes.
+
+    With e the error, J its derivatives by the parameters that the model has, and S the change that a probe makes, e is
+    regressed on [J] and on [J, S], both cross-validated over interleaved blocks of one second:
+
+        score = 1 - SSE[J, S] / SSE[J]
+
+    Args:
+        problem: The joints simulated alone.
+        now: The present model, fitted, with its Jacobian.
+        effects: What is tried.
+        effort: Typical torque of each joint, (n,) [N m].
+    """
+    model = now.model
+    slots, values, probes = [Slot(model=model, own=None, rows=1)], [model.to_physical(now.x)[None]], []
+    everywhere = torch.ones(model.num_joints, dtype=torch.bool)
+    for effect in effects:
+        own = [_probe_values(effect, point, effort) for point in probe_points(effect)]
+        slots.append(Slot(model=model.with_effect(effect, everywhere), own=effect, rows=len(own)))
+        values.append(torch.stack([torch.cat([model.to_physical(now.x), each], dim=1) for each in own]))
+        probes += [(effect, each) for each in own]
+    batch = SideBySide(problem, slots, training=True)
+    where = batch.dataset.train
+    errors = batch.simulate(values, where, _STRIDE)
+    blocks = _blocks(where, problem.control_dt)
+    jacobian = _free_columns(now)
+    scores, sizes = _explained(errors[0], jacobian, errors[1:] - errors[:1], blocks)
+    result = []
+    for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
+        allowed = size > 0 if not effect.two_sided else torch.ones_like(size, dtype=torch.bool)
+        result.append(Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size))
+    return result
+
+
+def _probe_values(effect: type[Effect], point: dict[str, float], effort: torch.Tensor) -> torch.Tensor:
+    """A probe's physical values on each joint, (n, parameters): small torques for small drives."""
+    values = start_values(effect, point).repeat(len(effort), 1)
+    for k, parameter in enumerate(effect.parameters):
+        if parameter.unit == "N m" and parameter.null == 0.0:
+            values[:, k] *= (effort / _USUAL_EFFORT).clamp(max=1.0)
+    return values
+
+
+_USUAL_EFFORT = 5.0
+"""Torque for which the probes' torques are meant [N m]."""
+
+
+def starts_of(probe: Probe) -> torch.Tensor:
+    """Where a refit starts: the probe, its amplitude multiplied by what fits best, (n, parameters)."""
+    values = probe.values.clone()
+    factor = probe.size.clamp(-20.0, 20.0)
+    factor = torch.where(factor.abs() < 0.2, torch.sign(factor) * 0.2, factor)
+    for k, p in enumerate(probe.effect.parameters):
+        if p.null == 0.0:
+            values[:, k] = (values[:, k] * factor).clamp(p.lower, p.upper)
+    return values
+
+
+def _blocks(where: torch.Tensor, control_dt: float) -> torch.Tensor:
+    """Fold of each kept sample, (K, R); -1 where there is none."""
+    steps = where.any(dim=1).nonzero()[:, 0][::_STRIDE]
+    second = (steps * control_dt / _BLOCK_S).long()
+    fold = (second[:, None] + torch.arange(where.shape[1])) % _FOLDS
+    return torch.where(where[steps], fold, -1)
+
+
+def _free_columns(now: Fitted) -> torch.Tensor:
+    """The Jacobian, without entries that sit at a bound, (P, K, R, n)."""
+    columns = now.jacobian.clone()
+    fixed = (now.x.abs() > 1 - _AT_BOUND) | ~now.model.free
+    for j, p in fixed.nonzero().tolist():
+        columns[p, ..., j] = 0.0
+    return columns
+
+
+def _explained(
+    error: torch.Tensor, jacobian: torch.Tensor, changes: torch.Tensor, fold: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Score and coefficient of every change, (probes, n) each.
+
+    Args:
+        error: (K, R, n).
+        jacobian: (P, K, R, n).
+        changes: (probes, K, R, n).
+        fold: (K, R).
+    """
+    n, size = error.shape[-1], len(jacobian)
+    scores = torch.zeros(len(changes), n, dtype=torch.float64)
+    sizes = torch.zeros_like(scores)
+    for j in range(n):
+        per_fold = []
+        columns = torch.cat([jacobian[..., j], error[None, ..., j]])
+        scale = columns.flatten(1).norm(dim=1).clamp(min=1e-12)
+        columns = columns / scale[:, None, None]
+        probes = changes[..., j]
+        amplitude = probes.flatten(1).norm(dim=1).clamp(min=1e-12)
+        probes = probes / amplitude[:, None, None]
+        for f in range(_FOLDS):
+            at = fold == f
+            a, s = columns[:, at], probes[:, at]
+            per_fold.append(((a @ a.T).double(), (s @ a.T).double(), s.square().sum(dim=1, dtype=torch.float64)))
+        base = _cross_validated([g for g, _, _ in per_fold], size)
+        for i in range(len(changes)):
+            if float(amplitude[i]) < 1e-9:
+                continue
+            grams = []
+            for g, s, square in per_fold:
+                whole = torch.empty(size + 2, size + 2, dtype=torch.float64)
+                order = [*range(size), size + 1]
+                whole[torch.tensor(order)[:, None], torch.tensor(order)] = g
+                whole[size, order] = whole[order, size] = s[i]
+                whole[size, size] = square[i]
+                grams.append(whole)
+            total = _cross_validated(grams, size + 1)
+            scores[i, j] = 1 - total / base
+            beta = _solve(sum(grams), size + 1)
+            sizes[i, j] = -float(beta[size] * scale[size] / amplitude[i])
+    return scores, sizes
+
+
+def _cross_validated(grams: list[torch.Tensor], size: int) -> float:
+    """Squared error of regressing the last column on the first ``size``, each fold by the others."""
+    whole, total = sum(grams), 0.0
+    for gram in grams:
+        beta = _solve(whole - gram, size)
+        a, b, c = gram[:size, :size], gram[:size, -1], gram[-1, -1]
+        total += float(c - 2 * beta @ b + beta @ a @ beta)
+    return max(total, 1e-30)
+
+
+def _solve(gram: torch.Tensor, size: int) -> torch.Tensor:
+    a = gram[:size, :size] + _RIDGE * torch.eye(size, dtype=torch.float64)
+    return torch.linalg.solve(a, gram[:size, -1])
