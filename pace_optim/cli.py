@@ -27,7 +27,10 @@ def run_cli(main: Callable[[], int | None]) -> int:
 
     What a user can mend (ValueError, KeyError, OSError) is printed to stderr as one line, ``error: ...``, and exits
     with 2; an interruption exits with 130. With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
+    Modules named on the command line, or in a run's settings, may lie in the present folder.
     """
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # as `python -m` would find them
     try:
         return main() or 0
     except KeyboardInterrupt:

@@ -1,0 +1,228 @@
+"""Effects in fits: the log's clock, single joints beside the whole robot, and what a fit finds and writes."""
+
+import copy
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from effect_envs import null_values, rms
+from problems import ANYMAL, BENCH, CALM, DT, chirp, env_cfg, legs_chirp, make_problem, record
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import pace_optim.fit as fit_module
+from pace_actuators.effects import get_effect
+from pace_envs import set_physics_dt
+from pace_optim.fit import fit
+from pace_optim.fit_settings import FitSettings
+from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.progress import ProgressLine
+from pace_optim.recording import save_recording
+
+ROOT = Path(__file__).parents[1]
+
+
+def problem_with(effects, recordings=None):
+    return make_problem(recordings or record(chirp(0.5), CALM), cfg=env_cfg()).with_effects(effects)
+
+
+def replay(problem, values):
+    """Sensed positions of one candidate at every control step, (T, R, n)."""
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
+    return torch.stack([position.clone() for _, position in rollout._samples()])
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "value", "lag"),
+    [
+        ("measurement_delay", "delay", 0.0033, lambda t: 0.0033 + 0 * t),
+        ("measurement_delay", "delay", 2 * DT, lambda t: 2 * DT + 0 * t),
+        ("clock_skew", "skew", 0.004, lambda t: -0.004 * t),
+        ("clock_skew", "skew", -0.004, lambda t: 0.004 * t),
+    ],
+)
+def test_a_late_log_is_exact_on_a_cubic_motion(effect, parameter, value, lag, monkeypatch):
+    problem = problem_with([effect])
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(problem.space.from_dict({**CALM, f"{effect}.{parameter}": value})[None])
+
+    def position(t):
+        return 0.3 - 2 * t + 5 * t**2 - 7 * t**3
+
+    steps = rollout.duration_steps
+
+    def simulated(count):
+        yield from (torch.full((1, 1), position(k * DT), dtype=torch.float64) for k in range(count))
+
+    monkeypatch.setattr(rollout, "simulated", simulated)
+    got = torch.stack([sample[0, 0] for _, sample in rollout._samples()]).numpy()
+    t = np.arange(steps) * DT
+    late = t - lag(t)
+    inside = late >= DT  # before, the robot stands where the recording begins
+    assert len(got) == steps
+    assert np.abs(got - position(late))[inside].max() < 1e-12
+
+
+def test_a_late_log_is_the_replay_read_earlier():
+    late = replay(problem_with(["measurement_delay"]), {**CALM, "measurement_delay.delay": 2 * DT})
+    assert torch.allclose(late[2:], replay(problem_with([]), CALM)[:-2], atol=1e-12)
+
+
+TWIN_CASES = {
+    "stribeck_friction": {"effort": 1.5, "velocity": 0.5},
+    "load_dependent_friction": {"coefficient": 0.2},
+    "friction_asymmetry": {"effort": 0.5},
+    "quadratic_friction": {"coefficient": 0.5},
+    "presliding_friction": {"stiffness": 10.0},
+    "friction_drift": {"ratio": -0.7, "time_constant": 1.0},
+    "torque_offset": {"effort": 1.0},
+    "parallel_spring": {"stiffness": 5.0, "rest": 0.2},
+    "torque_gain": {"gain": 0.1},
+    "proportional_gain": {"gain": 0.1},
+    "derivative_gain": {"gain": 0.5},
+    "drive_bandwidth": {"time_constant": 0.005},
+    "velocity_filter": {"time_constant": 0.02},
+    "torque_limit": {"effort": 10.0},
+    "torque_speed_limit": {"velocity": 4.0, "effort": 30.0},
+    "command_rate_limit": {"velocity": 2.0},
+    "torque_ripple": {"sine": 1.0, "cosine": 0.0, "periods": 20.0},
+    "joint_elasticity": {"stiffness": 300.0, "damping": 0.5, "encoder_side": 0.0},
+    "backlash": {"gap": 0.02, "stiffness": 3000.0, "damping": 5.0, "encoder_side": 0.0},
+    "encoder_scale": {"error": 0.03},
+    "encoder_eccentricity": {"sine": 0.01, "cosine": 0.01},
+    "other_delay": {"delay": 0.003},
+    "measurement_delay": {"delay": 0.004},
+    "payload": {"ratio": 0.2},
+    "com_offset": {"angle": 0.1},
+}
+
+
+@pytest.fixture(scope="module")
+def bench_and_twin():
+    """At physics steps of 0.5 ms, where the integrators' own errors are small."""
+    problem = make_problem(record(chirp(0.6, high=6.0), CALM), cfg=env_cfg())
+    cfg = copy.deepcopy(problem.plain_cfg)
+    set_physics_dt(cfg, 0.0005)
+    problem = dataclasses.replace(problem, env_cfg=cfg)
+    path = reference_path(problem, problem.space.from_dict(CALM), ("payload", "com_offset"))
+    return problem, twin_problem(problem, path)
+
+
+def test_the_twin_of_a_joint_moves_as_the_robot(bench_and_twin):
+    whole, twin = bench_and_twin
+    assert rms(replay(whole, CALM), replay(twin, CALM)) < 2e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TWIN_CASES)
+def test_an_effect_changes_the_twin_as_it_changes_the_robot(name, bench_and_twin):
+    values = {**CALM, **{f"{name}.{key}": value for key, value in TWIN_CASES[name].items()}}
+    changes = []
+    for problem in bench_and_twin:
+        other = problem.with_effects([name])
+        changes.append(replay(other, values) - replay(other, {**CALM, **null_values(name)}))
+    whole, alone = changes
+    assert rms(whole) > 1e-4
+    assert rms(whole, alone) < (0.15 if get_effect(name).parts_motor_and_link else 0.06) * rms(whole)
+
+
+class Silent(ProgressLine):
+    def say(self, text):
+        pass
+
+
+STRIBECK = {**CALM, "stribeck_friction.effort": 1.2, "stribeck_friction.velocity": 0.3}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A chirp, then a slow swing, of a drive with Stribeck friction."""
+    t = np.arange(0, 2.0, DT)[:, None]
+    target = np.concatenate([chirp(1.0), chirp(1.0)[-1] * np.cos(math.pi * t)])
+    cfg = env_cfg()
+    cfg.set_effects(["stribeck_friction"])
+    path = tmp_path_factory.mktemp("recorded") / "stribeck.npz"
+    save_recording(path, record(target, STRIBECK, cfg=cfg))
+    return str(path)
+
+
+def run_fit(folder, recorded, monkeypatch, **changes):
+    monkeypatch.setattr(fit_module, "write_report", lambda folder: None)
+    content = {"task": BENCH, "data": [recorded], "num_envs": 16, "log_dir": str(folder), "epsilon": 1e-9}
+    return fit(FitSettings(**{**content, "effects": ["stribeck_friction"], **changes}), Silent())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("optimizer", ["least_squares", "hybrid"])
+def test_a_fit_recovers_an_effect_and_writes_it(optimizer, recorded, tmp_path, monkeypatch):
+    result, folder = run_fit(tmp_path, recorded, monkeypatch, optimizer=optimizer, max_iteration=40)
+    content = json.loads((folder / "result.json").read_text())
+    assert content["effects"] == ["stribeck_friction"]
+    assert content["parameters"]["stribeck_friction.effort"]["servo"] == pytest.approx(1.2, abs=0.02)
+    assert content["parameters"]["stribeck_friction.velocity"]["servo"] == pytest.approx(0.3, abs=0.01)
+    assert content["parameters"]["friction"]["servo"] == pytest.approx(CALM["friction"], abs=0.02)
+    assert 0 <= content["std"]["stribeck_friction.effort"]["servo"] < 0.1
+    assert content["units"]["stribeck_friction.velocity"] == "rad/s"
+    assert result.score < 1e-9
+    events = EventAccumulator(str(folder)).Reload()
+    tags = events.Tags()["scalars"]
+    assert "result/stribeck_friction.effort/servo" in tags
+    assert "result/std/stribeck_friction.velocity/servo" in tags
+    without, _ = run_fit(tmp_path, recorded, monkeypatch, optimizer="least_squares", effects=[])
+    assert without.score > 100 * result.score
+
+
+@pytest.mark.slow
+def test_a_search_moves_effects_inside_their_bounds(recorded, tmp_path, monkeypatch):
+    result, folder = run_fit(tmp_path, recorded, monkeypatch, optimizer="cmaes", max_iteration=3)
+    found = result.parameters["stribeck_friction.velocity"]["servo"]
+    velocity = next(p for p in get_effect("stribeck_friction").parameters if p.name == "velocity")
+    assert velocity.lower <= found <= velocity.upper
+    tags = EventAccumulator(str(folder)).Reload().Tags()["scalars"]
+    assert any(tag.startswith("best/stribeck_friction.velocity") for tag in tags)
+    assert any(tag == "spread/stribeck_friction.effort" for tag in tags)
+
+
+def test_a_parameter_has_the_keys_of_its_joints_or_one_for_all():
+    cfg = env_cfg(ANYMAL)
+    cfg.sim2real.effects = ()
+    knees = [name for name in cfg.sim2real.joint_order if name.endswith("KFE")]
+    base = {name: value for name, value in CALM.items() if name != "delay"}
+    problem = make_problem(record(legs_chirp(cfg, 0.1), {**base, "delay": 1.0}, cfg=cfg), cfg=cfg)
+    problem = problem.with_effects(["torque_gain@.*KFE", "torque_offset@shared", "clock_skew"])
+    keys = {p.name: list(p.keys) for p in problem.space.parameters if "." in p.name}
+    assert keys == {"torque_gain.gain": knees, "torque_offset.effort": ["all"], "clock_skew.skew": ["all"]}
+    effect = {"torque_gain.gain": 0.1, "torque_offset.effort": 0.7, "clock_skew.skew": 0.001}
+    rollout = problem.evaluator().rollout(2)
+    one = problem.space.from_dict({**base, "delay": 1.0, **effect})
+    none = problem.space.from_dict({**base, "delay": 1.0, **dict.fromkeys(effect, 0.0)})
+    rollout.start(torch.stack([one, none]))
+    stack = next(iter(rollout.robot.actuators.values())).effects
+    at = [name in knees for name in problem.joint_names]
+    assert stack.find("torque_gain").gain[0].tolist() == [0.1 * x for x in at]
+    assert stack.find("torque_offset").effort.tolist() == [[0.7] * 12, [0.0] * 12]
+    assert stack.find("clock_skew").skew[0].tolist() == [0.001] * 12
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [
+        (["stribek_friction"], "no effect 'stribek_friction'. Did you mean 'stribeck_friction'?"),
+        (["torque_gain@elbow"], "'elbow' matches no joint. Available: servo."),
+        (["nowhere:Drag"], "cannot be imported"),
+        (["torque_gain", "torque_gain"], "named twice"),
+    ],
+)
+def test_a_wrong_effect_is_one_line_and_exit_code_2(effects, message, tmp_path):
+    command = [sys.executable, ROOT / "scripts" / "fit.py", "--task", BENCH, "--effects", *effects]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert run.returncode == 2
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("error: ") and message in line
+    assert not list(tmp_path.iterdir())
