@@ -1,0 +1,94 @@
+"""Other simulators for tests, fetched once with pip into ``.cache/``; where they cannot be, tests skip and say why."""
+
+from __future__ import annotations
+
+import os
+import site
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+CACHE = Path(os.environ.get("PACE_TEST_CACHE", ROOT / ".cache"))
+ISAACLAB = "isaaclab==2.3.0"
+MJLAB = (
+    "mjlab==1.6.0",
+    "mujoco==3.11.0",
+    "mujoco-warp==3.11.0",
+    "warp-lang==1.19.0",
+    # what these import and our own environment does not have; the rest (torch, rsl-rl, ...) is shared with ours
+    "absl-py",
+    "docstring_parser",
+    "etils",
+    "fsspec",
+    "glfw",
+    "importlib_resources",
+    "ipython",
+    "mediapy",
+    "mjviser",
+    "msgspec",
+    "numpy",
+    "prettytable",
+    "pyopengl",
+    "rich",
+    "traitlets",
+    "trimesh",
+    "typeguard",
+    "typing_extensions",
+    "tyro",
+    "viser",
+    "zipp",
+    "zstandard",
+)
+
+
+def isaaclab_wheel() -> Path:
+    """Isaac Lab's wheel (3 MB), unpacked."""
+    folder = CACHE / ISAACLAB
+    if not (folder / "isaaclab").is_dir():
+        wheels = CACHE / "wheels"
+        _pip("Isaac Lab's wheel", [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", wheels, ISAACLAB])
+        wheel = next(wheels.glob("isaaclab-2.3.0-*.whl"))
+        part = folder.with_suffix(".part")
+        with zipfile.ZipFile(wheel) as content:
+            content.extractall(part)
+        part.rename(folder)
+    return folder
+
+
+def mjlab_python() -> Path:
+    """Python of an environment with mjlab and its MuJoCo 3.11 (0.7 GB); torch and the like are ours."""
+    folder = CACHE / "mjlab-1.6.0"
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    done = folder / ".installed"
+    if not done.is_file():
+        made = subprocess.run([sys.executable, "-m", "venv", "--clear", folder], capture_output=True, text=True)
+        if made.returncode:
+            pytest.skip(f"no virtual environment for mjlab: {made.stderr.strip()[-200:]}")
+        _pip("mjlab", [python, "-m", "pip", "install", "-q", "--no-deps", *MJLAB])
+        own = next(folder.rglob("site-packages"))
+        (own / "zz_ours.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+        done.touch()
+    return python
+
+
+def run(python: str | Path, script: str, *args: str | Path) -> None:
+    """Run one of the scripts beside this file with this checkout's packages."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MJLAB_WARP_QUIET": "1"}
+    command = [str(python), str(ROOT / "tests" / script), *map(str, args)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
+    assert done.returncode == 0, f"{script}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+
+
+def _pip(what: str, command: list[object]) -> None:
+    CACHE.mkdir(exist_ok=True)
+    try:
+        done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240)
+    except subprocess.TimeoutExpired:
+        pytest.skip(f"{what} is not here, and pip did not fetch it within 240 s.")
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        pytest.skip(f"{what} is not here, and pip cannot fetch it: {last}")
