@@ -9,7 +9,7 @@ import mujoco
 import torch
 
 from pace_actuators import ActuatorActions, PaceDCMotor, match_names, resolve_joint_values
-from pace_actuators.effects import Effect
+from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.link_model import LinkModel
@@ -442,6 +442,10 @@ class Articulation:
             self.write_joint_armature_to_sim(actuator.armature, driven)
             self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)
             self.write_joint_friction_coefficient_to_sim(actuator.friction, driven)
+            configured = {cfg.effect_class.name for cfg in effect_cfgs(actuator.cfg.effects) if cfg.values}
+            for effect in [] if actuator.effects is None else actuator.effects.effects:
+                if effect.name in configured and effect.overrides("write_model"):
+                    self._write_model(actuator, effect)
 
     def _write_parameter(
         self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
