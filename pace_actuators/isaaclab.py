@@ -16,6 +16,7 @@ What differs there, and is converted here:
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
@@ -25,8 +26,10 @@ import torch
 from isaaclab.actuators import ActuatorBase, ActuatorBaseCfg
 from isaaclab.utils import configclass
 
+from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+from pace_actuators.representable import ISAACLAB, check_representable
 
 
 class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
@@ -115,7 +118,15 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
     def from_result(
         cls, path: str | Path, joint_names_expr: str | Sequence[str] | None = None, **overrides: Any
     ) -> PaceDCMotorActuatorCfg:
-        """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`. Give ``physics_dt``."""
+        """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`. Give ``physics_dt``.
+
+        What the simulator cannot represent, or only with help, is warned of.
+
+        Raises:
+            ValueError: If the result is unusable, or an effect cannot be represented at all.
+        """
+        for note in check_representable(IdentifiedDrives.load(path), ISAACLAB):
+            warnings.warn(note, stacklevel=2)
         return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import copy
 import copyreg
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +33,10 @@ from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 
 from pace_actuators.actions import ActuatorActions
 from pace_actuators.effects import DriveState
+from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+from pace_actuators.representable import MJLAB, check_representable
 
 _SMALLEST_FRICTION = 1e-9
 """Where friction changes from step to step, the model must have some from the start [N m]."""
@@ -77,7 +80,15 @@ class PaceDCMotorActuatorCfg(ActuatorCfg):  # type: ignore[misc]
     def from_result(
         cls, path: str | Path, joint_names_expr: str | Sequence[str] | None = None, **overrides: Any
     ) -> PaceDCMotorActuatorCfg:
-        """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`."""
+        """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`.
+
+        What the simulator cannot represent, or only with help, is warned of.
+
+        Raises:
+            ValueError: If the result is unusable, or an effect cannot be represented at all.
+        """
+        for note in check_representable(IdentifiedDrives.load(path), MJLAB):
+            warnings.warn(note, stacklevel=2)
         return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
 
     def build(self, entity: Any, target_ids: list[int], target_names: list[str]) -> PaceDCMotorActuator:

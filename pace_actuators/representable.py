@@ -20,6 +20,9 @@ class World:
     friction_per_step: bool = True
     """Whether a drive can change the joint's friction at every physics step."""
 
+    inertia_per_step: bool = True
+    """Whether a drive can change the joint's inertia at every physics step, by what the joint carries."""
+
     friction_hook: str = ""
     """What the user must add for that, in words; empty if nothing."""
 
@@ -28,11 +31,13 @@ HERE = World(name="the environments of pace_envs")
 MJLAB = World(
     name="mjlab",
     bodies=False,
+    inertia_per_step=False,
     friction_hook="add events['drive_friction'] = drive_friction_event() of pace_actuators.mjlab to the environment",
 )
 ISAACLAB = World(
     name="Isaac Lab",
     bodies=False,
+    inertia_per_step=False,
     friction_hook="set ArticulationCfg.class_type to a class of DriveFrictionMixin (pace_actuators.isaaclab) and "
     "isaaclab.assets.Articulation; it copies friction to the CPU at every physics step, which is slow",
 )
@@ -46,7 +51,7 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
         world: Where it is to be used.
 
     Raises:
-        ValueError: If an effect changes friction at every step, and the world has no way to do so.
+        ValueError: If an effect changes friction or inertia at every step, and the world has no way to do so.
     """
     notes = []
     for cfg in drives.effects:
@@ -57,6 +62,11 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             notes.append(
                 f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
                 "use the model that scripts/export.py --format mjcf writes, which has it."
+            )
+        if getattr(kind, "changes_armature", False) and not world.inertia_per_step:
+            raise ValueError(
+                f"{kind.name} changes the joint's inertia at every physics step, which {world.name} cannot do. Fit "
+                "again without it, or leave it out: effects=… without it, if it is of the test rig."
             )
         if kind.overrides("friction") or kind.overrides("transmission"):
             if not world.friction_per_step:

@@ -1,0 +1,75 @@
+"""A fit's result for other programs: robot models, and configurations of drives."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pace_actuators import IdentifiedDrives
+from pace_optim.atomic import write_atomically
+from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
+from pace_optim.export.mjcf import mjcf
+
+__all__ = ["FORMATS", "Export", "export"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """What is written."""
+
+    text: str
+    """The file's content."""
+
+    notes: list[str]
+    """What the format cannot hold, in words."""
+
+    def write(self, path: str | Path) -> None:
+        """Write the file, whole or not at all."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(Path(path), lambda file: file.write(self.text.encode()))
+
+
+def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
+    """Values per joint, what all joints share written out, in SI units."""
+    joints = drives.joint_names
+    names = [name for name in drives.parameters if name != "delay"]
+    content = {
+        "version": 1,
+        "joint_names": list(joints),
+        "delay_mode": drives.delay_mode,
+        "delay_s": drives.delay_s,
+        "control_dt_s": drives.at.control_dt,
+        "physics_dt_s": drives.at.physics_dt,
+        "drive": {name: dict(values) for name, values in drives.drive.items()},
+        "effects": [effect.label for effect in drives.effects],
+        "parameters": {name: drives.values(name, joints) for name in names},
+    }
+    return json.dumps(content, indent=2) + "\n", []
+
+
+FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
+    "mjcf": mjcf,
+    "mjlab": mjlab_python,
+    "isaaclab": isaaclab_python,
+    "cfg": cfg_python,
+    "json": _json,
+}
+"""Format -> what writes it."""
+
+
+def export(path: str | Path, fmt: str) -> Export:
+    """A result in another format.
+
+    Args:
+        path: ``result.json``, or the run's folder.
+        fmt: One of ``FORMATS``.
+
+    Raises:
+        ValueError: If the result is unusable, the format is unknown, or the robot's model has gone.
+    """
+    if fmt not in FORMATS:
+        raise ValueError(f"There is no format {fmt!r}. Available: {', '.join(FORMATS)}.")
+    text, notes = FORMATS[fmt](IdentifiedDrives.load(path))
+    return Export(text=text, notes=notes)

@@ -1,0 +1,170 @@
+"""What is exported holds what was identified."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from other_simulators import isaaclab_wheel, mjlab_python
+from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
+
+from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_envs import load_env_cfg
+from pace_optim.export import FORMATS, export
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def result(tmp_path):
+    return write_result(tmp_path / "result.json")
+
+
+def with_effects(path: Path, effects: list[str], parameters: dict[str, dict[str, float]]) -> Path:
+    content = json.loads(path.read_text())
+    content["effects"] += effects
+    content["parameters"] |= parameters
+    path.write_text(json.dumps(content))
+    return path
+
+
+def torques(cfg: PaceDCMotorCfg) -> np.ndarray:
+    motor, data = PaceDCMotor(cfg, JOINTS, slice(None), ENVS, physics_dt=DT, dtype=torch.float64), sequence()
+    return np.stack(
+        [
+            motor.compute(ActuatorActions(torch.tensor(c)), torch.tensor(p), torch.tensor(v)).joint_efforts.numpy()
+            for c, p, v in zip(data["command"], data["position"], data["velocity"], strict=True)
+        ]
+    )
+
+
+def test_the_mjcf_loads_and_its_joints_hold_the_values(result):
+    exported, drives = export(result, "mjcf"), IdentifiedDrives.load(result)
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    original = mujoco.MjModel.from_xml_path(str(load_env_cfg("Pace-AnymalD-v0").scene.robot.mjcf_path))
+    assert (model.nv, model.nbody) == (original.nv, original.nbody)
+    fields = {"armature": "dof_armature", "viscous_friction": "dof_damping", "friction": "dof_frictionloss"}
+    for name, field in fields.items():
+        for joint, value in drives.values(name, JOINTS).items():
+            assert getattr(model, field)[model.joint(joint).dofadr[0]] == pytest.approx(value, rel=1e-5), (name, joint)
+    assert np.allclose(model.dof_solref[6:], [2 * DT, 1.0])
+    assert np.allclose(model.body_mass, original.body_mass) and np.allclose(model.body_inertia, original.body_inertia)
+
+
+def test_the_mjcf_says_what_it_cannot_hold(result):
+    exported = export(result, "mjcf")
+    said = " ".join(exported.notes)
+    for word in ("encoder bias", "delay of 8.5 ms", "drive_bandwidth", "torque_gain", "stribeck_friction"):
+        assert word in said and word in exported.text.split("-->")[0]
+
+
+def test_the_mjcf_holds_a_payload(result):
+    share = {joint: 0.3 if joint == "LF_KFE" else 0.0 for joint in JOINTS}
+    exported = export(with_effects(result, ["payload"], {"payload.ratio": share}), "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    original = mujoco.MjModel.from_xml_path(str(load_env_cfg("Pace-AnymalD-v0").scene.robot.mjcf_path))
+    body = int(original.joint("LF_KFE").bodyid[0])
+    expected = np.where(np.arange(model.nbody) == body, 1.3, 1.0)
+    assert np.allclose(model.body_mass, expected * original.body_mass, rtol=1e-5)
+    assert np.allclose(model.body_inertia[body], 1.3 * original.body_inertia[body], rtol=1e-4)
+    assert np.allclose(model.body_ipos, original.body_ipos, atol=1e-5)
+
+
+def test_the_cfg_gives_the_same_torque(result):
+    space: dict = {}
+    exec(compile(export(result, "cfg").text, "exported.py", "exec"), space)
+    (cfg,) = space["ACTUATORS"].values()
+    expected = torques(PaceDCMotorCfg.from_result(result))
+    assert np.abs(expected).max() > 50 and np.abs(torques(cfg) - expected).max() < 1e-6
+
+
+def test_groups_of_drives_stay_groups(tmp_path):
+    """Go2 has two types of drive."""
+    cfg = load_env_cfg("Pace-Go2-v0")
+    joints = cfg.sim2real.joint_order
+    content = json.loads(write_result(tmp_path / "result.json").read_text())
+    content |= {"task": "Pace-Go2-v0", "joint_names": list(joints), "effects": [], "drive": {}}
+    for name, values in content["parameters"].items():
+        if name != "delay":
+            content["parameters"][name] = dict(zip(joints, values.values(), strict=True))
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    space: dict = {}
+    exec(export(tmp_path / "result.json", "cfg").text, space)
+    groups = space["ACTUATORS"]
+    assert set(groups) == {"hip_thigh", "calf"}
+    assert (groups["calf"].effort_limit, groups["hip_thigh"].effort_limit) == (45.43, 23.7)
+    assert len(groups["calf"].armature) == 4 and len(groups["hip_thigh"].armature) == 8
+
+
+def test_the_json_is_plain_and_complete(result):
+    content, drives = json.loads(export(result, "json").text), IdentifiedDrives.load(result)
+    assert content["delay_s"] == drives.delay_s and "delay" not in content["parameters"]
+    for name in content["parameters"]:
+        assert set(content["parameters"][name]) == set(JOINTS)
+    assert content["parameters"]["armature"]["LF_HAA"] == drives.parameters["armature"]["LF_HAA"]
+
+
+def test_the_isaac_lab_configuration_runs_there(result, tmp_path):
+    code = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from pathlib import Path\n"
+        "from isaaclab_torques import load_isaaclab, build\n"
+        f"load_isaaclab(Path({str(isaaclab_wheel())!r}))\n"
+        f"space = {{}}; exec(Path({str(tmp_path / 'cfg.py')!r}).read_text(), space)\n"
+        "actuator = build(space['ACTUATORS']['legs'])\n"
+        "print(actuator.armature[0, 1].item(), actuator.motor.time_lags[0].item())\n"
+    )
+    export(result, "isaaclab").write(tmp_path / "cfg.py")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    armature, delay = map(float, done.stdout.split())
+    assert armature == pytest.approx(0.055) and delay == pytest.approx(3.4)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_mjlab_configuration_runs_there(result, tmp_path):
+    code = (
+        "import sys; sys.path[:0] = ['.', 'tests']\n"
+        "from pathlib import Path\n"
+        "from mjlab_torques import World\n"
+        f"space = {{}}; exec(Path({str(tmp_path / 'cfg.py')!r}).read_text(), space)\n"
+        "world = World('assets/anymal_d/anymal_d.xml', *space['ARTICULATION'].actuators)\n"
+        "world.entity.reset()\n"
+        "print('result', world.dofs('dof_armature')[0, 1], -world.entity.data.encoder_bias[0, 0].item())\n"
+    )
+    export(result, "mjlab").write(tmp_path / "cfg.py")
+    done = subprocess.run([mjlab_python(), "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    armature, bias = map(float, done.stdout.split("result")[1].split())
+    assert armature == pytest.approx(0.055) and bias == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize("fmt", FORMATS)
+def test_the_command_line_writes_every_format(result, tmp_path, fmt):
+    done = command(result, "--format", fmt, "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out").read_text() == export(result, fmt).text
+    assert done.stdout.splitlines()[-1] == f"written: {tmp_path / 'out'}"
+    assert done.stdout.count("note: ") == len(export(result, fmt).notes)
+
+
+def test_bad_input_is_one_line_and_exit_code_2(result, tmp_path):
+    unknown = with_effects(write_result(tmp_path / "unknown.json"), ["warp_drive"], {})
+    for args, said in (
+        ((tmp_path / "missing.json", "--format", "json"), "does not exist"),
+        ((result, "--format", "urdf"), "invalid choice"),
+        ((unknown, "--format", "json"), "There is no effect 'warp_drive'"),
+    ):
+        done = command(*args)
+        assert done.returncode == 2 and said in done.stderr, done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+
+
+def command(*args) -> subprocess.CompletedProcess:
+    words = [sys.executable, str(ROOT / "scripts" / "export.py"), *map(str, args)]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
