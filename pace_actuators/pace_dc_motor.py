@@ -316,6 +316,9 @@ class PaceDCMotor:
         if self._speed_slope is not None:
             s.effort += self._speed_slope * s.motor_vel
             s.viscous_friction += self._speed_slope
+        if stack.changes_armature:
+            s.armature = self.armature
+            stack.run("armature")
         stack.run("friction")
         stack.run("transmission")
         torch.clamp(s.friction, min=0.0, out=s.friction)
@@ -365,6 +368,11 @@ class PaceDCMotor:
         """Whether an effect reads the torque of gravity and load (:meth:`set_load_effort`)."""
         return self.effects is not None and self.effects.needs_load
 
+    @property
+    def changes_armature(self) -> bool:
+        """Whether ``joint_armature`` changes from call to call, by what :meth:`set_link` gives."""
+        return self.effects is not None and self.effects.changes_armature
+
     def sensed_position(self, joint_pos: torch.Tensor) -> torch.Tensor:
         """What the encoder shows, before its bias is subtracted [rad], (num_envs, num_joints).
 
@@ -406,6 +414,18 @@ class PaceDCMotor:
         """Give the torque of gravity and load on the joints at this instant [N m], (num_envs, num_joints)."""
         if self.effects is not None:
             self.effects.state.load_effort = load_effort
+
+    def set_link(self, inertia: torch.Tensor, stiffness: torch.Tensor, spare: torch.Tensor) -> None:
+        """Give what the joints carry at this instant, (num_envs, num_joints) each.
+
+        Args:
+            inertia: Without armature [kg m²].
+            stiffness: How fast gravity pulls back with the angle [N m/rad].
+            spare: What may be taken from the inertia beyond the armature [kg m²].
+        """
+        if self.effects is not None:
+            s = self.effects.state
+            s.link_inertia, s.load_stiffness, s.spare_inertia = inertia, stiffness, spare
 
     def set_session_time(self, time: torch.Tensor) -> None:
         """Set the time since the session began [s], (num_envs, 1) or (num_envs, num_joints); it goes on from there."""
@@ -493,8 +513,10 @@ class PaceDCMotor:
     def _seen_by_controller(self, position: torch.Tensor | None, joint_vel: torch.Tensor) -> tuple:
         """Target, speed and gains after the effects on them."""
         stack = self.effects
-        s = stack.state
         encoder_vel, stiffness, damping = joint_vel, self.stiffness, self.damping
+        if stack is None:
+            return position, encoder_vel, stiffness, damping
+        s = stack.state
         if position is not None and stack.has("command"):
             s.joint_pos_target = position
             stack.run("command")

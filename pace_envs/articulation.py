@@ -238,6 +238,8 @@ class Articulation:
             ids = actuator.joint_indices
             if actuator.needs_load:
                 actuator.set_load_effort(self.load_effort[:, ids])
+            if actuator.changes_armature:
+                actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
             action = ActuatorActions(
                 data.joint_pos_target[:, ids],
                 None if data.joint_vel_target is None else data.joint_vel_target[:, ids],
@@ -258,6 +260,8 @@ class Articulation:
                 columns = self._columns_of(actuator)
                 self._sim.qfrc_applied[:, columns] = actuator.held_effort
                 self._write_friction(actuator, columns)
+            if actuator.changes_armature:
+                self._sim.expand("dof_armature")[:, self._columns_of(actuator)] = actuator.joint_armature
 
     def update(self) -> None:
         """Read the state after a physics step."""
@@ -284,6 +288,8 @@ class Articulation:
             if actuator.effects is not None:
                 if actuator.needs_load:
                     actuator.set_load_effort(self.load_effort[:, ids])
+                if actuator.changes_armature:
+                    actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
                 result[:, ids] = actuator.observe(self.data.joint_pos[:, ids], self.data.joint_vel[:, ids])
         return result
 

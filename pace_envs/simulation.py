@@ -96,6 +96,7 @@ class Simulation:
         self.qfrc_applied = self.bind("qfrc_applied")
         self.qfrc_bias = self.bind("qfrc_bias")
         self._constants_changed = False
+        self._link_fields: dict[str, torch.Tensor] = {}
 
     def bind(self, field: str) -> torch.Tensor:
         """A live tensor over an ``MjData`` field, shape (num_envs, ...).
@@ -126,6 +127,29 @@ class Simulation:
         """
         self.expand("dof_frictionloss")[:, columns] = friction
         self.expand("dof_damping")[:, columns] = viscous if implicit is None else viscous + implicit
+
+    def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What hinge joints carry, as it was computed last, (num_envs, len(columns)) each.
+
+        Args:
+            columns: Their degrees of freedom.
+
+        Returns:
+            Inertia without armature [kg m²], how fast gravity pulls back with the angle [N m/rad], and what of the
+            inertia does not couple to other joints [kg m²].
+        """
+        model, ids = self.model, columns.numpy()
+        joints, bodies = model.dof_jntid[ids], model.dof_bodyid[ids]
+        if not self._link_fields:  # they hold what is computed after they were bound
+            self._link_fields = {name: self.bind(name) for name in ("M", "xaxis", "xanchor", "subtree_com")}
+            self.forward()
+        fields = self._link_fields
+        diagonal = fields["M"][:, model.M_rowadr[ids] + model.M_rownnz[ids] - 1]
+        inertia = (diagonal - self.expand("dof_armature")[:, columns]).clamp(min=0.0)
+        axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
+        weight = self.expand("body_subtreemass")[:, bodies, None] * torch.tensor(model.opt.gravity)
+        turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
+        return inertia, -(axis * turned).sum(dim=-1), inertia * self._stands_alone(columns)
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Note that an effect has written to the bodies of joints with these degrees of freedom."""
@@ -170,6 +194,11 @@ class Simulation:
         if ids.size and (ids[0] < 0 or ids[-1] >= self.num_envs):
             raise ValueError(f"env_ids holds {ids[0]} to {ids[-1]}, expected 0 to {self.num_envs - 1}.")
         return ids.astype(np.int32)
+
+    def _stands_alone(self, columns: torch.Tensor) -> torch.Tensor:
+        """Which degrees of freedom follow no other, and are followed by none, (len(columns),) bool."""
+        ids, parents = columns.numpy(), self.model.dof_parentid
+        return torch.as_tensor((parents[ids] < 0) & ~np.isin(ids, parents))
 
     def close(self) -> None:
         """Release the simulations."""

@@ -61,6 +61,7 @@ def test_the_library_holds_what_it_should():
         "proportional_gain", "derivative_gain", "drive_bandwidth", "velocity_filter", "torque_limit",
         "torque_speed_limit", "command_rate_limit", "torque_ripple", "joint_elasticity", "backlash", "payload",
         "com_offset", "encoder_scale", "encoder_eccentricity", "other_delay", "measurement_delay", "clock_skew",
+        "mount_compliance",
     } <= set(EFFECTS)  # fmt: skip
 
 

@@ -100,6 +100,7 @@ TWIN_CASES = {
     "measurement_delay": {"delay": 0.004},
     "payload": {"ratio": 0.2},
     "com_offset": {"angle": 0.1},
+    "mount_compliance": {"stiffness": 1000.0, "damping": 3.0, "inertia": 0.5},
 }
 
 

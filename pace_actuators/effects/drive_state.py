@@ -22,6 +22,9 @@ _WRITABLE = (
     "motor_vel",
     "motor_effort",
     "load_effort",
+    "load_stiffness",
+    "link_inertia",
+    "spare_inertia",
     "base_friction",
     "base_viscous_friction",
     "base_armature",
@@ -51,11 +54,15 @@ class DriveState:
             the transmission gives way.
         motor_effort: The motor's torque [N m]; ``effort`` may be split up between a torque and a friction.
         load_effort: Torque of gravity and load on the joint [N m]; zero where the simulator does not give it.
+        load_stiffness: How fast gravity pulls back with the angle [N m/rad]; zero where it is not given.
+        link_inertia: Inertia of what the joint carries [kg m²]; zero where it is not given.
+        spare_inertia: What may be taken from the joint's inertia beyond the armature [kg m²].
         base_friction, base_viscous_friction, base_armature: The identified base parameters.
         time: Since the session began [s].
     """
 
     __slots__ = ("_fields",)
+    _fields: dict[str, torch.Tensor]
 
     def __init__(self, fields: dict[str, torch.Tensor]):
         """Keep the tensors of the fields."""

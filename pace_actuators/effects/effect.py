@@ -91,6 +91,8 @@ class Effect:
     """Whether it has fast dynamics of its own, so that the simulation must be implicit."""
     parts_motor_and_link: ClassVar[bool] = False
     """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
+    changes_armature: ClassVar[bool] = False
+    """Whether it changes ``s.armature`` from step to step, and reads the link's inertia."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     separates: ClassVar[str] = ""

@@ -87,6 +87,8 @@ class EffectStack:
         self._at["transmission"].sort(key=lambda pair: _side(pair[0]))
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
         """Whether friction or viscous friction change from step to step."""
+        self.changes_armature = any(effect.changes_armature for effect in self.effects)
+        """Whether the armature changes from step to step."""
         self.lags = [effect for effect in self.effects if effect.overrides("observation_lag")]
         self.needs_load = any(
             effect.overrides("friction") or effect.overrides("transmission") for effect in self.effects

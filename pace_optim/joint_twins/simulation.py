@@ -84,25 +84,20 @@ class TwinSimulation(Simulation):
 
     def step(self) -> None:
         """Advance by ``dt``."""
-        if self._constants_changed or self._steps == 0:
-            self._prepare()
+        self._constants_changed = False
         path, n = self.path, len(self._columns)
         k, part = divmod(self._steps, self._steps_per_interval)
         k = min(k, len(path.feel.torque) - 1)
         shape = (-1, self._count, n)
         q, v = self._get(self.qpos).view(shape), self._get(self.qvel).view(shape)
-        inertia, torque = path.feel.inertia[k], path.feel.torque[k]
-        for key, values in self._model_values.items():
-            change = path.model_effects[key]
-            inertia = inertia + values.view(shape) * change.inertia[k]
-            torque = torque + values.view(shape) * change.torque[k]
+        inertia, torque = self._feel(k)
         effort = self._get(self.qfrc_applied).view(shape)
         damping = self._get(self.expand("dof_damping")).view(shape)
         friction = self._get(self.expand("dof_frictionloss")).view(shape)
         implicit = self._get(self._implicit).view(shape)
         stiffness = path.stiffness[min(k, len(path.stiffness) - 1)]
         h = self.cfg.dt
-        total = inertia + self._armature.view(shape)
+        total = inertia + self._get(self.expand("dof_armature")).view(shape)
         resisting = total + h * (0.5 * damping + implicit)
         end = path.position[k + 1]
         reference = torch.lerp(path.position[k], end, (part + 0.5) / self._steps_per_interval)
@@ -118,6 +113,17 @@ class TwinSimulation(Simulation):
         self._load[:, self._columns] = (torque + stiffness * (q - end)).view(-1, n)
         self._steps += 1
 
+    def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What joints carry, as :meth:`Simulation.felt_link`."""
+        k = self._steps // self._steps_per_interval
+        order = self._columns.tolist()
+        place = [order.index(column) for column in columns.tolist()]
+        inertia = self._feel(min(k, len(self.path.feel.torque) - 1))[0]
+        inertia = inertia.expand(self.num_envs // self._count, -1, -1).reshape(self.num_envs, -1)[:, place]
+        stiffness = self.path.stiffness[min(k, len(self.path.stiffness) - 1)]
+        stiffness = stiffness.repeat(self.num_envs // self._count, 1)[:, place]
+        return inertia, -stiffness, inertia * self._stands_alone(columns)
+
     def forward(self, env_ids: EnvIds = None) -> None:
         """What the joints feel at the start."""
         path = self.path
@@ -130,9 +136,15 @@ class TwinSimulation(Simulation):
     def close(self) -> None:
         """Nothing to release."""
 
-    def _prepare(self) -> None:
-        self._armature = self._get(self.expand("dof_armature"))
-        self._constants_changed = False
+    def _feel(self, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Inertia and torque in an interval, (candidates or 1, recordings, n)."""
+        path, shape = self.path, (-1, self._count, len(self._columns))
+        inertia, torque = path.feel.inertia[k], path.feel.torque[k]
+        for key, values in self._model_values.items():
+            change = path.model_effects[key]
+            inertia = inertia + values.view(shape) * change.inertia[k]
+            torque = torque + values.view(shape) * change.torque[k]
+        return inertia, torque
 
     def _get(self, field: torch.Tensor) -> torch.Tensor:
         return field if self._as_in_model else field.index_select(1, self._columns)
