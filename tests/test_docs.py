@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from other_simulators import isaaclab_wheel, mjlab_python
+from torque_sequence import write_result
 
 from pace_actuators.effects.__main__ import page as page_of_effects
 
@@ -71,17 +73,52 @@ def test_the_page_of_effects_is_that_of_the_registry():
     )
 
 
-SHOWN = [ROOT / "README.md", ROOT / "docs" / "training.md"]
+SHOWN = [ROOT / "README.md", ROOT / "docs" / "training.md", ROOT / "docs" / "deploying.md"]
 """Pages whose code runs and whose commands exist; they take too long to be typed."""
 
 
 @pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
 def test_the_code_runs(page, tmp_path):
+    write_result(tmp_path / "result.json")
     for i, (_, text) in enumerate(blocks(page, "python")):
+        if text.startswith("# in "):  # another simulator's environment
+            continue
         run = subprocess.run(
             [sys.executable, "-"], input=text, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
         )
         assert run.returncode == 0, f"block {i}:\n{run.stderr}"
+
+
+def test_the_code_for_isaac_lab_runs_there(tmp_path):
+    stubs = "from pathlib import Path\nfrom isaaclab_torques import load_isaaclab, build\n"
+    stubs += f"load_isaaclab(Path({str(isaaclab_wheel())!r}))\n"
+    built = 'print(build(actuators["legs"]).motor.time_lags.tolist())\n'
+    assert "3.4" in elsewhere(sys.executable, stubs + block_for("Isaac Lab") + built, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_code_for_mjlab_runs_there(tmp_path):
+    robot = str(ROOT / "assets" / "anymal_d" / "anymal_d.xml")
+    built = (
+        f"from mjlab_torques import World\nprint(World({robot!r}, *articulation.actuators).dofs('dof_armature')[0])\n"
+    )
+    assert "0.055" in elsewhere(mjlab_python(), block_for("mjlab") + built, tmp_path)
+
+
+def block_for(simulator: str) -> str:
+    (text,) = (text for _, text in blocks(ROOT / "docs" / "deploying.md") if text.startswith(f"# in {simulator}'s"))
+    return text
+
+
+def elsewhere(python: str | Path, code: str, folder: Path) -> str:
+    write_result(folder / "result.json")
+    paths = {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    run = subprocess.run(
+        [python, "-"], input=code, cwd=folder, env={**os.environ, **paths}, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout
 
 
 @pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
