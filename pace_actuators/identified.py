@@ -29,6 +29,9 @@ BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
 DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 """Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
 
+RIG_EFFECTS = ("mount_compliance",)
+"""Effects of what held the robot during the recording, by name: a walking robot does not have them."""
+
 _FARTHEST = 2.0
 """Ratio of two physics steps from where on the values are called into question."""
 
@@ -140,11 +143,14 @@ class IdentifiedDrives:
         found = {i for group in match_names(joint_names_expr, self.joint_names) for i in group}
         return [name for i, name in enumerate(self.joint_names) if i in found]
 
-    def cfg_fields(self, joint_names_expr: str | Sequence[str] | None = None) -> dict[str, Any]:
+    def cfg_fields(
+        self, joint_names_expr: str | Sequence[str] | None = None, *, on_the_rig: bool = False
+    ) -> dict[str, Any]:
         """Fields of a ``PaceDCMotorCfg`` of some joints.
 
         Args:
             joint_names_expr: Which joints; ``None`` means all.
+            on_the_rig: Whether the robot is held as in the recording: with the effects of what held it.
 
         Raises:
             ValueError: If an expression matches no joint.
@@ -155,7 +161,7 @@ class IdentifiedDrives:
             "delay_s": self.delay_s,
             "delay_mode": self.delay_mode,
             "identified": self.at,
-            "effects": tuple(self._effects_of(joints)),
+            "effects": tuple(self._effects_of(joints, on_the_rig)),
         }
         for name in BASE_FIELDS:
             fields[name] = _by_pattern(self.values(name, joints))
@@ -165,10 +171,12 @@ class IdentifiedDrives:
                 fields[name] = _by_pattern({joint: float(known[joint]) for joint in joints})
         return fields
 
-    def _effects_of(self, joints: Sequence[str]) -> list[EffectCfg]:
+    def _effects_of(self, joints: Sequence[str], on_the_rig: bool) -> list[EffectCfg]:
         """The effects with their values on those of some joints that have them."""
         result = []
         for cfg in self.effects:
+            if cfg.effect_class.name in RIG_EFFECTS and not on_the_rig:
+                continue
             own = [joint for joint in cfg.joints(self.joint_names) if joint in joints]
             if own:
                 name = cfg.effect_class.name

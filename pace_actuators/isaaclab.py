@@ -29,7 +29,7 @@ from isaaclab.utils import configclass
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-from pace_actuators.representable import ISAACLAB, check_representable
+from pace_actuators.representable import ISAACLAB, check_representable, refuse_inertia
 
 
 class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
@@ -71,6 +71,7 @@ class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
         self.motor = (cfg.motor.class_type or PaceDCMotor)(
             cfg.motor, joint_names, joint_ids, num_envs, device, stiffness, damping, *given
         )
+        refuse_inertia(self.motor, ISAACLAB)
         motor = self.motor
         self.stiffness, self.damping = motor.stiffness, motor.damping  # Isaac Lab's events write into them
         self.effort_limit, self.velocity_limit = motor.effort_limit, motor.velocity_limit

@@ -36,7 +36,7 @@ from pace_actuators.effects import DriveState
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-from pace_actuators.representable import MJLAB, check_representable
+from pace_actuators.representable import MJLAB, check_representable, refuse_inertia
 
 _SMALLEST_FRICTION = 1e-9
 """Where friction changes from step to step, the model must have some from the start [N m]."""
@@ -145,6 +145,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
                 f"The drive's physics_dt is {self.cfg.motor.physics_dt:g} s, the simulation's time step {dt:g} s. "
                 "Leave physics_dt out."
             )
+        refuse_inertia(self.motor, MJLAB)
         self._model, self._data = model, data
         self._dofs = self.entity.indexing.joint_v_adr[self.target_ids]
         bias = PaceDCMotor(

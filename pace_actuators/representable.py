@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from pace_actuators.identified import IdentifiedDrives
+from pace_actuators.identified import RIG_EFFECTS, IdentifiedDrives
+
+if TYPE_CHECKING:
+    from pace_actuators.pace_dc_motor import PaceDCMotor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +60,9 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
     notes = []
     for cfg in drives.effects:
         kind = cfg.effect_class
+        if kind.name in RIG_EFFECTS:
+            notes.append(f"{kind.name} is of what held the robot during the recording: it is left out.")
+            continue
         if kind.stage == "recording":
             notes.append(f"{kind.name} is about the recording's time stamps: it has no influence on a policy.")
         if kind.overrides("write_model") and not world.bodies:
@@ -63,10 +70,10 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
                 f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
                 "use the model that scripts/export.py --format mjcf writes, which has it."
             )
-        if getattr(kind, "changes_armature", False) and not world.inertia_per_step:
+        if kind.changes_armature and not world.inertia_per_step:
             raise ValueError(
-                f"{kind.name} changes the joint's inertia at every physics step, which {world.name} cannot do. Fit "
-                "again without it, or leave it out: effects=… without it, if it is of the test rig."
+                f"{kind.name} changes the joint's inertia at every physics step, which {world.name} cannot do. "
+                "Fit again without it, or train elsewhere."
             )
         if kind.overrides("friction") or kind.overrides("transmission"):
             if not world.friction_per_step:
@@ -77,3 +84,17 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             if world.friction_hook:
                 notes.append(f"{kind.name} changes the joint's friction at every physics step: {world.friction_hook}.")
     return notes
+
+
+def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
+    """Refuse a drive that changes the joint's inertia at every step where that cannot be done.
+
+    Raises:
+        ValueError: If it does.
+    """
+    if motor.changes_armature and not world.inertia_per_step and motor.effects is not None:
+        names = ", ".join(effect.name for effect in motor.effects.effects if effect.changes_armature)
+        raise ValueError(
+            f"{names} changes the joint's inertia at every physics step, which {world.name} cannot do. Leave it out of "
+            "the drive's effects."
+        )

@@ -23,7 +23,12 @@ _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def use_identified(
-    cfg: ManagerBasedEnvCfg, path: str | Path, *, randomize_std: float | None = None, gains: bool = False
+    cfg: ManagerBasedEnvCfg,
+    path: str | Path,
+    *,
+    randomize_std: float | None = None,
+    gains: bool = False,
+    on_the_rig: bool = False,
 ) -> list[str]:
     """Give the robot of an environment the drives that a fit identified.
 
@@ -36,6 +41,7 @@ def use_identified(
         randomize_std: Draw every environment's drives with this many standard deviations around the identified values;
             ``None`` does not.
         gains: Also take over the gains and limits of the recordings, as far as the result says them.
+        on_the_rig: Whether the robot is held as in the recording: with the effects of what held it.
 
     Returns:
         What the environment cannot represent, in words.
@@ -45,7 +51,7 @@ def use_identified(
     """
     drives = IdentifiedDrives.load(path)
     notes = check_representable(drives, HERE)
-    cfg.scene.robot.actuators = _identified_groups(cfg.scene.robot, drives, gains)
+    cfg.scene.robot.actuators = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
     if randomize_std is not None:
         cfg.events = {
             **cfg.events,
@@ -96,7 +102,9 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None
     return f"physics and drives run at {1e3 * dt:g} ms, as in the identification, not at {1e3 * before:g} ms"
 
 
-def _identified_groups(robot: ArticulationCfg, drives: IdentifiedDrives, gains: bool) -> dict[str, PaceDCMotorCfg]:
+def _identified_groups(
+    robot: ArticulationCfg, drives: IdentifiedDrives, gains: bool, on_the_rig: bool
+) -> dict[str, PaceDCMotorCfg]:
     names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
     result, used = {}, set()
     for group, drive in robot.actuators.items():
@@ -111,7 +119,7 @@ def _identified_groups(robot: ArticulationCfg, drives: IdentifiedDrives, gains: 
                 "that were not identified into a group of their own."
             )
         used |= set(identified)
-        result[group] = _merged(drive, drives, identified, gains)
+        result[group] = _merged(drive, drives, identified, gains, on_the_rig)
     if left := [joint for joint in drives.joint_names if joint not in used]:
         raise ValueError(
             f"{drives.path} is of another robot: it has {', '.join(left)}, and the robot has {', '.join(names)}. "
@@ -120,8 +128,10 @@ def _identified_groups(robot: ArticulationCfg, drives: IdentifiedDrives, gains: 
     return result
 
 
-def _merged(drive: PaceDCMotorCfg, drives: IdentifiedDrives, joints: list[str], gains: bool) -> PaceDCMotorCfg:
-    fields: dict[str, Any] = drives.cfg_fields([re.escape(joint) for joint in joints])
+def _merged(
+    drive: PaceDCMotorCfg, drives: IdentifiedDrives, joints: list[str], gains: bool, on_the_rig: bool
+) -> PaceDCMotorCfg:
+    fields: dict[str, Any] = drives.cfg_fields([re.escape(joint) for joint in joints], on_the_rig=on_the_rig)
     del fields["joint_names_expr"]
     if not gains:
         fields = {name: value for name, value in fields.items() if name not in DRIVE_FIELDS}

@@ -125,7 +125,7 @@ def _held_robot(fitted: PaceSim2realEnvCfg, training: ManagerBasedEnvCfg, folder
     cfg, training = copy.deepcopy(fitted), copy.deepcopy(training)
     drives = {name: _with_recorded_gains(drive, fitted) for name, drive in training.scene.robot.actuators.items()}
     training.scene.robot.actuators = drives
-    use_identified(training, folder, gains=True)
+    use_identified(training, folder, gains=True, on_the_rig=True)
     x, y, z = fitted.scene.robot.init_state.pos
     robot = replace(
         training.scene.robot,

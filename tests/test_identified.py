@@ -9,19 +9,23 @@ from pathlib import Path
 
 import pytest
 import torch
-from torque_sequence import DT, JOINTS, write_result
+from problems import chirp, make_problem, record
+from torque_sequence import DT, GAINS, JOINTS, write_result
 
 from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators.effects import get_effect
 from pace_actuators.identified_draws import draw, labels_with_std
-from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable
+from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.fit import fit
+from pace_optim.fit_result import drive_in_force
 from pace_optim.fit_settings import FitSettings
 from pace_optim.training_replay import replay_in_training
 
 ROOT = Path(__file__).parents[1]
+CHIRP = chirp(0.2)
 WALK = "Pace-AnymalD-Velocity-v0"
 
 
@@ -162,6 +166,22 @@ def test_a_payload_weighs_in_training(result):
     body = int(model.joint("LF_KFE").bodyid[0])
     assert env.sim.expand("body_mass")[:, body].tolist() == pytest.approx([1.3 * model.body_mass[body]] * 2)
     env.close()
+
+
+def test_what_held_the_robot_stays_on_the_rig(result):
+    """A soft mount is simulated when the recording is replayed, and not when a policy is trained."""
+    effect = get_effect("mount_compliance")
+    values = {f"mount_compliance.{p.name}": {"all": p.start} for p in effect.parameters}
+    drives = IdentifiedDrives.load(changed(result, effects=["mount_compliance"], parameters=values))
+    for world in (HERE, MJLAB, ISAACLAB):
+        (said,) = check_representable(drives, world)
+        assert "it is left out" in said
+    assert PaceDCMotorCfg.from_result(result).effects == ()
+    assert drives.cfg_fields(on_the_rig=True)["effects"][0].effect == "mount_compliance"
+    cfg = load_env_cfg(WALK)
+    assert use_identified(cfg, result, on_the_rig=True) and len(cfg.scene.robot.actuators["legs"].effects) == 1
+    with pytest.raises(ValueError, match="mount_compliance changes the joint's inertia"):
+        refuse_inertia(motor(PaceDCMotorCfg(**drives.cfg_fields(on_the_rig=True)), DT), MJLAB)
 
 
 def test_another_robot_is_refused(result):
@@ -309,6 +329,8 @@ def test_the_replay_in_training_has_the_error_of_the_fit(anymal_run):
     cfg = load_cfg(RunSettings(task=WALK, identified=str(anymal_run)))
     found = replay_in_training(anymal_run, cfg)
     assert found.fitted["train"]["all"] == pytest.approx(5e-4, rel=0.1)
+    drive = IdentifiedDrives.load(anymal_run).drive
+    assert {name: set(values.values()) for name, values in drive.items()} == {k: {v} for k, v in GAINS.items()}
     assert found.largest_change < 0.01
     for part in ("train", "validation"):
         for joint in (*JOINTS, "all"):
@@ -329,3 +351,10 @@ def test_the_command_line_replays(anymal_run):
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()[2:-2]] == list(JOINTS)
+
+
+def test_gains_that_differ_between_recordings_are_not_the_drives():
+    made = [record(CHIRP, drive={"stiffness": kp}, name=str(kp)) for kp in (60.0, 85.0)]
+    found = drive_in_force(make_problem(made))
+    assert "stiffness" not in found and found["damping"] == {"servo": 0.6}
+    assert drive_in_force(make_problem(made[:1]))["stiffness"] == {"servo": 60.0}

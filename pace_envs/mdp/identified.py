@@ -56,6 +56,8 @@ def randomize_identified_drives(
             _write_to_drives(env, robot, name, values, ids, drives)
         else:
             effect, _, parameter = name.partition(".")
+            if effect not in robot.effects:  # left out: it is of the rig
+                continue
             robot.write_effect_parameter_to_sim(effect, parameter, values, ids)
 
 
