@@ -307,6 +307,20 @@ def test_a_training_keeps_its_drives(result, tmp_path):
     assert played.returncode == 0 and "identified drives: physics and drives run at 2.5 ms" in played.stdout
 
 
+def test_a_finer_step_keeps_the_controllers_rate_and_minds_the_effects(result):
+    fine = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.0005))
+    drive = fine.scene.robot.actuators["legs"]
+    assert (fine.sim.dt, fine.decimation, drive.control_decimation) == (pytest.approx(0.0005), 40, 5)
+    assert fine.sim.integrator == "rk4"
+    values = {"stiffness": 800.0, "damping": 0.5, "encoder_side": 0.0}
+    parameters = {f"joint_elasticity.{name}": dict.fromkeys(JOINTS, value) for name, value in values.items()}
+    changed(result, effects=["joint_elasticity"], parameters=parameters)
+    stiff = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.0005))
+    assert stiff.sim.integrator == "implicitfast"
+    coarse = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.005))
+    assert (coarse.sim.dt, coarse.decimation) == (0.005, 4)
+
+
 def test_error_bars_without_a_result_are_refused():
     with pytest.raises(ValueError, match="--identified"):
         load_cfg(RunSettings(task=WALK, randomize_identified=1.0))

@@ -12,7 +12,7 @@ import torch
 from pace_actuators import IdentifiedDrives
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
-from pace_envs.registration import load_env_cfg
+from pace_envs.registration import load_env_cfg, set_physics_dt
 from pace_envs.rl.export import export_policy
 from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, latest_checkpoint, new_run_folder
 from pace_envs.rl.runner import PaceOnPolicyRunner
@@ -56,16 +56,19 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
 
 def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
     """Physics step and drives as the settings say; prints what a reader should know of it."""
-    if settings.physics_dt is not None:
-        set_step(cfg, settings.physics_dt)
     if settings.identified is None:
         if settings.randomize_identified is not None:
-            raise ValueError(
-                "randomize_identified needs identified drives: name a fit's result.json with --identified."
-            )
+            raise ValueError("randomize_identified needs identified drives: name a result.json with --identified.")
+        if settings.physics_dt is not None:
+            set_step(cfg, settings.physics_dt)
         return
-    notes = [set_identified_step(cfg, settings.identified)] if settings.physics_dt is None else []
-    notes += use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
+    notes = [set_identified_step(cfg, settings.identified)]
+    more = use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
+    if settings.physics_dt is not None:
+        notes = []
+        # a finer step leaves the drives' controllers at their rate; how it is taken depends on their effects
+        (set_physics_dt if settings.physics_dt < cfg.sim.dt else set_step)(cfg, settings.physics_dt)
+    notes += more
     for note in notes:
         if note:
             print(f"identified drives: {note}")
