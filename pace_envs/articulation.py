@@ -440,7 +440,7 @@ class Articulation:
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
-            actuator.holds_line = actuator.cfg.control_decimation > 1
+            actuator.holds_line = actuator.cfg.control_decimation > 1 or self._sim.is_trapezoidal
             actuator.centred = actuator.holds_line and self._sim.is_semi_implicit
             if actuator.effects is not None:
                 actuator.effects.is_trapezoidal = self._sim.is_trapezoidal

@@ -18,9 +18,9 @@ from pace_optim.fit_settings import FitSettings
 from pace_optim.fit_warnings import fit_warnings
 from pace_optim.history import History
 from pace_optim.jacobian import colour
-from pace_optim.least_squares import Descent, LeastSquaresCfg
+from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.other_solutions import with_other_solutions
-from pace_optim.problem import Problem, file_digest, load_problem
+from pace_optim.problem import Problem, as_vector, file_digest, load_problem
 from pace_optim.progress import ProgressLine
 from pace_optim.refine import refine
 from pace_optim.report import write_report
@@ -181,6 +181,8 @@ class _Fit:
 
     def _optimize(self) -> Outcome:
         if not self.descents:
+            if self.settings.start is not None and self.optimizer is None:
+                return self._refine_from(as_vector(self.problem, self.settings.start))
             starts = [self.problem.space.start]
             if self.optimizer is not None:
                 starts = self._search(self.optimizer) + starts
@@ -191,6 +193,11 @@ class _Fit:
             self._write_checkpoint()
         self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
+
+    def _refine_from(self, x: torch.Tensor) -> Outcome:
+        """Refine a known vector: it needs no coarse stage."""
+        self.descents = least_squares(self.evaluator, self.colouring, [x], on_iteration=self._after_iteration)
+        return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)

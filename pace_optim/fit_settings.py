@@ -56,6 +56,9 @@ class FitSettings:
     save_optimization_process: bool = False
     """Keep every generation's parameters and scores in ``progress.pt``."""
 
+    start: dict[str, dict[str, float]] | None = None
+    """Parameters to start least squares from, as in ``result.json``; ``None``: from the middle of the bounds."""
+
     log_dir: str = "logs/pace"
     """Where runs are kept."""
 

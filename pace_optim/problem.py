@@ -72,6 +72,10 @@ class Problem:
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
+    def with_physics_dt(self, physics_dt: float) -> Problem:
+        """The same with another physics step [s]."""
+        return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
+
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""
         return Evaluator(self.make_env, self.dataset, self.space)

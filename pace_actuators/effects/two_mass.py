@@ -66,7 +66,8 @@ class _TwoMass(Effect):
     def prepare(self) -> None:
         """Where it acts."""
         self._on = self.switched_on()
-        self._any = bool(self._on.any())
+        self._any, self._all = bool(self._on.any()), bool(self._on.all())
+        self._side = torch.where(self._on, self.encoder_side, 0.0)
         if not hasattr(self, "_angle"):
             zeros = self.zeros
             self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
@@ -93,7 +94,7 @@ class _TwoMass(Effect):
         total = self._inertia + self._coupling
         speed = (self._drive + self._coupling * s.joint_vel) / total
         # friction brakes, it does not push; 0 in direction: the motor stuck
-        speed = torch.where(speed * self._direction > 0, speed, 0.0)
+        speed = speed * (speed * self._direction > 0)
         moving = 0.5 * (self._speed + speed) if self.is_trapezoidal else speed
         self._angle = self._angle + self.dt * moving
         self._speed = speed
@@ -113,7 +114,7 @@ class _TwoMass(Effect):
     def sensed_velocity(self, s: DriveState) -> None:
         """And its speed."""
         if self._any:
-            s.encoder_vel += torch.where(self._on, self.encoder_side * (self._speed - s.joint_vel), 0.0)
+            s.encoder_vel += self._side * (self._speed - s.joint_vel)
 
     def transmission(self, s: DriveState) -> None:
         """Turn the motor's torque into that of the spring."""
@@ -132,16 +133,22 @@ class _TwoMass(Effect):
         push = (momentum - drag) * self._speed + s.effort - explicit
         free = push + coupling * s.joint_vel
         stuck = free.abs() <= s.friction
-        direction = torch.where(stuck, 0.0, torch.sign(free))
+        direction = torch.sign(free) * ~stuck
         push = push - s.friction * direction
         total = inertia + coupling
-        share = torch.where(stuck, 0.0, coupling / total)
-        on = self._on
+        share = coupling / total * ~stuck
         self._drive, self._coupling, self._inertia, self._direction = push, coupling, inertia, direction
-        s.effort = torch.where(on, explicit + share * push, s.effort)
-        s.viscous_friction = torch.where(on, 0.0, s.viscous_friction)
-        s.implicit_damping = torch.where(on, coupling * (1 - share), s.implicit_damping)
-        s.friction = torch.where(on, 0.0, s.friction)
+        s.effort = self._where_on(explicit + share * push, s.effort)
+        s.implicit_damping = self._where_on(coupling * (1 - share), s.implicit_damping)
+        if self._all:
+            s.viscous_friction.zero_()
+            s.friction.zero_()
+        else:
+            s.viscous_friction = torch.where(self._on, 0.0, s.viscous_friction)
+            s.friction = torch.where(self._on, 0.0, s.friction)
+
+    def _where_on(self, value: torch.Tensor, otherwise: torch.Tensor) -> torch.Tensor:
+        return value if self._all else torch.where(self._on, value, otherwise)
 
 
 @register_effect
@@ -173,12 +180,13 @@ class JointElasticity(_TwoMass):
 
     def switched_on(self) -> torch.Tensor:
         """Where the stiffness is finite."""
-        return ~off(self.stiffness)
+        on = ~off(self.stiffness)
+        self._finite = torch.where(on, self.stiffness, 0.0)
+        return on
 
     def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Linear."""
-        k = torch.where(self._on, self.stiffness, 0.0)
-        return k * deflection, k
+        return self._finite * deflection, self._finite
 
     def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
         """A parameter."""
@@ -219,12 +227,12 @@ class Backlash(_TwoMass):
     def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Nothing inside the gap."""
         beyond = (deflection.abs() - 0.5 * self.gap).clamp(min=0.0)
-        k = torch.where(beyond > 0, self.stiffness, 0.0)
+        k = self.stiffness * (beyond > 0)
         return k * torch.sign(deflection) * beyond, k
 
     def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
         """Only in contact."""
-        return torch.where(stiffness > 0, self.damping, 0.0)
+        return self.damping * (stiffness > 0)
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """-τ_g / k beyond the gap, on the side that the load presses on."""

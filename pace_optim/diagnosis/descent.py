@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from pace_optim.least_squares import bounded_step
 
 _STEP = 1e-4
 _TRIALS = (1.0, 30.0, 1e3)
-_ENOUGH = 3e-4
+_ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
 _STRIDE = 2
 """Only every so many control steps count in a fit."""
@@ -37,11 +38,20 @@ class Fitted:
     """At x, (K, R, n) float32, where wanted."""
 
 
+def fit_coarse_to_fine(
+    problem: TwinProblem, starts: Sequence[Fitted], coarse_iterations: int = 8, fine_iterations: int = 3
+) -> list[Fitted]:
+    """Go most of the way at the control step, which costs half, and the rest at the problem's physics step."""
+    coarse = fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, coarse_iterations)
+    return fit_side_by_side(problem, coarse, fine_iterations, keep_jacobian=True)
+
+
 def fit_side_by_side(
     problem: TwinProblem,
     starts: Sequence[Fitted],
-    max_iteration: int = 12,
+    max_iteration: int = 9,
     keep_jacobian: bool = False,
+    part: float = 1.0,
 ) -> list[Fitted]:
     """Fit several models from their present x, each joint by itself.
 
@@ -53,10 +63,12 @@ def fit_side_by_side(
         starts: Models and where they start.
         max_iteration: Largest number of iterations.
         keep_jacobian: Whether the last Jacobian is kept.
+        part: Only so much of the beginning of the recordings is simulated.
     """
     slots = [Slot(model=s.model, own=s.own, rows=s.model.size + len(_TRIALS)) for s in starts]
     batch = SideBySide(problem, slots, training=True)
-    where = batch.dataset.train
+    where = batch.dataset.train.clone()
+    where[math.ceil(part * len(where)) :] = False
     samples = float(where[where.any(dim=1)][::_STRIDE].sum())
     ways = [_Way(start, samples, keep_jacobian) for start in starts]
     for _ in range(max_iteration):

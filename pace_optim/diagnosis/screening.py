@@ -33,9 +33,7 @@ class Probe:
     """Multiple of the probe that fits best, (n,)."""
 
 
-def screen(
-    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
-) -> list[Probe]:
+def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor) -> list[Probe]:
     """Look at each effect at its probes.
 
     With e the error, J its derivatives by the parameters that the model has, and S the change that a probe makes, e is
@@ -62,7 +60,7 @@ def screen(
     errors = batch.simulate(values, where, _STRIDE)
     blocks = _blocks(where, problem.control_dt)
     jacobian = _free_columns(now)
-    scores, sizes = _explained(errors[0], jacobian, errors[1:] - errors[:1], blocks)
+    scores, sizes = _explained(now.error, jacobian, errors[1:] - errors[:1], blocks)
     result = []
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
         allowed = size > 0 if not effect.two_sided else torch.ones_like(size, dtype=torch.bool)

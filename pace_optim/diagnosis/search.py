@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
-SCREEN_THRESHOLD = 0.02
+SCREEN_THRESHOLD = 0.03
 """An effect that would explain less than this of what is left is not refitted."""
 SHORT_LIST = 6
 """Effects refitted for each joint, at most."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
-WORTH_KEEPING = 1.05
-"""An effect without which the validation RMSE grows by less than this factor is taken out again."""
+NEXT_FLOOR = 1.3
+"""Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -87,8 +87,8 @@ def add_effects(
     outcome = Outcome(base=base, base_errors=errors, final=base, final_errors=errors)
     open_joints = torch.ones(base.model.num_joints, dtype=torch.bool)
     for depth in range(max_effects):
-        open_joints &= errors.mse.sqrt() > floor
-        untried = [e for e in effects if not _everywhere(now, e)]
+        open_joints &= errors.mse.sqrt() > (1.0 if depth == 0 else NEXT_FLOOR) * floor
+        untried = [e for e in effects if e not in now.model.effects]
         if not bool(open_joints.any()) or not untried:
             break
         say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
@@ -126,13 +126,13 @@ def _try(
     open_joints: torch.Tensor,
     say: Callable[[str], None],
 ) -> tuple[Round, dict[type[Effect], Fitted]] | None:
-    probes = screen(problem, now, effects, effort)
+    probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
     best = _best_probes(probes, open_joints)
     if not best:
         return None
     say(f"refitting with {', '.join(effect.name for effect in best)}")
     starts = [_start(now, effect, chosen) for effect, lists in best.items() for chosen in lists]
-    fitted = fit_side_by_side(problem, starts)
+    fitted = fit_coarse_to_fine(problem, _better_starts(problem, starts))
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
     first = not now.model.effects
@@ -141,11 +141,8 @@ def _try(
     keep: dict[type[Effect], Fitted] = {}
     for effect in best:
         own = [(f, b) for f, b in zip(fitted, blocks, strict=True) if f.own is effect]
-        merged = own[0][0]
+        chosen, after = own[0]
         for j in range(n):
-            # of several starts, the one that fits the training recordings best
-            chosen, after = min(own, key=lambda pair: float(pair[0].score[j]))
-            merged.x[j], merged.score[j] = chosen.x[j], chosen.score[j]
             if not bool(open_joints[j]):
                 continue
             verdict = judge(errors, after, j, tried, first)
@@ -163,7 +160,7 @@ def _try(
                     values=dict(zip([p.name for p in effect.parameters], values, strict=True)),
                 )
             )
-        keep[effect] = merged
+        keep[effect] = chosen
     chosen_effects, rivals = _choose(trials)
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals), keep
 
@@ -187,6 +184,19 @@ def _best_probes(probes: Sequence[Probe], open_joints: torch.Tensor) -> dict[typ
         count = min(2, len(by_effect[effect]))
         result[effect] = [[ranked[j][k] for j in range(n)] for k in range(count)]
     return result
+
+
+def _better_starts(problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
+    """Of the starts of each effect, the one that is better after a few coarse steps, joint by joint."""
+    fitted = fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, max_iteration=4, part=0.4)
+    result: dict[type[Effect], Fitted] = {}
+    for each in fitted:
+        if each.own is None:
+            continue
+        best = result.setdefault(each.own, each)
+        better = each.score < best.score
+        best.x[better], best.score[better] = each.x[better], each.score[better]
+    return list(result.values())
 
 
 def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted:
@@ -223,7 +233,9 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type[Effect], Fitted]) -> Fitted:
-    """The present model with each joint's chosen effect, refitted."""
+    """The present model with each joint's chosen effect, refitted unless all joints chose the same."""
+    if len(set(found.chosen)) == 1 and found.chosen[0] is not None:
+        return replace(fitted[found.chosen[0]], own=None)
     model, n = now.model, now.model.num_joints
     physical = model.to_physical(now.x)
     for effect in dict.fromkeys(e for e in found.chosen if e is not None):
@@ -231,7 +243,7 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type
         source = fitted[effect]
         values = source.model.to_physical(source.x)
         if effect in model.effects:  # another joint has it already
-            model = _extended(model, effect, has)
+            model = model.on_more_joints(effect, has)
         else:
             model = model.with_effect(effect, has)
             physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
@@ -241,12 +253,3 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type
         model=model, own=None, x=model.to_normalised(physical), score=torch.full((n,), torch.inf, dtype=torch.float64)
     )
     return fit_side_by_side(problem, [start], max_iteration=6, keep_jacobian=True)[0]
-
-
-def _extended(model, effect: type[Effect], has: torch.Tensor):  # noqa: ANN001, ANN202
-    raise NotImplementedError
-
-
-def _everywhere(now: Fitted, effect: type[Effect]) -> bool:
-    """Whether the present model has the effect already."""
-    return effect in now.model.effects

@@ -45,6 +45,7 @@ class SideBySide:
         self._num_candidates = sum(slot.rows for slot in slots)
         self.rollout: Rollout = evaluator.rollout(self._num_candidates)
 
+    @torch.inference_mode()
     def simulate(self, physical: Sequence[torch.Tensor], where: torch.Tensor, stride: int = 1) -> torch.Tensor:
         """Errors of all parameter sets, simulated less measured.
 
@@ -79,14 +80,25 @@ class SideBySide:
         """The parts of something with one row per candidate, slot by slot."""
         return list(values.split([slot.rows for slot in self.slots]))
 
+    def _groups(self) -> list[list[int]]:
+        """Indices of neighbouring slots whose own effect is the same: one effect acts for all of them."""
+        groups: list[list[int]] = []
+        for i, slot in enumerate(self.slots):
+            if groups and slot.own is not None and self.slots[groups[-1][0]].own is slot.own:
+                groups[-1].append(i)
+            else:
+                groups.append([i])
+        return groups
+
     def _cfgs(self, problem: TwinProblem, training: bool) -> list[EffectCfg]:
         count = len(problem.dataset.trained()) if training else problem.dataset.num_recordings
         cfgs = [EffectCfg(effect=effect.name) for effect in self._common]
         start = 0
-        for slot in self.slots:
-            end = start + slot.rows * count
-            if slot.own is not None:
-                cfgs.append(EffectCfg(effect=slot.own.name, env_rows=slice(start, end)))
+        for group in self._groups():
+            end = start + sum(self.slots[i].rows for i in group) * count
+            own = self.slots[group[0]].own
+            if own is not None:
+                cfgs.append(EffectCfg(effect=own.name, env_rows=slice(start, end)))
             start = end
         return cfgs
 
@@ -112,14 +124,16 @@ class SideBySide:
                     [_of_effect(slot.model, common, v) for slot, v in zip(self.slots, physical, strict=True)]
                 )
                 robot.write_effect_to_sim(actuator, stack.effects[k], values.repeat_interleave(count, dim=0)[:, ids])
-            own = [(slot, v) for slot, v in zip(self.slots, physical, strict=True) if slot.own is not None]
-            for (slot, v), effect in zip(own, stack.effects[len(self._common) :], strict=True):
-                values = _of_effect(slot.model, slot.own, v).repeat_interleave(count, dim=0)
-                robot.write_effect_to_sim(actuator, effect, values[:, ids])
+            groups = [group for group in self._groups() if self.slots[group[0]].own is not None]
+            for group, effect in zip(groups, stack.effects[len(self._common) :], strict=True):
+                values = torch.cat([_of_effect(self.slots[i].model, self.slots[i].own, physical[i]) for i in group])
+                robot.write_effect_to_sim(actuator, effect, values.repeat_interleave(count, dim=0)[:, ids])
 
 
-def _of_effect(model: JointModel, effect: type[Effect], physical: torch.Tensor) -> torch.Tensor:
+def _of_effect(model: JointModel, effect: type[Effect] | None, physical: torch.Tensor) -> torch.Tensor:
     """An effect's values (rows, n, parameters), null where a joint does not have it."""
+    if effect is None:
+        raise ValueError("This slot has no effect of its own.")
     values = physical[..., model.columns(effect)]
     null = torch.tensor([p.start if p.null is None else p.null for p in effect.parameters], dtype=torch.float64)
     return torch.where(model.has[model.effects.index(effect)][:, None], values, null)

@@ -48,6 +48,17 @@ class ReferencePath:
     control_dt: float
     """[s]."""
 
+    def typical_effort(self, armature: torch.Tensor) -> torch.Tensor:
+        """RMS torque that moves each joint and holds its load, (n,) [N m].
+
+        Args:
+            armature: (n,) [kg m²].
+        """
+        q, dt = self.position, self.control_dt
+        acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / dt**2
+        effort = (self.feel.inertia[1:] + armature) * acceleration - self.feel.torque[1:]
+        return effort.square().mean(dim=(0, 1)).sqrt()
+
     def select(self, recordings: Sequence[int]) -> ReferencePath:
         """Some of the recordings, by index."""
         chosen = list(recordings)

@@ -35,6 +35,10 @@ class TwinProblem(Problem):
         """The same with these effects instead of its own."""
         return _with_path(super().with_effects(effects), self.path)
 
+    def with_physics_dt(self, physics_dt: float) -> TwinProblem:
+        """The same with another physics step [s]."""
+        return _with_path(super().with_physics_dt(physics_dt), self.path)
+
     def _evaluator(self, dataset: Dataset, path: ReferencePath) -> Evaluator:
         def make_env(num_envs: int) -> ManagerBasedRLEnv:
             return self.make_env(num_envs, simulation=partial(TwinSimulation, path=path))

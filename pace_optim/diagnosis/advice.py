@@ -1,0 +1,33 @@
+"""What to do and to record next."""
+
+from __future__ import annotations
+
+from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.verdict import confounded_pairs
+from pace_optim.problem import Problem
+
+
+def advise(problem: Problem, outcome: Outcome, decision: str, data: DataCheck) -> list[str]:
+    """Sentences, the most useful first."""
+    result = []
+    for chosen, rival in confounded_pairs(outcome):
+        separates = chosen.separates or rival.separates
+        how = f" Record {separates} to tell them apart." if separates else ""
+        result.append(f"These recordings cannot tell {chosen.name} from {rival.name}.{how}")
+    if data.loads == 1:
+        result.append(
+            "All recordings carry the same load: friction that grows with the load, and a wrong torque or mass, cannot "
+            "be told from other things. Record once with a known added mass (added_mass in the recording)."
+        )
+    if data.gains == 1:
+        result.append(
+            "All recordings have the same gains: errors of the gains and some delays cannot be seen. Record once with "
+            "another proportional gain (stiffness in the recording)."
+        )
+    if decision == "unknown":
+        result.append(
+            "None of the known effects explains the error. The error map says which variable carries it: write an "
+            "effect of your own (docs/your_own_effect.md) and diagnose again with --effects module:Class."
+        )
+    return result

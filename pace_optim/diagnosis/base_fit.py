@@ -1,0 +1,72 @@
+"""The base model of each joint, fitted at the step of the diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.problem import Problem
+
+_FAR = 0.02
+"""Where a normalised parameter has moved further than this the reference is simulated again."""
+_ROUNDS = 3
+_PART = 0.4
+"""Of the recordings; the last fit has all of them."""
+
+
+def fit_base(
+    problem: Problem,
+    physical: torch.Tensor,
+    effects: Sequence[type[Effect]] = (),
+    say: Callable[[str], None] = lambda _: None,
+) -> tuple[TwinProblem, Fitted, torch.Tensor]:
+    """Fit the base model from a first guess; the reference that the joints move along follows.
+
+    Args:
+        problem: The whole robot, without effects.
+        physical: First guess of its parameters, (size,).
+        effects: Effects whose influence on the rigid bodies is wanted.
+        say: Shows how far it is.
+
+    Returns:
+        The problem of single joints, the fitted model with its Jacobian, and the typical torque of each joint
+        (n,) [N m].
+    """
+    model = JointModel.base(problem)
+    names = [effect.name for effect in effects if effect.overrides("write_model")]
+    x = model.to_normalised(joint_vectors(problem, physical))
+    fitted = Fitted(model=model, own=None, x=x, score=torch.full((len(x),), torch.inf, dtype=torch.float64))
+    for i in range(_ROUNDS):
+        say(f"base model, round {i + 1}")
+        path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)))
+        coarse = twin_problem(problem, path).with_physics_dt(problem.control_dt)
+        fitted.score[:] = torch.inf
+        before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6, part=_PART)[0]
+        if float((fitted.x - before.x).abs().max()) < _FAR:
+            break
+    path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)), names)
+    twins = twin_problem(problem, path)
+    fitted = fit_side_by_side(twins, [fitted], max_iteration=5, keep_jacobian=True)[0]
+    x = fitted.x
+    return twins, fitted, path.typical_effort(model.to_physical(x)[:, BASE.index("armature")])
+
+
+def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:
+    """The base parameters of each joint, (n, 5), of a vector of the whole robot."""
+    n, space = len(problem.joint_names), problem.space
+    return torch.stack([physical[space[name]].expand(n) for name in BASE], dim=1)
+
+
+def whole_vector(problem: Problem, joints: torch.Tensor) -> torch.Tensor:
+    """A vector of the whole robot of each joint's base parameters (n, 5); the delay is the joints' median."""
+    space = problem.space
+    result = space.to_physical(space.start)
+    for k, name in enumerate(BASE):
+        result[space[name]] = joints[:, k].median() if name == "delay" else joints[:, k]
+    return result

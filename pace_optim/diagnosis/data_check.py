@@ -1,0 +1,85 @@
+"""A look at the recordings before anything is concluded from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from pace_optim.comparison.noise import lattice_step, noise_floor
+from pace_optim.diagnosis.base_fit import whole_vector
+from pace_optim.diagnosis.descent import Fitted
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.problem import Problem
+
+_FINER = 2
+
+
+@dataclass(kw_only=True, eq=False)
+class DataCheck:
+    """What the recordings can show."""
+
+    floor: torch.Tensor
+    """RMSE that no model can go below: measurement noise and the error of the physics step, (n,) [rad]."""
+    noise: torch.Tensor
+    """(n,) [rad]."""
+    numerical: torch.Tensor
+    """Change when the physics step is halved, (n,) [rad]."""
+    sentences: list[str] = field(default_factory=list)
+    unusable: set[str] = field(default_factory=set)
+    """Effects that these recordings cannot show at all."""
+    loads: int = 1
+    """Number of different loads."""
+    gains: int = 1
+    """Number of different gains."""
+
+
+def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
+    """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are."""
+    data, names = problem.dataset, problem.joint_names
+    squares, steps = [], {}
+    for recording in data.recordings:
+        dt = float(np.median(np.diff(recording.time)))
+        squares.append([noise_floor(recording.dof_pos[:, j], dt).sigma ** 2 for j in range(len(names))])
+        for j, name in enumerate(names):
+            step = lattice_step(recording.dof_pos[:, j])
+            if step is not None:
+                steps[name] = step
+    noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
+    numerical = _numerical_floor(problem, base)
+    sentences = [
+        f"Measurement noise: {1e3 * float(noise.min()):.2g} to {1e3 * float(noise.max()):.2g} mrad by joint; halving the "
+        f"physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
+        f"{1e3 * float(numerical.max()):.2g} mrad.",
+    ]
+    if steps:
+        coarse = max(steps, key=lambda name: steps[name])
+        sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} mrad ({coarse}).")
+    loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
+    gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
+    sentences.append(
+        f"{len(data.recordings)} recordings with {len(loads)} different loads and {len(gains)} sets of gains."
+    )
+    return DataCheck(
+        floor=(noise**2 + numerical**2).sqrt(),
+        noise=noise,
+        numerical=numerical,
+        sentences=sentences,
+        loads=len(loads),
+        gains=len(gains),
+    )
+
+
+def _numerical_floor(problem: Problem, base: Fitted) -> torch.Tensor:
+    """RMS change of each joint when the physics step is made finer, on validation (n,) [rad]."""
+    finer = problem.with_physics_dt(problem.physics_dt / _FINER)
+    physical = whole_vector(problem, base.model.to_physical(base.x))[None]
+    where = problem.dataset.validation
+    coarse, fine = (p.evaluator().residuals(physical, where) for p in (problem, finer))
+    change = (coarse.error[0] - fine.error[0])[coarse.where]
+    return change.square().mean(dim=0).sqrt().nan_to_num(nan=0.0, posinf=0.0)
+
+
+def _key(*values: object) -> str:
+    return repr([v.tolist() if isinstance(v, np.ndarray) else (dict(v) if hasattr(v, "items") else v) for v in values])

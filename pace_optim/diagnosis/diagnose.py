@@ -1,0 +1,204 @@
+"""A diagnosis from a run's folder to ``diagnosis.json``: look at the data, search, judge, refit, advise."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from pace_actuators.effects import Effect, available_effects, get_effect
+from pace_optim.diagnosis.advice import advise
+from pace_optim.diagnosis.base_fit import fit_base
+from pace_optim.diagnosis.data_check import DataCheck, check_data
+from pace_optim.diagnosis.error_map import error_map
+from pace_optim.diagnosis.result import Diagnosis
+from pace_optim.diagnosis.search import Outcome, add_effects
+from pace_optim.diagnosis.settings import DiagnosisSettings
+from pace_optim.diagnosis.verdict import labels, ranking, verdict
+from pace_optim.fit import fit
+from pace_optim.fit_result import FitResult
+from pace_optim.fit_settings import FitSettings
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.problem import Problem, load_problem
+from pace_optim.progress import ProgressLine
+
+_FLOOR_MARGIN = 1.1
+
+
+@dataclass(kw_only=True, eq=False)
+class Findings:
+    """What the search on the twins found."""
+
+    twins: TwinProblem
+    outcome: Outcome
+    data: DataCheck
+    verdict: str
+    explained: float
+    """Part of the error above the floor that the effects found explain."""
+    added: list[str]
+
+
+def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) -> Diagnosis:
+    """Find out which physical effect a run's model lacks; writes ``diagnosis.json`` into the run's folder.
+
+    Args:
+        settings: What to diagnose, and how.
+        progress: Shows how far it is.
+
+    Raises:
+        ValueError: If the run cannot be read, or anything does not fit; nothing has been written then.
+    """
+    begin = time.monotonic()
+    progress = progress or ProgressLine()
+    folder = Path(settings.run)
+    result = FitResult.load(folder)
+    run_settings, _ = FitSettings.load(folder / "settings.json")
+    candidates = candidate_effects(settings.effects, only=settings.only)
+    physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
+    problem = load_problem(
+        run_settings.task,
+        data=run_settings.data,
+        validation=run_settings.validation,
+        delay_mode=run_settings.delay_mode,
+        physics_dt=physics_dt,
+    ).with_effects(())
+    base = {name: result.parameters[name] for name in problem.space.slices}
+    found = search_effects(problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say)
+    runs, ladder = [str(folder)], _ladder(found)
+    if settings.refit and found.added:
+        progress.say(f"fitting the whole robot with {', '.join(found.added)}")
+        refit_settings = replace(
+            run_settings,
+            effects=found.added,
+            optimizer="least_squares",
+            physics_dt=physics_dt,
+            start=_start_values(found),
+            log_dir=str(folder.parent.parent),
+        )
+        _, path = fit(refit_settings, progress)
+        runs.append(str(path))
+    diagnosis = Diagnosis(
+        run=str(folder),
+        verdict=found.verdict,
+        summary=summary_of(found, problem),
+        added=found.added,
+        ranking=ranking(found.outcome, problem.joint_names),
+        joints=_joints(found, problem),
+        data=found.data.sentences,
+        advice=advise(problem, found.outcome, found.verdict, found.data),
+        runs=runs,
+        tried=[effect.name for effect in candidates],
+        physics_dt=physics_dt,
+        ladder=ladder,
+        error_map=error_map(found.twins, found.outcome.final, found.data.floor),
+        wall_time_s=time.monotonic() - begin,
+    )
+    diagnosis.save(folder)
+    for run in runs[1:]:
+        diagnosis.save(run)
+    progress.close()
+    return diagnosis
+
+
+def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
+    """What is tried: all registered effects and the user's, or only the user's."""
+    own = [get_effect(name) for name in extra]
+    every = [] if only else [get_effect(name) for name in available_effects()]
+    return list(dict.fromkeys([*every, *own]))
+
+
+def search_effects(
+    problem: Problem,
+    physical: torch.Tensor,
+    candidates: Sequence[type[Effect]],
+    max_effects: int,
+    say: Callable[[str], None] = lambda _: None,
+) -> Findings:
+    """Look for missing effects, each joint simulated alone.
+
+    Args:
+        problem: The whole robot with the base model.
+        physical: A first guess of its parameters, (size,).
+        candidates: What is tried.
+        max_effects: Most effects of a joint.
+        say: Shows how far it is.
+    """
+    torch.set_flush_denormal(True)
+    twins, base, effort = fit_base(problem, physical, candidates, say)
+    data = check_data(problem, twins, base)
+    usable = [effect for effect in candidates if effect.name not in data.unusable]
+    outcome = add_effects(twins, base, usable, effort, _FLOOR_MARGIN * data.floor, max_effects, say)
+    decision, explained = verdict(outcome, data.floor)
+    added = labels(outcome, problem.joint_names) if decision == "effect" else []
+    return Findings(twins=twins, outcome=outcome, data=data, verdict=decision, explained=explained, added=added)
+
+
+def summary_of(found: Findings, problem: Problem) -> str:
+    """The verdict in a sentence or two."""
+    before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
+    after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
+    floor = 1e3 * float(found.data.floor.square().mean().sqrt())
+    if found.verdict == "nothing_missing":
+        return (
+            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} mrad, the "
+            f"floor of noise and numerics {floor:.3g} mrad."
+        )
+    if found.verdict == "unknown":
+        return (
+            f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
+            f"mrad, the floor {floor:.3g} mrad, and the effects tried explain {100 * max(0.0, found.explained):.0f} % "
+            "of what lies between."
+        )
+    return (
+        f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
+        f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
+    )
+
+
+def _ladder(found: Findings) -> list[dict]:
+    outcome = found.outcome
+    steps = [{"model": "base model", "validation_rmse": float(outcome.base_errors.mse.mean().sqrt())}]
+    if found.added:
+        steps.append(
+            {"model": " + ".join(found.added), "validation_rmse": float(outcome.final_errors.mse.mean().sqrt())}
+        )
+    return steps
+
+
+def _start_values(found: Findings) -> dict[str, dict[str, float]]:
+    """Where the refit of the whole robot starts: what the joints alone ended with."""
+    from pace_optim.diagnosis.model import BASE
+
+    model, names = found.outcome.final.model, found.twins.joint_names
+    physical = model.to_physical(found.outcome.final.x)
+    start: dict[str, dict[str, float]] = {}
+    for k, name in enumerate(BASE):
+        column = physical[:, k]
+        start[name] = (
+            {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
+        )
+    for effect, has in zip(model.effects, model.has, strict=True):
+        values = physical[:, model.columns(effect)]
+        for k, parameter in enumerate(effect.parameters):
+            key = f"{effect.name}.{parameter.name}"
+            if effect.shared:
+                start[key] = {"all": float(values[has][:, k].median())}
+            else:
+                start[key] = {n: float(values[j, k]) for j, n in enumerate(names) if bool(has[j])}
+    return start
+
+
+def _joints(found: Findings, problem: Problem) -> dict[str, dict]:
+    outcome, model = found.outcome, found.outcome.final.model
+    return {
+        name: {
+            "validation_rmse_before": float(outcome.base_errors.mse[j].sqrt()),
+            "validation_rmse_after": float(outcome.final_errors.mse[j].sqrt()),
+            "floor": float(found.data.floor[j]),
+            "effects": [e.name for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])],
+        }
+        for j, name in enumerate(problem.joint_names)
+    }

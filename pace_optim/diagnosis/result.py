@@ -1,0 +1,67 @@
+"""What a diagnosis found: ``diagnosis.json``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pace_optim.atomic import write_json
+
+VERSION = 1
+
+
+@dataclass(kw_only=True)
+class Diagnosis:
+    """The content of ``diagnosis.json``; field names are the file's keys."""
+
+    version: int = VERSION
+    run: str
+    verdict: str
+    """``effect``, ``nothing_missing`` or ``unknown``."""
+    summary: str
+    """The verdict in a sentence or two."""
+    added: list[str]
+    """Effects to add, as ``fit.py --effects`` takes them."""
+    ranking: list[dict[str, Any]]
+    """Every effect that was refitted, the best first."""
+    joints: dict[str, dict[str, Any]]
+    """For each joint its errors, floor and effects."""
+    data: list[str]
+    """What was noticed about the recordings."""
+    advice: list[str]
+    """What to do or to record next."""
+    runs: list[str]
+    """Folders of the refits."""
+    tried: list[str]
+    """Names of all candidates."""
+    physics_dt: float
+    """Physics step of the diagnosis [s]."""
+    ladder: list[dict[str, Any]] = field(default_factory=list)
+    """Validation RMSE of all joints from the base model to the last effect [rad]."""
+    error_map: dict[str, Any] = field(default_factory=dict)
+    """Which variable carries what is left, joint by joint."""
+    simulated_steps: int = 0
+    wall_time_s: float = 0.0
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``diagnosis.json`` to a run's folder, atomically."""
+        path = Path(folder) / "diagnosis.json"
+        write_json(path, asdict(self))
+        return path
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Diagnosis:
+        """Read it.
+
+        Raises:
+            ValueError: If it is missing or of another version.
+        """
+        path = Path(folder) / "diagnosis.json"
+        if not path.is_file():
+            raise ValueError(f"{path} does not exist. Run scripts/diagnose.py {folder} first.")
+        content = json.loads(path.read_text())
+        if content.get("version") != VERSION:
+            raise ValueError(f"{path} is no diagnosis of version {VERSION}. Diagnose again.")
+        return cls(**{key: value for key, value in content.items() if key in cls.__dataclass_fields__})

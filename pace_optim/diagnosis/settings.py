@@ -1,0 +1,40 @@
+"""What a user asks of a diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(kw_only=True)
+class DiagnosisSettings:
+    """One diagnosis, as on the command line of ``scripts/diagnose.py``."""
+
+    run: str | Path
+    """The run's folder."""
+
+    effects: list[str] = field(default_factory=list)
+    """More candidates (``module:Class``), beside all registered ones; or, with ``only``, the only ones."""
+
+    only: bool = False
+    """Whether nothing but ``effects`` is tried."""
+
+    max_effects: int = 3
+    """Most effects that are added to a joint."""
+
+    physics_dt: float | None = None
+    """Physics step of the diagnosis [s]; ``None``: half a control step, or the run's if that is finer."""
+
+    refit: bool = True
+    """Whether the model with the effects found is fitted to the whole robot, as a run of its own."""
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without reading anything.
+
+        Raises:
+            ValueError: If a value is unusable.
+        """
+        if self.max_effects < 1:
+            raise ValueError(f"max_effects is {self.max_effects}, expected at least 1.")
+        if self.only and not self.effects:
+            raise ValueError("--only needs the effects to try: name them with --effects.")

@@ -1,0 +1,121 @@
+"""From what was tried to a verdict, in numbers and in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.search import Outcome, Trial
+
+NOTHING_RATIO = 1.1
+"""Below this many times the floor there is nothing to explain."""
+UNKNOWN_RATIO = 3.0
+"""An unexplained error above this many times the floor is a finding of its own."""
+EXPLAINED = 0.5
+"""Less than this part of the error above the floor, and the effects found are not what is missing."""
+SHARED_SPREAD = 0.25
+"""Joints whose values scatter less than this about their mean can share one."""
+
+
+def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
+    """The verdict, and the part of the error above the floor that the effects found explain.
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    before, after = outcome.base_errors.mse, outcome.final_errors.mse
+    excess = (before - floor**2).clamp(min=0.0)
+    left = (after - floor**2).clamp(min=0.0)
+    explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
+    worst = float((after.sqrt() / floor).max())
+    if outcome.final.model.effects and (explained >= EXPLAINED or worst <= UNKNOWN_RATIO):
+        return "effect", explained
+    if worst > UNKNOWN_RATIO:
+        return "unknown", explained
+    return "nothing_missing", explained
+
+
+def labels(outcome: Outcome, joint_names: Sequence[str]) -> list[str]:
+    """The effects found as ``fit.py --effects`` takes them: ``name``, ``name@joints`` or ``name@shared``."""
+    model = outcome.final.model
+    result = []
+    for effect, has in zip(model.effects, model.has, strict=True):
+        own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
+        if effect.shared or len(own) == len(joint_names):
+            result.append(effect.name)
+        else:
+            result.append(f"{effect.name}@{'|'.join(own)}")
+    return result
+
+
+def ranking(outcome: Outcome, joint_names: Sequence[str]) -> list[dict[str, Any]]:
+    """Every effect that was refitted, those that were added first, then by what they explain."""
+    entries: list[dict[str, Any]] = []
+    for depth, this in enumerate(outcome.rounds):
+        effects = dict.fromkeys(t.effect for own in this.trials for t in own)
+        for effect in effects:
+            own = [t for trials in this.trials for t in trials if t.effect is effect]
+            added = [j for j, chosen in enumerate(this.chosen) if chosen is effect]
+            good = [t for t in own if t.significant]
+            shown = [t for t in own if t.joint in added] or good or own
+            confounded = sorted(
+                {other.name for j in added for other in this.rivals[j]}
+                | {
+                    this.chosen[j].name  # type: ignore[union-attr]
+                    for j, rivals in enumerate(this.rivals)
+                    if effect in rivals and this.chosen[j] is not None
+                }
+                | {other.name for j in added for other in this.rivals[j]}
+            )
+            entries.append(
+                {
+                    "effect": effect.name,
+                    "round": depth + 1,
+                    "added": bool(added),
+                    "joints": [joint_names[t.joint] for t in shown],
+                    "validation_rmse_before": _rms(t.mse_before for t in shown),
+                    "validation_rmse_after": _rms(t.mse_after for t in shown),
+                    "significant": bool(good),
+                    "evidence": _evidence(shown, effect),
+                    "confounded_with": confounded,
+                    "screen_score": max(t.screen_score for t in own),
+                    "values": {joint_names[t.joint]: t.values for t in shown},
+                }
+            )
+    return sorted(
+        entries,
+        key=lambda e: (
+            e["round"],
+            not e["added"],
+            -e["validation_rmse_before"] / max(e["validation_rmse_after"], 1e-12),
+        ),
+    )
+
+
+def confounded_pairs(outcome: Outcome) -> list[tuple[type[Effect], type[Effect]]]:
+    """Effects that were chosen, each with one that does as well."""
+    pairs = []
+    for this in outcome.rounds:
+        for chosen, rivals in zip(this.chosen, this.rivals, strict=True):
+            pairs += [(chosen, rival) for rival in rivals if chosen is not None]
+    return list(dict.fromkeys(pairs))
+
+
+def _evidence(trials: Sequence[Trial], effect: type[Effect]) -> str:
+    before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
+    strongest = max(trials, key=lambda t: t.ratio)
+    verb = "falls" if after < before else "does not fall:"
+    return (
+        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} mrad with it "
+        f"(t = {strongest.t:.1f} over blocks of one second). Sign: {effect.looks}."
+    )
+
+
+def _rms(squares: Any) -> float:
+    values = list(squares)
+    return math.sqrt(sum(values) / len(values))
