@@ -59,12 +59,11 @@ def main() -> None:
     parser.add_argument("--robot", choices=tuple(ROBOTS), default="bench")
     parser.add_argument("--workers", type=int, default=2, help="processes, one thread each")
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
-    parser.add_argument("--physics_dt", type=float, default=0.0005, help="of the model [s]")
-    parser.add_argument("--fits_only", action="store_true", help="no diagnosis: only the base and the true model")
+    parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
     parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")
     parser.add_argument("--table", action="store_true", help="only print what the results say")
     args = parser.parse_args()
-    results = args.folder / f"{args.robot}_{args.recordings}{'_fits' if args.fits_only else ''}.jsonl"
+    results = args.folder / f"{args.robot}_{args.recordings}.jsonl"
     if not args.table:
         try:
             jobs = make_jobs(
@@ -75,7 +74,6 @@ def main() -> None:
                 args.folder / f"{args.robot}_{args.recordings}",
                 physics_dt=args.physics_dt,
                 max_effects=args.max_effects,
-                fits_only=args.fits_only,
             )
         except ValueError as error:
             sys.exit(f"error: {error}")

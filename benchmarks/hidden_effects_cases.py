@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+import shutil
 import time
 import traceback
 from collections.abc import Sequence
@@ -11,9 +11,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pace_optim.fit import fit
-from pace_optim.fit_settings import FitSettings
-from pace_optim.plant import Case, CaseFiles, library_effects, outside_effects, write_case
+import torch
+
+from pace_actuators.effects import Effect, get_effect
+from pace_optim.diagnosis import candidate_effects, search_effects
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
+from pace_optim.diagnosis.model import start_values
+from pace_optim.diagnosis.search import validation_errors
+from pace_optim.diagnosis.verdict import ranking
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.plant import Case, library_effects, outside_effects, write_case
+from pace_optim.problem import load_problem
 
 GROUPS = ("effects", "clean", "outside", "pairs", "background", "harmonic")
 ROBOTS = {"bench": ("Pace-TestBench-v0", ".*"), "leg": ("Pace-AnymalD-v0", "LF_.*")}
@@ -35,12 +44,10 @@ class Job:
     """What is hidden."""
     folder: Path
     """Where its recordings and runs go."""
-    physics_dt: float = 0.0005
+    physics_dt: float = 0.00125
     """Of the model [s]."""
     max_effects: int = 3
     """How many effects the diagnosis may add."""
-    fits_only: bool = False
-    """Whether only the base model and the true model are fitted."""
 
 
 def make_jobs(
@@ -92,67 +99,58 @@ def run_job(job: Job) -> dict[str, Any]:
 
 
 def run_case(job: Job) -> dict[str, Any]:
-    """Make the recordings, fit the base model, diagnose, and fit the model that has the true effects."""
+    """Make the recordings, diagnose, and fit the model that has the true effects and no others."""
     start = time.perf_counter()
     files = write_case(job.case, job.folder)
     truth = json.loads(files.truth.read_text())
     made = time.perf_counter()
-    settings = _fit_settings(job, files)
-    base, run = fit(settings)
-    fitted = time.perf_counter()
-    found = {} if job.fits_only else _diagnose(run, job.max_effects)
+    problem = load_problem(
+        job.case.task,
+        data=[str(path) for path in files.train],
+        validation=[str(path) for path in files.validation],
+        physics_dt=job.physics_dt,
+    )
+    middle = problem.space.to_physical(problem.space.start)
+    found = search_effects(problem, middle, candidate_effects(), job.max_effects)
     diagnosed = time.perf_counter()
-    before = base.rmse["validation"]["all"]
-    true_effects = [name for name in truth["effects"] if name in library_effects()]
+    outcome = found.outcome
+    base, final = outcome.base, outcome.final
+    true_effects = [get_effect(name) for name in truth["effects"] if name in library_effects()]
     with_truth = None
     if true_effects and not job.case.background:
-        with_truth = fit(replace(settings, effects=true_effects))[0].rmse["validation"]["all"]
+        same = set(true_effects) == set(final.model.effects)
+        known = final if same else _fit_with(found.twins, base, true_effects, truth)
+        with_truth = _rms(validation_errors(found.twins, [known])[0])
+    shutil.rmtree(job.folder, ignore_errors=True)  # a case can be made again from its name
     return {
         "size": truth["size"],
         "noise": job.case.noise,
-        "at_bound": list(base.at_bound),
-        **found,
-        "rmse": {"before": before, "after": _rmse_after(found, before), "truth": with_truth},
+        "verdict": found.verdict,
+        "added": found.added,
+        "explained": found.explained,
+        "floor": float(found.data.floor.square().mean().sqrt()),
+        "ranking": ranking(outcome, problem.joint_names),
+        "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
+        "truth": truth["effects"],
         "seconds": {
             "recordings": made - start,
-            "base_fit": fitted - made,
-            "diagnosis": diagnosed - fitted,
+            "diagnosis": diagnosed - made,
             "true_fit": time.perf_counter() - diagnosed,
         },
     }
 
 
-def _diagnose(run: Path, max_effects: int) -> dict[str, Any]:
-    """The one place that knows the diagnosis: the fields of diagnosis.json that are judged."""
-    from pace_optim.diagnosis import DiagnosisSettings, diagnose
-
-    result = diagnose(DiagnosisSettings(run=run, max_effects=max_effects))
-    result = result[0] if isinstance(result, tuple) else result
-    if dataclasses.is_dataclass(result) and not isinstance(result, type):
-        result = dataclasses.asdict(result)
-    return {key: result[key] for key in ("verdict", "added", "ranking", "advice")} | {
-        "runs": [str(path) for path in result["runs"]]
-    }
-
-
-def _rmse_after(found: dict[str, Any], before: float) -> float:
-    """Validation error of the model with all that was added [rad]."""
-    if not found.get("added"):
-        return before
-    after = [
-        entry["validation_rmse_after"]
-        for entry in found["ranking"]
-        if entry["effect"].partition("@")[0] in {name.partition("@")[0] for name in found["added"]}
-    ]
-    return min(after, default=before)
+def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]) -> Fitted:
+    """The model that knows which effects there are; its search starts at the usual place."""
+    model, physical, n = base.model, base.model.to_physical(base.x), base.model.num_joints
+    for effect in effects:
+        has = torch.tensor([name in str(truth["effects"][effect.name]) for name in twins.joint_names])
+        model = model.with_effect(effect, has)
+        physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
+    score = torch.full((n,), torch.inf, dtype=torch.float64)
+    start = Fitted(model=model, own=None, x=model.to_normalised(physical), score=score)
+    return fit_coarse_to_fine(twins, [start])[0]
 
 
-def _fit_settings(job: Job, files: CaseFiles) -> FitSettings:
-    return FitSettings(
-        task=job.case.task,
-        data=[str(path) for path in files.train],
-        validation=[str(path) for path in files.validation],
-        optimizer="least_squares",
-        physics_dt=job.physics_dt,
-        log_dir=str(job.folder / "runs"),
-    )
+def _rms(errors: BlockErrors) -> float:
+    return float(errors.mse.mean().sqrt())

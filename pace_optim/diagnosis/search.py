@@ -88,7 +88,8 @@ def add_effects(
     open_joints = torch.ones(base.model.num_joints, dtype=torch.bool)
     for depth in range(max_effects):
         open_joints &= errors.mse.sqrt() > (1.0 if depth == 0 else NEXT_FLOOR) * floor
-        untried = [e for e in effects if e not in now.model.effects]
+        parted = any(e.parts_motor_and_link for e in now.model.effects)
+        untried = [e for e in effects if e not in now.model.effects and not (parted and e.parts_motor_and_link)]
         if not bool(open_joints.any()) or not untried:
             break
         say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")

@@ -119,13 +119,20 @@ class SideBySide:
             if stack is None:
                 continue
             ids = actuator.joint_indices
-            for k, common in enumerate(self._common):
+            by_place = {(effect.name, effect.rows.start, effect.rows.stop): effect for effect in stack.effects}
+            for common in self._common:
                 values = torch.cat(
                     [_of_effect(slot.model, common, v) for slot, v in zip(self.slots, physical, strict=True)]
                 )
-                robot.write_effect_to_sim(actuator, stack.effects[k], values.repeat_interleave(count, dim=0)[:, ids])
+                robot.write_effect_to_sim(
+                    actuator, by_place[common.name, None, None], values.repeat_interleave(count, dim=0)[:, ids]
+                )
             groups = [group for group in self._groups() if self.slots[group[0]].own is not None]
-            for group, effect in zip(groups, stack.effects[len(self._common) :], strict=True):
+            for group in groups:
+                first = self.slots[group[0]]
+                begin = sum(slot.rows for slot in self.slots[: group[0]]) * count
+                end = begin + sum(self.slots[i].rows for i in group) * count
+                effect = by_place[first.own.name, begin, end]
                 values = torch.cat([_of_effect(self.slots[i].model, self.slots[i].own, physical[i]) for i in group])
                 robot.write_effect_to_sim(actuator, effect, values.repeat_interleave(count, dim=0)[:, ids])
 
