@@ -144,7 +144,9 @@ class Rollout:
                 found = True
                 for row, at in enumerate((0.0, (steps - 1) * dt)):
                     time = torch.full((self.env.num_envs, actuator.num_joints), at, dtype=torch.float64)
-                    total[row][:, actuator.joint_indices] = actuator.effects.observation_lag(time) / dt
+                    lag = actuator.effects.observation_lag(time)
+                    if lag is not None:
+                        total[row][:, actuator.joint_indices] = lag / dt
         return total if found else None
 
     def simulated(self, steps: int) -> Iterator[torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,8 +50,8 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
     numerical = _numerical_floor(problem, base)
     sentences = [
-        f"Measurement noise: {1e3 * float(noise.min()):.2g} to {1e3 * float(noise.max()):.2g} mrad by joint; halving the "
-        f"physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
+        f"Measurement noise: {1e3 * float(noise.min()):.2g} to {1e3 * float(noise.max()):.2g} mrad by joint; halving "
+        f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
         f"{1e3 * float(numerical.max()):.2g} mrad.",
     ]
     if steps:
@@ -82,4 +83,10 @@ def _numerical_floor(problem: Problem, base: Fitted) -> torch.Tensor:
 
 
 def _key(*values: object) -> str:
-    return repr([v.tolist() if isinstance(v, np.ndarray) else (dict(v) if hasattr(v, "items") else v) for v in values])
+    return repr([_plain(value) for value in values])
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else value

@@ -48,18 +48,21 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
         effort: Typical torque of each joint, (n,) [N m].
     """
     model = now.model
-    slots, values, probes = [Slot(model=model, own=None, rows=1)], [model.to_physical(now.x)[None]], []
+    if now.error is None or now.jacobian is None:
+        raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
+    slots, values = [Slot(model=model, own=None, rows=1)], [model.to_physical(now.x)[None]]
+    probes: list[tuple[type[Effect], torch.Tensor]] = []
     everywhere = torch.ones(model.num_joints, dtype=torch.bool)
     for effect in effects:
-        own = [_probe_values(effect, point, effort) for point in probe_points(effect)]
-        slots.append(Slot(model=model.with_effect(effect, everywhere), own=effect, rows=len(own)))
-        values.append(torch.stack([torch.cat([model.to_physical(now.x), each], dim=1) for each in own]))
-        probes += [(effect, each) for each in own]
+        points = [_probe_values(effect, point, effort) for point in probe_points(effect)]
+        slots.append(Slot(model=model.with_effect(effect, everywhere), own=effect, rows=len(points)))
+        values.append(torch.stack([torch.cat([model.to_physical(now.x), each], dim=1) for each in points]))
+        probes += [(effect, each) for each in points]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train
     errors = batch.simulate(values, where, _STRIDE)
     blocks = _blocks(where, problem.control_dt)
-    jacobian = _free_columns(now)
+    jacobian = _free_columns(now, now.jacobian)
     scores, sizes = _explained(now.error, jacobian, errors[1:] - errors[:1], blocks)
     result = []
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
@@ -100,9 +103,9 @@ def _blocks(where: torch.Tensor, control_dt: float) -> torch.Tensor:
     return torch.where(where[steps], fold, -1)
 
 
-def _free_columns(now: Fitted) -> torch.Tensor:
-    """The Jacobian, without entries that sit at a bound, (P, K, R, n)."""
-    columns = now.jacobian.clone()
+def _free_columns(now: Fitted, jacobian: torch.Tensor) -> torch.Tensor:
+    """The Jacobian (P, K, R, n), without entries that sit at a bound."""
+    columns = jacobian.clone()
     fixed = (now.x.abs() > 1 - _AT_BOUND) | ~now.model.free
     for j, p in fixed.nonzero().tolist():
         columns[p, ..., j] = 0.0
@@ -149,14 +152,14 @@ def _explained(
                 grams.append(whole)
             total = _cross_validated(grams, size + 1)
             scores[i, j] = 1 - total / base
-            beta = _solve(sum(grams), size + 1)
+            beta = _solve(torch.stack(grams).sum(dim=0), size + 1)
             sizes[i, j] = -float(beta[size] * scale[size] / amplitude[i])
     return scores, sizes
 
 
 def _cross_validated(grams: list[torch.Tensor], size: int) -> float:
     """Squared error of regressing the last column on the first ``size``, each fold by the others."""
-    whole, total = sum(grams), 0.0
+    whole, total = torch.stack(grams).sum(dim=0), 0.0
     for gram in grams:
         beta = _solve(whole - gram, size)
         a, b, c = gram[:size, :size], gram[:size, -1], gram[-1, -1]

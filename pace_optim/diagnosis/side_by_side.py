@@ -132,6 +132,8 @@ class SideBySide:
                 first = self.slots[group[0]]
                 begin = sum(slot.rows for slot in self.slots[: group[0]]) * count
                 end = begin + sum(self.slots[i].rows for i in group) * count
+                if first.own is None:
+                    raise ValueError("This slot has no effect of its own.")
                 effect = by_place[first.own.name, begin, end]
                 values = torch.cat([_of_effect(self.slots[i].model, self.slots[i].own, physical[i]) for i in group])
                 robot.write_effect_to_sim(actuator, effect, values.repeat_interleave(count, dim=0)[:, ids])

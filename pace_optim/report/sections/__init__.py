@@ -10,6 +10,7 @@ from ..markup import Section
 from ..run_data import RunData
 from .consistency import consistency
 from .correlation import correlation
+from .diagnosis import diagnosis
 from .failure import failure
 from .ladder import ladder
 from .making import making
@@ -24,6 +25,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     ladder,
     trajectories,
     failure,
+    diagnosis,
     parameters,
     consistency,
     correlation,

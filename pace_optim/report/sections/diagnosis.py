@@ -1,0 +1,204 @@
+"""Which physical effect is missing: the verdict, the evidence, and what to do next."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from pace_optim.trajectory_errors import angle_unit
+
+from ..markup import Section, bullets, esc, figure, table
+from ..run_data import RunData
+from ..wording import in_words
+
+_HEADINGS = {
+    "effect": ("good", "An effect is missing, and it is known"),
+    "nothing_missing": ("good", "Nothing is missing"),
+    "unknown": ("bad", "Something is missing, and it is none of the known effects"),
+}
+_SHOWN = 10
+"""Effects in the chart, at most."""
+_VARIABLES = 6
+"""Variables of an error map in the table, at most."""
+_COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py )")
+
+
+def diagnosis(run: RunData) -> Section | None:
+    """What ``diagnose.py`` found."""
+    content = run.read_json("diagnosis.json")
+    if not content:
+        return None
+    parts = [_verdict(content), _ladder(content), _ranking(content), _error_map(content), _joints(content)]
+    parts += [_advice(content), _data(content)]
+    return Section(id="diagnosis", title="Which effect is missing", html="".join(parts))
+
+
+def _verdict(content: dict[str, Any]) -> str:
+    css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
+    add = ""
+    if content["added"]:
+        add = f"<p>Add it: <code>scripts/fit.py … --effects {esc(' '.join(content['added']))}</code></p>"
+    return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
+
+
+def _floor(content: dict[str, Any]) -> float:
+    """Of all joints [rad]."""
+    floors = [joint["floor"] for joint in content["joints"].values()]
+    return (sum(floor**2 for floor in floors) / max(1, len(floors))) ** 0.5
+
+
+def _ladder(content: dict[str, Any]) -> str:
+    steps = content.get("ladder", [])
+    if not steps:
+        return ""
+    floor = _floor(content)
+    factor, unit = angle_unit([step["validation_rmse"] for step in steps])
+    rows, before = [], None
+    for step in steps:
+        error = step["validation_rmse"]
+        gain = "" if before is None or error <= 0 else f"{before / error:.2f}"
+        rows.append([f"<b>{esc(step['model'])}</b>", f"{factor * error:#.3g}", gain])
+        before = error
+    rows.append(["floor of noise and numerics", f"{factor * floor:#.3g}", ""])
+    head = ["model, each joint simulated alone", f"validation [{unit}]", "× better than before"]
+    return f"<h3>The error with it</h3>{table(head, rows)}"
+
+
+def _ranking(content: dict[str, Any]) -> str:
+    entries = content["ranking"]
+    tried = f"<p>{len(content['tried'])} effects were tried.</p>" if content.get("tried") else ""
+    if not entries:
+        return f"<h3>Effects</h3><p>No effect was worth a refit.</p>{tried}"
+    errors = [entry[key] for entry in entries for key in ("validation_rmse_before", "validation_rmse_after")]
+    factor, unit = angle_unit(errors)
+    return (
+        "<h3>Effects<small>refitted one at a time, judged on recordings that were not fitted</small></h3>"
+        f"{_chart(entries[:_SHOWN], _floor(content), factor, unit)}{_evidence(entries, factor, unit)}{tried}"
+    )
+
+
+def _name(entry: dict[str, Any]) -> str:
+    return entry["effect"] if entry.get("round", 1) == 1 else f"{entry['effect']} (round {entry['round']})"
+
+
+def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str) -> str:
+    names = [_name(entry) for entry in reversed(entries)]
+    traces = []
+    for key, word, color in (
+        ("validation_rmse_before", "before", "var(--target)"),
+        ("validation_rmse_after", "after", "var(--heldedge)"),
+    ):
+        traces.append(
+            {
+                "type": "bar",
+                "orientation": "h",
+                "name": word,
+                "y": names,
+                "x": [factor * entry[key] for entry in reversed(entries)],
+                "marker": {"color": color},
+                "hovertemplate": f"%{{y}}, {word}: %{{x:.3g}} {unit}<extra></extra>",
+            }
+        )
+    floor_line = {
+        "type": "scatter",
+        "mode": "lines",
+        "name": "floor",
+        "x": [factor * floor] * len(names),
+        "y": names,
+        "line": {"width": 1.5, "dash": "dot", "color": "var(--muted)"},
+        "hovertemplate": f"floor: %{{x:.3g}} {unit}<extra></extra>",
+    }
+    layout = {
+        "barmode": "group",
+        "bargap": 0.35,
+        "xaxis": {"title": {"text": f"validation error [{unit}]"}, "rangemode": "tozero"},
+        "yaxis": {"type": "category", "automargin": True, "showgrid": False},
+        "hovermode": "closest",
+        "legend": {"traceorder": "normal"},
+    }
+    return figure("effect-ranking", [*traces, floor_line], layout, height=130 + 42 * len(names))
+
+
+def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> str:
+    rows = []
+    for entry in entries:
+        state = "added" if entry.get("added") else "pays" if entry["significant"] else "does not pay"
+        rows.append(
+            [
+                f"<b>{esc(_name(entry))}</b>",
+                state,
+                f"{factor * entry['validation_rmse_before']:#.3g} → {factor * entry['validation_rmse_after']:#.3g}",
+                esc(_few(entry["joints"])),
+                esc(", ".join(entry["confounded_with"]) or "–"),
+                esc(entry["evidence"]),
+            ]
+        )
+    head = ["effect", "", f"validation [{unit}]", "joints", "cannot be told from", "evidence"]
+    return table(head, rows, "recordings")
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
+
+
+def _joints(content: dict[str, Any]) -> str:
+    joints = content["joints"]
+    factor, unit = angle_unit([joint["validation_rmse_before"] for joint in joints.values()])
+    rows = [
+        [
+            f"<b>{esc(name)}</b>",
+            *(f"{factor * joint[key]:#.3g}" for key in ("validation_rmse_before", "validation_rmse_after", "floor")),
+            esc(", ".join(joint["effects"]) or "–"),
+        ]
+        for name, joint in joints.items()
+    ]
+    return f"<h3>Joint by joint</h3>{table(['joint', f'before [{unit}]', 'after', 'floor', 'effects'], rows)}"
+
+
+def _error_map(content: dict[str, Any]) -> str:
+    """Which variable carries what is left; only where no known effect explains it."""
+    found = content.get("error_map") or {}
+    if content["verdict"] != "unknown" or not found.get("joints"):
+        return ""
+    joints = found["joints"]
+    variables = list(next(iter(joints.values()))["r2"])[:_VARIABLES]
+    rows = [
+        [f"<b>{esc(name)}</b>", *(f"{100 * max(0.0, joint['r2'][v]):.0f} %" for v in variables), esc(joint["sentence"])]
+        for name, joint in joints.items()
+    ]
+    worst = max(joints, key=lambda name: joints[name]["r2"][joints[name]["best"]])
+    curve = joints[worst]["curve"]
+    trace = {
+        "type": "scatter",
+        "mode": "lines+markers",
+        "name": worst,
+        "x": curve["at"],
+        "y": curve["torque"],
+        "line": {"color": "var(--simulated)", "width": 2},
+        "hovertemplate": "%{x:.3g}: %{y:.3g} N m<extra></extra>",
+    }
+    layout = {
+        "xaxis": {"title": {"text": joints[worst]["best_label"]}},
+        "yaxis": {"title": {"text": f"missing torque of {worst} [N m]"}},
+        "showlegend": False,
+    }
+    return (
+        "<h3>What carries the error<small>part of the missing torque that a map of one variable explains</small></h3>"
+        f"{bullets([found['sentence']], 'notes')}{figure('error-map', [trace], layout, height=300)}"
+        f"{table(['joint', *variables, ''], rows)}"
+    )
+
+
+def _advice(content: dict[str, Any]) -> str:
+    if not content["advice"]:
+        return ""
+    entries = []
+    for sentence in content["advice"]:
+        first, *commands = _COMMAND.split(sentence)
+        lines = "".join(f"<pre>{esc(command.strip())}</pre>" for command in commands)
+        entries.append(f"<li>{esc(first.strip())}{lines}</li>")
+    return f"<h3>What to do and to record next</h3><ul>{''.join(entries)}</ul>"
+
+
+def _data(content: dict[str, Any]) -> str:
+    return f"<h3>The recordings</h3>{bullets(content['data'], 'notes')}" if content["data"] else ""
