@@ -14,7 +14,7 @@ from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
 _FOLDS = 5
-_BLOCK_S = 1.0
+_BLOCK_S = 0.2
 _STRIDE = 2
 _AT_BOUND = 1e-3
 _RIDGE = 1e-9
@@ -37,7 +37,7 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
     """Look at each effect at its probes.
 
     With e the error, J its derivatives by the parameters that the model has, and S the change that a probe makes, e is
-    regressed on [J] and on [J, S], both cross-validated over interleaved blocks of one second:
+    regressed on [J] and on [J, S], both cross-validated over interleaved blocks of a fifth of a second:
 
         score = 1 - SSE[J, S] / SSE[J]
 

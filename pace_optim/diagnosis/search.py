@@ -18,7 +18,11 @@ from pace_optim.joint_twins.problem import TwinProblem
 SCREEN_THRESHOLD = 0.03
 """An effect that would explain less than this of what is left is not refitted."""
 SHORT_LIST = 6
-"""Effects refitted for each joint, at most."""
+"""Effects refitted because they would explain most of the whole robot's error."""
+WORST_JOINTS = 4
+"""Joints whose own best candidates are refitted too."""
+PER_JOINT = 4
+"""How many of them."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
 NEXT_FLOOR = 1.3
@@ -93,7 +97,7 @@ def add_effects(
         if not bool(open_joints.any()) or not untried:
             break
         say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
-        this = _try(problem, now, errors, untried, effort, open_joints, say)
+        this = _try(problem, now, errors, untried, effort, floor, open_joints, say)
         if this is None:
             break
         found, fitted = this
@@ -124,11 +128,12 @@ def _try(
     errors: BlockErrors,
     effects: Sequence[type[Effect]],
     effort: torch.Tensor,
+    floor: torch.Tensor,
     open_joints: torch.Tensor,
     say: Callable[[str], None],
 ) -> tuple[Round, dict[type[Effect], Fitted]] | None:
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
-    best = _best_probes(probes, open_joints)
+    best = _best_probes(probes, torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0))
     if not best:
         return None
     say(f"refitting with {', '.join(effect.name for effect in best)}")
@@ -166,19 +171,26 @@ def _try(
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals), keep
 
 
-def _best_probes(probes: Sequence[Probe], open_joints: torch.Tensor) -> dict[type[Effect], list[list[Probe]]]:
-    """Effects worth a refit, each with one or two starts: for every joint its best probe, and its second best."""
-    n = len(open_joints)
-    wanted: dict[type[Effect], None] = {}
+def _best_probes(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], list[list[Probe]]]:
+    """Effects worth a refit, each with one or two starts: for every joint its best probe, and its second best.
+
+    Args:
+        probes: What was screened.
+        excess: Squared error of each joint that could be explained, (n,) [rad²]; zero where there is nothing to find.
+    """
+    n = len(excess)
     by_effect: dict[type[Effect], list[Probe]] = {}
     for probe in probes:
         by_effect.setdefault(probe.effect, []).append(probe)
-    for j in range(n):
-        if not bool(open_joints[j]):
-            continue
-        scores = {effect: max(float(p.score[j]) for p in own) for effect, own in by_effect.items()}
-        listed = sorted((e for e in scores if scores[e] > SCREEN_THRESHOLD), key=lambda e: -scores[e])[:SHORT_LIST]
-        wanted.update(dict.fromkeys(listed))
+    scores = {effect: torch.stack([p.score for p in own]).max(dim=0).values for effect, own in by_effect.items()}
+    promising = {e: torch.where(s > SCREEN_THRESHOLD, s, 0.0) * excess for e, s in scores.items()}
+    wanted: dict[type[Effect], None] = {}
+    # what explains most of the whole robot's error, then what explains most of the worst joints'
+    total = sorted((e for e in promising if promising[e].sum() > 0), key=lambda e: -float(promising[e].sum()))
+    wanted.update(dict.fromkeys(total[:SHORT_LIST]))
+    for j in excess.argsort(descending=True)[:WORST_JOINTS].tolist():
+        own = sorted((e for e in promising if promising[e][j] > 0), key=lambda e: -float(promising[e][j]))
+        wanted.update(dict.fromkeys(own[:PER_JOINT]))
     result = {}
     for effect in wanted:
         ranked = [sorted(by_effect[effect], key=lambda p: -float(p.score[j])) for j in range(n)]
