@@ -44,7 +44,7 @@ def error_map(problem: TwinProblem, model: Fitted, floor: torch.Tensor) -> dict[
         floor: Of each joint, (n,) [rad]; a joint whose error is below is left out.
     """
     torques, signals, folds, rms = _residual_torques(problem, model)
-    joints = {}
+    joints: dict[str, dict[str, Any]] = {}
     for j, name in enumerate(problem.joint_names):
         if rms[j] <= float(floor[j]):
             continue
@@ -101,7 +101,7 @@ def _residual_torques(
         stiffness = path.stiffness[np.minimum(k, len(path.stiffness) - 1), r].numpy()
         turned = _smooth(np.sign(v) - np.sign(v - gap_v), dt)
         missing = inertia * gap_a + (base["viscous_friction"] + kd[r]) * gap_v + (kp[r] - stiffness) * gap
-        parts["r"].append(-(missing + base["friction"] * turned))
+        parts["r"].append(missing + base["friction"] * turned)
         torque = inertia * a - path.feel.torque[k, r].numpy()
         time = np.broadcast_to(at[:, None] * problem.control_dt, q.shape)
         for key, value in zip(VARIABLES, (q, v, q, np.abs(torque), torque, time), strict=True):
