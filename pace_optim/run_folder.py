@@ -28,6 +28,8 @@ best_trajectory.pt   commanded, measured and simulated positions of the best par
 mean_xxx.pt          mean of the search after generation xxx, physical, in the layout of config.pt
 config.pt            joints, bounds and layout of the parameter vector
 history.json         scores over iterations
+comparison.json      where the model fails, once scripts/compare.py was run
+diagnosis.json       which physical effect is missing, once scripts/diagnose.py was run
 events.out.*         TensorBoard: tensorboard --logdir {folder}
 settings.json, checkpoint.npz   what `scripts/fit.py --resume {folder}` needs
 """
