@@ -35,7 +35,7 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 	$(BIN)/python -m pip install --quiet $(PIP_INSTALL_ARGS) --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
-demo: install  ## identify a robot from its sample recording and open up the result
+demo: install  ## hide an effect in a robot, fit, compare, diagnose, add what is missing
 	$(BIN)/python scripts/demo.py
 
 lint: install  ## ruff and mypy

@@ -116,7 +116,7 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
-    The finer steps are Runge-Kutta's, unless a drive has an effect with fast dynamics of its own, which must be implicit.
+    The finer steps are Runge-Kutta's, unless a drive has an effect with fast dynamics of its own: those are implicit.
 
     Raises:
         ValueError: If the present time step is no multiple of the finer one.

@@ -15,6 +15,7 @@ from pace_optim.jacobian import Colouring, Jacobian, jacobian, perturbed
 
 _DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
 _STALLED = 3
+_CREEPING = 4
 _SMALLEST_DAMPING = 1e-9
 
 
@@ -27,6 +28,9 @@ class LeastSquaresCfg:
 
     score_tolerance: float = 1e-6
     """Stop when an iteration lowers the score by less than this part of it."""
+
+    creep_tolerance: float = 1e-4
+    """Stop when the score fell by less than this part of it in each of the last four iterations, on average."""
 
     step_tolerance: float = 1e-7
     """Stop when no normalised parameter moves by more than this."""
@@ -229,12 +233,19 @@ def _advance(
         if expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED:
             descent.stop_reason = "converged"
     descent.scores.append(descent.score)
+    if descent.stop_reason is None and _creeps(descent.scores, cfg.creep_tolerance):
+        descent.stop_reason = "converged"
     if descent.score <= cfg.target_score:
         descent.stop_reason = f"score below {cfg.target_score:g}"
     elif not np.isfinite(descent.score):
         descent.stop_reason = "diverged at its start"
     elif descent.stop_reason is None and descent.iteration >= cfg.max_iteration:
         descent.stop_reason = f"max_iteration {cfg.max_iteration}"
+
+
+def _creeps(scores: Sequence[float], tolerance: float) -> bool:
+    """Whether the score has all but stopped falling, as it does where friction makes it rough."""
+    return len(scores) > _CREEPING and scores[-1 - _CREEPING] - scores[-1] < _CREEPING * tolerance * scores[-1]
 
 
 def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:

@@ -17,7 +17,6 @@ from pace_optim.summary import summary
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
-PHYSICS_DT = 0.00125  # half a control step [s]
 MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
 
 
@@ -62,7 +61,6 @@ def main() -> None:
             data=files["train"],
             validation=files["validation"],
             optimizer="least_squares",
-            physics_dt=PHYSICS_DT,
             log_dir=str(args.log_dir),
         )
     )

@@ -79,10 +79,16 @@ class DriveState:
 
     def __getattr__(self, name: str) -> torch.Tensor:
         """A field."""
+        if name.startswith("_"):  # copying and pickling ask before there are any
+            raise AttributeError(name)
         try:
             return self._fields[name]
         except KeyError:
             raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(self._fields)}.") from None
+
+    def __deepcopy__(self, memo: dict) -> DriveState:
+        """A copy with tensors of its own."""
+        return DriveState({name: tensor.clone() for name, tensor in self._fields.items()})
 
     def __setattr__(self, name: str, value: torch.Tensor) -> None:
         """Write into a field."""

@@ -23,6 +23,8 @@ WORST_JOINTS = 4
 """Joints whose own best candidates are refitted too."""
 PER_JOINT = 4
 """How many of them."""
+FAR_FROM_FLOOR = 50.0
+"""An error that is this many times the floor is beyond what screening can judge: all effects are refitted."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
 NEXT_FLOOR = 1.3
@@ -133,7 +135,8 @@ def _try(
     say: Callable[[str], None],
 ) -> tuple[Round, dict[type[Effect], Fitted]] | None:
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
-    best = _best_probes(probes, torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0))
+    excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
+    best = _best_probes(probes, excess, bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any()))
     if not best:
         return None
     say(f"refitting with {', '.join(effect.name for effect in best)}")
@@ -171,12 +174,15 @@ def _try(
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals), keep
 
 
-def _best_probes(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], list[list[Probe]]]:
+def _best_probes(
+    probes: Sequence[Probe], excess: torch.Tensor, everything: bool
+) -> dict[type[Effect], list[list[Probe]]]:
     """Effects worth a refit, each with one or two starts: for every joint its best probe, and its second best.
 
     Args:
         probes: What was screened.
         excess: Squared error of each joint that could be explained, (n,) [rad²]; zero where there is nothing to find.
+        everything: Whether all effects are refitted: what small changes do says little of a large error.
     """
     n = len(excess)
     by_effect: dict[type[Effect], list[Probe]] = {}
@@ -191,6 +197,8 @@ def _best_probes(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Eff
     for j in excess.argsort(descending=True)[:WORST_JOINTS].tolist():
         own = sorted((e for e in promising if promising[e][j] > 0), key=lambda e: -float(promising[e][j]))
         wanted.update(dict.fromkeys(own[:PER_JOINT]))
+    if everything:
+        wanted.update(dict.fromkeys(by_effect))
     result = {}
     for effect in wanted:
         ranked = [sorted(by_effect[effect], key=lambda p: -float(p.score[j])) for j in range(n)]
