@@ -73,9 +73,9 @@ class Judgement:
 def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first: bool) -> Judgement:
     """Compare two models block by block.
 
-    Neighbouring samples are alike, blocks of one second hardly: the mean of the blocks' log(MSE before / MSE after)
-    is held against its scatter, and the threshold is Student's for the chance that the best of ``tried`` candidates
-    looks this good by luck.
+    Neighbouring samples are alike, blocks of one second hardly: the mean of the blocks' log(MSE before / MSE after),
+    and that of MSE before - MSE after, are held against their scatter. The threshold is Student's for the chance that
+    the best of ``tried`` candidates looks this good by luck in either of them.
 
     Args:
         before: The present model's errors.
@@ -89,8 +89,15 @@ def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first
     count = len(logs)
     if count < 4:
         return Judgement(ratio=ratio, t=0.0, significant=False)
-    t = float(logs.mean() / (logs.std() / math.sqrt(count)).clamp(min=1e-12))
-    threshold = float(stats.t.isf(LEVEL / max(1, tried), count - 1))
+    falls = (before.square[:, joint] - after.square[:, joint]) / before.mse[joint]
+    # the first sees a small fall everywhere, the second a large one somewhere
+    t = max(_t(logs), _t(falls))
+    threshold = float(stats.t.isf(LEVEL / (2 * max(1, tried)), count - 1))
     least = FIRST_RATIO if first else NEXT_RATIO
     enough = t > threshold or (ratio >= CLEAR_RATIO and t > CLEAR_T)
     return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)
+
+
+def _t(values: torch.Tensor) -> float:
+    """Mean over its standard error."""
+    return float(values.mean() / (values.std() / math.sqrt(len(values))).clamp(min=1e-12))
