@@ -78,6 +78,7 @@ def drive_problem(steps: int = 8000) -> DriveProblem:
     recording = _simulated(env, space, truth, chirp(steps, env.step_dt), tuple(sim2real.joint_order))
     problem = Problem(
         task=TASK,
+        plain_cfg=cfg,
         env_cfg=cfg,
         dataset=make_dataset([recording], train_fraction=1),
         space=space,

@@ -159,7 +159,7 @@ def test_the_part_explained_is_of_what_lies_above_the_floor():
 
 def test_effects_are_named_as_fit_takes_them():
     outcome = outcome_of([1.0] * 3, [1.0] * 3, [STRIBECK, GAIN], [[True] * 3, [True, False, True]])
-    assert labels(outcome, ("a", "b", "c")) == ["stribeck_friction", "torque_gain@a|c"]
+    assert labels(outcome.final.model, ("a", "b", "c")) == ["stribeck_friction", "torque_gain@a|c"]
 
 
 def trial(effect, joint, after, significant=True):

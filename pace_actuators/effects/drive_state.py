@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 
 _WRITABLE = (
@@ -87,8 +89,8 @@ class DriveState:
             raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(self._fields)}.") from None
 
     def __deepcopy__(self, memo: dict) -> DriveState:
-        """A copy with tensors of its own."""
-        return DriveState({name: tensor.clone() for name, tensor in self._fields.items()})
+        """A copy with tensors of its own; what shares memory with it still does in its copy."""
+        return DriveState(copy.deepcopy(self._fields, memo))
 
     def __setattr__(self, name: str, value: torch.Tensor) -> None:
         """Write into a field."""

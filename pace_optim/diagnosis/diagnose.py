@@ -13,7 +13,9 @@ from pace_actuators.effects import Effect, available_effects, get_effect
 from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import DataCheck, check_data
+from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.error_map import error_map
+from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
@@ -21,6 +23,7 @@ from pace_optim.diagnosis.verdict import labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
+from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem, load_problem
 from pace_optim.progress import ProgressLine
@@ -75,7 +78,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
             effects=found.added,
             optimizer="least_squares",
             physics_dt=physics_dt,
-            start=_start_values(found),
+            start=whole_values(found.outcome.final, problem.joint_names),
             log_dir=str(folder.parent.parent),
         )
         _, path = fit(refit_settings, progress)
@@ -130,9 +133,19 @@ def search_effects(
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base)
     usable = [effect for effect in candidates if effect.name not in data.unusable]
-    outcome = add_effects(twins, base, usable, effort, _FLOOR_MARGIN * data.floor, max_effects, say)
+
+    def renewed(present: TwinProblem, model: Fitted) -> TwinProblem:
+        if max(len(tree) for tree in problem.trees) == 1:
+            return present
+        say("reference motion with what was found")
+        whole = problem.with_effects(labels(model.model, problem.joint_names))
+        values = whole.space.from_dict(whole_values(model, problem.joint_names))
+        changing = [effect.name for effect in candidates if effect.overrides("write_model")]
+        return twin_problem(problem, reference_path(whole, values, changing))
+
+    outcome = add_effects(twins, base, usable, effort, _FLOOR_MARGIN * data.floor, max_effects, say, renewed)
     decision, explained = verdict(outcome, data.floor)
-    added = labels(outcome, problem.joint_names) if decision == "effect" else []
+    added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
     return Findings(twins=twins, outcome=outcome, data=data, verdict=decision, explained=explained, added=added)
 
 
@@ -168,27 +181,25 @@ def _ladder(found: Findings) -> list[dict]:
     return steps
 
 
-def _start_values(found: Findings) -> dict[str, dict[str, float]]:
-    """Where the refit of the whole robot starts: what the joints alone ended with."""
-    from pace_optim.diagnosis.model import BASE
-
-    model, names = found.outcome.final.model, found.twins.joint_names
-    physical = model.to_physical(found.outcome.final.x)
-    start: dict[str, dict[str, float]] = {}
+def whole_values(fitted: Fitted, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """What the joints alone ended with, as the parameters of the whole robot; the delay is their median."""
+    model = fitted.model
+    physical = model.to_physical(fitted.x)
+    values: dict[str, dict[str, float]] = {}
     for k, name in enumerate(BASE):
         column = physical[:, k]
-        start[name] = (
+        values[name] = (
             {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
         )
     for effect, has in zip(model.effects, model.has, strict=True):
-        values = physical[:, model.columns(effect)]
+        own = physical[:, model.columns(effect)]
         for k, parameter in enumerate(effect.parameters):
             key = f"{effect.name}.{parameter.name}"
             if effect.shared:
-                start[key] = {"all": float(values[has][:, k].median())}
+                values[key] = {"all": float(own[has][:, k].median())}
             else:
-                start[key] = {n: float(values[j, k]) for j, n in enumerate(names) if bool(has[j])}
-    return start
+                values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
+    return values
 
 
 def _joints(found: Findings, problem: Problem) -> dict[str, dict]:

@@ -77,6 +77,7 @@ def add_effects(
     floor: torch.Tensor,
     max_effects: int,
     say: Callable[[str], None] = lambda _: None,
+    renewed: Callable[[TwinProblem, Fitted], TwinProblem] = lambda problem, _: problem,
 ) -> Outcome:
     """Look for the effects that are missing.
 
@@ -88,6 +89,7 @@ def add_effects(
         floor: Below this RMSE of each joint there is nothing to find, (n,) [rad].
         max_effects: Most effects of a joint.
         say: Shows how far it is.
+        renewed: Gives the problem along the motion of the robot with the present model: a joint feels its neighbours.
     """
     now, errors = base, validation_errors(problem, [base])[0]
     outcome = Outcome(base=base, base_errors=errors, final=base, final_errors=errors)
@@ -108,6 +110,10 @@ def add_effects(
         if not bool(open_joints.any()):
             break
         now = _combined(problem, now, found, fitted)
+        along = renewed(problem, now)
+        if along is not problem:
+            problem = along
+            now = fit_side_by_side(problem, [now], max_iteration=4, keep_jacobian=True)[0]
         errors = validation_errors(problem, [now])[0]
         outcome.final, outcome.final_errors = now, errors
     return outcome

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect
+from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome, Trial
 
 NOTHING_RATIO = 1.1
@@ -40,9 +41,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
     return "nothing_missing", explained
 
 
-def labels(outcome: Outcome, joint_names: Sequence[str]) -> list[str]:
+def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
     """The effects found as ``fit.py --effects`` takes them: ``name``, ``name@joints`` or ``name@shared``."""
-    model = outcome.final.model
     result = []
     for effect, has in zip(model.effects, model.has, strict=True):
         own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
