@@ -1,6 +1,12 @@
 """Play a trained policy: figures, a film, a window, an export. Or replay a fit where it is to be trained with."""
 
+import os
 import sys
+from ctypes.util import find_library
+
+HAS_SCREEN = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported: films need no screen
 
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play
 from pace_optim.cli import import_task, make_parser, run_cli
