@@ -25,6 +25,7 @@ MJLAB = (
     "etils",
     "fsspec",
     "glfw",
+    "imageio-ffmpeg",
     "importlib_resources",
     "ipython",
     "mediapy",

@@ -10,35 +10,8 @@ from pace_actuators.effects.effect import Effect, EffectParameter
 from pace_actuators.effects.registry import register_effect
 
 _INFINITE = float("inf")
-_RIPPLE_PERIODS = (
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    12,
-    14,
-    16,
-    18,
-    21,
-    24,
-    28,
-    32,
-    36,
-    42,
-    48,
-    56,
-    64,
-    72,
-    84,
-    96,
-    112,
-    128,
-    144,
-    168,
-    200,
-)
+_RIPPLE_PERIODS = sorted({round(5 * 40 ** (i / 26)) for i in range(27)})
+"""From 5 to 200 per revolution, each about 15 % more than the one before."""
 
 
 @register_effect
@@ -115,37 +88,7 @@ class TorqueRipple(Effect):
     looks = "a comb over position"
     source = "cogging and commutation of a motor, seen through its gear"
     probes = tuple(
-        {"sine": a, "cosine": b, "periods": float(n)}
-        for n in (
-            5,
-            6,
-            7,
-            8,
-            9,
-            10,
-            12,
-            14,
-            16,
-            18,
-            21,
-            24,
-            28,
-            32,
-            36,
-            42,
-            48,
-            56,
-            64,
-            72,
-            84,
-            96,
-            112,
-            128,
-            144,
-            168,
-            200,
-        )
-        for a, b in ((0.1, 0.0), (0.0, 0.1))
+        {"sine": a, "cosine": b, "periods": float(n)} for n in _RIPPLE_PERIODS for a, b in ((0.1, 0.0), (0.0, 0.1))
     )
     separates = "a slow motion over a wide range"
     sine: torch.Tensor

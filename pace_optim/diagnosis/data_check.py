@@ -28,8 +28,6 @@ class DataCheck:
     numerical: torch.Tensor
     """Change when the physics step is halved, (n,) [rad]."""
     sentences: list[str] = field(default_factory=list)
-    unusable: set[str] = field(default_factory=set)
-    """Effects that these recordings cannot show at all."""
     loads: int = 1
     """Number of different loads."""
     gains: int = 1

@@ -83,6 +83,10 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         )
         _, path = fit(refit_settings, progress)
         runs.append(str(path))
+    if result.effects:
+        found.data.sentences.append(
+            f"The run has {', '.join(result.effects)}: the search started from the base model, and looked for it again."
+        )
     diagnosis = Diagnosis(
         run=str(folder),
         verdict=found.verdict,
@@ -132,7 +136,6 @@ def search_effects(
     torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base)
-    usable = [effect for effect in candidates if effect.name not in data.unusable]
 
     def renewed(present: TwinProblem, model: Fitted) -> TwinProblem:
         if max(len(tree) for tree in problem.trees) == 1:
@@ -143,7 +146,7 @@ def search_effects(
         changing = [effect.name for effect in candidates if effect.overrides("write_model")]
         return twin_problem(problem, reference_path(whole, values, changing))
 
-    outcome = add_effects(twins, base, usable, effort, _FLOOR_MARGIN * data.floor, max_effects, say, renewed)
+    outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, renewed)
     decision, explained = verdict(outcome, data.floor)
     added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
     return Findings(twins=twins, outcome=outcome, data=data, verdict=decision, explained=explained, added=added)

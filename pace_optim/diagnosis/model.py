@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -83,13 +83,6 @@ class JointModel:
             upper=torch.cat([self.upper, bounds[1]], dim=1),
             log=torch.cat([self.log, torch.tensor([p.scale == "log" for p in effect.parameters])]),
         )
-
-    def on_more_joints(self, effect: type[Effect], has: torch.Tensor) -> JointModel:
-        """The same with an effect that it has on more joints, (n,) bool."""
-        row = self.effects.index(effect)
-        every = self.has.clone()
-        every[row] |= has
-        return replace(self, has=every)
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:
         """Physical values of normalised ones (…, n, P)."""

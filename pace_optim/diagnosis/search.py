@@ -236,7 +236,7 @@ def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted
 
 
 def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
-    """Each joint's best significant effect; among rivals, the one that most joints want, then the simplest."""
+    """Each joint's best significant effect; among rivals, the one that most joints want."""
     wanted: dict[type[Effect], int] = {}
     near: list[list[Trial]] = []
     for own in trials:
@@ -269,11 +269,8 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type
         has = torch.tensor([e is effect for e in found.chosen])
         source = fitted[effect]
         values = source.model.to_physical(source.x)
-        if effect in model.effects:  # another joint has it already
-            model = model.on_more_joints(effect, has)
-        else:
-            model = model.with_effect(effect, has)
-            physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
+        model = model.with_effect(effect, has)
+        physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
         physical[has, model.columns(effect)] = values[has][:, source.model.columns(effect)]
         physical[has, : now.model.size] = values[has, : now.model.size]
     start = Fitted(

@@ -12,14 +12,10 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome, Trial
 
-NOTHING_RATIO = 1.1
-"""Below this many times the floor there is nothing to explain."""
 UNKNOWN_RATIO = 3.0
 """An unexplained error above this many times the floor is a finding of its own."""
 EXPLAINED = 0.5
 """Less than this part of the error above the floor, and the effects found are not what is missing."""
-SHARED_SPREAD = 0.25
-"""Joints whose values scatter less than this about their mean can share one."""
 
 
 def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
@@ -42,7 +38,7 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
 
 
 def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
-    """The effects found as ``fit.py --effects`` takes them: ``name``, ``name@joints`` or ``name@shared``."""
+    """The effects found as ``fit.py --effects`` takes them: ``name`` or ``name@joints``."""
     result = []
     for effect, has in zip(model.effects, model.has, strict=True):
         own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
@@ -70,7 +66,6 @@ def ranking(outcome: Outcome, joint_names: Sequence[str]) -> list[dict[str, Any]
                     for j, rivals in enumerate(this.rivals)
                     if effect in rivals and this.chosen[j] is not None
                 }
-                | {other.name for j in added for other in this.rivals[j]}
             )
             entries.append(
                 {
