@@ -373,13 +373,18 @@ class PaceDCMotor:
         """Whether ``joint_armature`` changes from call to call, by what :meth:`set_link` gives."""
         return self.effects is not None and self.effects.changes_armature
 
+    @property
+    def distorts_measurement(self) -> bool:
+        """Whether an effect lets encoders show something else than the joints' positions."""
+        return self.effects is not None and self.effects.has("measurement")
+
     def sensed_position(self, joint_pos: torch.Tensor) -> torch.Tensor:
         """What the encoder shows, before its bias is subtracted [rad], (num_envs, num_joints).
 
         Args:
             joint_pos: q [rad], (num_envs, num_joints).
         """
-        if self.effects is None or not self.effects.has("measurement"):
+        if self.effects is None or not self.distorts_measurement:
             return joint_pos
         s = self.effects.state
         s.encoder_pos, s.joint_pos = joint_pos, joint_pos
@@ -393,7 +398,7 @@ class PaceDCMotor:
             encoder_pos: [rad], (num_envs, num_joints).
         """
         position = encoder_pos.clone()
-        if self.effects is not None and self.effects.has("measurement"):
+        if self.distorts_measurement:
             for _ in range(_INVERSION_STEPS):
                 position += encoder_pos - self.sensed_position(position)
         return position

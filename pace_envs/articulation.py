@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import torch
@@ -85,7 +86,6 @@ class Articulation:
                 sim.qvel[:, v : v + 3],
                 sim.qvel[:, v + 3 : v + 6],
             )
-        self._effort = sim.qfrc_applied[:, self._dof_view] if self._side_by_side else None
         self._link_model: LinkModel | None = None
         self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=torch.float64)
         self._build_actuators()
@@ -235,33 +235,22 @@ class Articulation:
         """Run the drives on the present targets and state, and apply their torques."""
         data = self.data
         for actuator in self.actuators.values():
-            ids = actuator.joint_indices
-            if actuator.needs_load:
-                actuator.set_load_effort(self.load_effort[:, ids])
-            if actuator.changes_armature:
-                actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
+            ids, place = actuator.joint_indices, self._place_of(actuator)
+            self._tell_link(actuator)
             action = ActuatorActions(
-                data.joint_pos_target[:, ids],
-                None if data.joint_vel_target is None else data.joint_vel_target[:, ids],
-                None if data.joint_effort_target is None else data.joint_effort_target[:, ids],
+                _of(data.joint_pos_target, ids), _of(data.joint_vel_target, ids), _of(data.joint_effort_target, ids)
             )
-            efforts = actuator.compute(action, data.joint_pos[:, ids], data.joint_vel[:, ids]).joint_efforts
+            efforts = actuator.compute(action, _of(data.joint_pos, ids), _of(data.joint_vel, ids)).joint_efforts
             if isinstance(ids, slice):  # the only group: it drives every joint
                 data.computed_torque, data.applied_torque = actuator.computed_effort, efforts
             else:
                 data.computed_torque[:, ids] = actuator.computed_effort
                 data.applied_torque[:, ids] = efforts
-        if self._effort is not None:
-            self._effort.copy_(data.applied_torque)
-        else:
-            self._sim.qfrc_applied[:, self._dof_columns] = data.applied_torque
-        for actuator in self.actuators.values():
+            self._sim.qfrc_applied[:, place] = actuator.held_effort
             if actuator.changes_passive:
-                columns = self._columns_of(actuator)
-                self._sim.qfrc_applied[:, columns] = actuator.held_effort
-                self._write_friction(actuator, columns)
+                self._write_friction(actuator, place)
             if actuator.changes_armature:
-                self._sim.expand("dof_armature")[:, self._columns_of(actuator)] = actuator.joint_armature
+                self._sim.expand("dof_armature")[:, place] = actuator.joint_armature
 
     def update(self) -> None:
         """Read the state after a physics step."""
@@ -270,7 +259,7 @@ class Articulation:
     @property
     def load_effort(self) -> torch.Tensor:
         """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
-        return -self._sim.qfrc_bias[:, self._dof_columns]
+        return -self._sim.qfrc_bias[:, self._dof_view if self._side_by_side else self._dof_columns]
 
     @property
     def effects(self) -> list[str]:
@@ -280,17 +269,14 @@ class Articulation:
 
     def sensed_joint_pos(self) -> torch.Tensor:
         """What the encoders show before their bias is subtracted [rad], (num_envs, num_joints)."""
-        if not any(actuator.effects is not None for actuator in self.actuators.values()):
+        distorted = [actuator for actuator in self.actuators.values() if actuator.distorts_measurement]
+        if not distorted:
             return self.data.joint_pos
         result = self.data.joint_pos.clone()
-        for actuator in self.actuators.values():
+        for actuator in distorted:
             ids = actuator.joint_indices
-            if actuator.effects is not None:
-                if actuator.needs_load:
-                    actuator.set_load_effort(self.load_effort[:, ids])
-                if actuator.changes_armature:
-                    actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
-                result[:, ids] = actuator.observe(self.data.joint_pos[:, ids], self.data.joint_vel[:, ids])
+            self._tell_link(actuator)
+            result[:, ids] = actuator.observe(_of(self.data.joint_pos, ids), _of(self.data.joint_vel, ids))
         return result
 
     def write_effect_parameter_to_sim(
@@ -351,6 +337,18 @@ class Articulation:
     def _columns_of(self, actuator: PaceDCMotor) -> torch.Tensor:
         return self._dof_columns[actuator.joint_indices]
 
+    def _place_of(self, actuator: PaceDCMotor) -> torch.Tensor | slice:
+        """Its columns in the model's arrays; a slice, which is faster, where it drives all joints side by side."""
+        whole = self._side_by_side and isinstance(actuator.joint_indices, slice)
+        return self._dof_view if whole else self._columns_of(actuator)
+
+    def _tell_link(self, actuator: PaceDCMotor) -> None:
+        """Give a drive what its effects read of the link."""
+        if actuator.needs_load:
+            actuator.set_load_effort(_of(self.load_effort, actuator.joint_indices))
+        if actuator.changes_armature:
+            actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
+
     def _write_model(self, actuator: PaceDCMotor, effect: Effect) -> None:
         """Write an effect on the rigid bodies; loads have been written before."""
         self._link_model = self._link_model or LinkModel(self._sim, self.joint_names, self._added_mass)
@@ -359,17 +357,17 @@ class Articulation:
         self._sim.note_model_effect(effect, self._columns_of(actuator))
         self._sim.constants_changed()
 
-    def _write_friction(self, actuator: PaceDCMotor, columns: torch.Tensor) -> None:
+    def _write_friction(self, actuator: PaceDCMotor, place: torch.Tensor | slice) -> None:
         self._sim.write_passive(
-            columns, actuator.joint_friction, actuator.joint_viscous_friction, actuator.joint_implicit_damping
+            place, actuator.joint_friction, actuator.joint_viscous_friction, actuator.joint_implicit_damping
         )
 
     def _write_passive(self, actuator: PaceDCMotor) -> None:
         """Write what the simulator carries of a drive: rotor inertia, friction, the link's rigid body."""
         actuator.update_effects()
-        columns = self._columns_of(actuator)
-        self._sim.expand("dof_armature")[:, columns] = actuator.joint_armature
-        self._write_friction(actuator, columns)
+        place = self._place_of(actuator)
+        self._sim.expand("dof_armature")[:, place] = actuator.joint_armature
+        self._write_friction(actuator, place)
         self._sim.constants_changed()
 
     def _find_joints_in_model(self, model: mujoco.MjModel) -> None:
@@ -494,6 +492,11 @@ def _indices(ids: EnvIds | JointIds) -> torch.Tensor | slice:
         return slice(None) if ids is None else ids
     indices = torch.as_tensor(ids)
     return indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
+
+
+def _of(tensor: torch.Tensor | None, ids: Any) -> Any:
+    """The columns of a drive's joints; the tensor itself where it drives them all."""
+    return tensor if tensor is None or isinstance(ids, slice) else tensor[:, ids]
 
 
 def _span(columns: torch.Tensor) -> slice:

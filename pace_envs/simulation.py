@@ -96,6 +96,7 @@ class Simulation:
         self.qfrc_applied = self.bind("qfrc_applied")
         self.qfrc_bias = self.bind("qfrc_bias")
         self._constants_changed = False
+        self._expanded: dict[str, torch.Tensor] = {}
         self._link_fields: dict[str, torch.Tensor] = {}
 
     def bind(self, field: str) -> torch.Tensor:
@@ -112,12 +113,18 @@ class Simulation:
 
         Call :meth:`constants_changed` after writing.
         """
-        return torch.from_numpy(self.batch.expand(field))
+        if field not in self._expanded:
+            self._expanded[field] = torch.from_numpy(self.batch.expand(field))
+        return self._expanded[field]
 
     def write_passive(
-        self, columns: torch.Tensor, friction: torch.Tensor, viscous: torch.Tensor, implicit: torch.Tensor | None
+        self,
+        columns: torch.Tensor | slice,
+        friction: torch.Tensor,
+        viscous: torch.Tensor,
+        implicit: torch.Tensor | None,
     ) -> None:
-        """Write what drives leave to the simulation until the next step, (num_envs, len(columns)).
+        """Write what drives leave to the simulation until the next step, (num_envs, number of columns).
 
         Args:
             columns: Degrees of freedom.

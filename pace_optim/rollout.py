@@ -169,16 +169,16 @@ class Rollout:
         count = self.dataset.num_recordings
         if count == 1:
             return per_recording.expand(self.env.num_envs, -1)
-        return per_recording.repeat(self.num_candidates, 1)
+        return per_recording.expand(self.num_candidates, -1, -1).reshape(self.env.num_envs, -1)
 
     def look_at(self, where: torch.Tensor) -> None:
         """Say which samples count, (T, R) bool."""
         self._where = where
 
-    def samples_at_every_step(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """As iterating, but at every control step up to the last sample that counts."""
-        for k, sim_dof_pos in self._samples():
-            yield sim_dof_pos, self._rows(self.dataset.measured[k])
+    def positions_at_every_step(self) -> Iterator[torch.Tensor]:
+        """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
+        for _, sim_dof_pos in self._samples():
+            yield sim_dof_pos
 
     def begin(self, offset: torch.Tensor | float = 0.0) -> None:
         """Put every environment at its recording's first sample, with the parameters that it has.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import site
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 ROOT = Path(__file__).parents[1]
 CACHE = Path(os.environ.get("PACE_TEST_CACHE", ROOT / ".cache"))
@@ -46,6 +49,19 @@ MJLAB = (
 )
 
 
+def one_at_a_time(fetch: Callable[[], Path]) -> Callable[[], Path]:
+    """Let only one of the processes that run tests fetch; the others wait and find it done."""
+
+    @functools.wraps(fetch)
+    def alone() -> Path:
+        CACHE.mkdir(exist_ok=True)
+        with FileLock(CACHE / "lock"):
+            return fetch()
+
+    return alone
+
+
+@one_at_a_time
 def isaaclab_wheel() -> Path:
     """Isaac Lab's wheel (3 MB), unpacked."""
     folder = CACHE / ISAACLAB
@@ -60,6 +76,7 @@ def isaaclab_wheel() -> Path:
     return folder
 
 
+@one_at_a_time
 def mjlab_python() -> Path:
     """Python of an environment with mjlab and its MuJoCo 3.11 (0.7 GB); torch and the like are ours."""
     folder = CACHE / "mjlab-1.6.0"
@@ -85,7 +102,6 @@ def run(python: str | Path, script: str, *args: str | Path) -> None:
 
 
 def _pip(what: str, command: list[object]) -> None:
-    CACHE.mkdir(exist_ok=True)
     try:
         done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240)
     except subprocess.TimeoutExpired:

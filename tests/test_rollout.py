@@ -230,7 +230,7 @@ def test_a_search_stores_nothing_of_the_size_of_population_times_time():
 def tensor_bytes():
     """Memory of all tensors that are alive."""
     gc.collect()  # what waits for collection, in this test or from one before it, is not
-    tensors = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
+    tensors = [thing for thing in gc.get_objects() if type(thing) in (torch.Tensor, torch.nn.Parameter)]
     return sum({t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}.values())
 
 

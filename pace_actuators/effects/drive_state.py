@@ -3,35 +3,11 @@
 from __future__ import annotations
 
 import copy
+import operator
 
 import torch
 
-_WRITABLE = (
-    "joint_pos_target",
-    "encoder_pos",
-    "encoder_vel",
-    "stiffness",
-    "damping",
-    "effort",
-    "speed_slope",
-    "friction",
-    "viscous_friction",
-    "implicit_damping",
-    "armature",
-    "joint_pos",
-    "joint_vel",
-    "motor_pos",
-    "motor_vel",
-    "motor_effort",
-    "load_effort",
-    "load_stiffness",
-    "link_inertia",
-    "spare_inertia",
-    "base_friction",
-    "base_viscous_friction",
-    "base_armature",
-    "time",
-)
+_LOAD_FIELDS = ("load_effort", "load_stiffness", "link_inertia", "spare_inertia")
 
 
 class DriveState:
@@ -63,37 +39,76 @@ class DriveState:
         time: Since the session began [s].
     """
 
-    __slots__ = ("_fields",)
-    _fields: dict[str, torch.Tensor]
+    joint_pos_target: torch.Tensor
+    encoder_pos: torch.Tensor
+    encoder_vel: torch.Tensor
+    stiffness: torch.Tensor
+    damping: torch.Tensor
+    effort: torch.Tensor
+    speed_slope: torch.Tensor
+    friction: torch.Tensor
+    viscous_friction: torch.Tensor
+    implicit_damping: torch.Tensor
+    armature: torch.Tensor
+    joint_pos: torch.Tensor
+    joint_vel: torch.Tensor
+    motor_pos: torch.Tensor
+    motor_vel: torch.Tensor
+    motor_effort: torch.Tensor
+    load_effort: torch.Tensor
+    load_stiffness: torch.Tensor
+    link_inertia: torch.Tensor
+    spare_inertia: torch.Tensor
+    base_friction: torch.Tensor
+    base_viscous_friction: torch.Tensor
+    base_armature: torch.Tensor
+    time: torch.Tensor
+
+    __slots__ = tuple(f"_{name}" for name in __annotations__)
 
     def __init__(self, fields: dict[str, torch.Tensor]):
         """Keep the tensors of the fields."""
-        object.__setattr__(self, "_fields", fields)
+        for name, tensor in fields.items():
+            setattr(self, f"_{name}", tensor)
 
     @classmethod
     def zeros(cls, num_envs: int, num_joints: int, device: torch.device, dtype: torch.dtype) -> DriveState:
         """All fields zero."""
-        return cls({name: torch.zeros(num_envs, num_joints, device=device, dtype=dtype) for name in _WRITABLE})
+        return cls({name: torch.zeros(num_envs, num_joints, device=device, dtype=dtype) for name in _FIELDS})
 
-    def of_rows(self, rows: slice) -> DriveState:
-        """The same fields, seen through some rows."""
-        return DriveState({name: tensor[rows] for name, tensor in self._fields.items()})
+    def of_rows(self, rows: slice, with_load: bool = True) -> DriveState:
+        """The same fields, seen through some rows; those of the load only where they are wanted."""
+        wanted = _FIELDS if with_load else [name for name in _FIELDS if name not in _LOAD_FIELDS]
+        return DriveState({name: getattr(self, name)[rows] for name in wanted})
 
     def __getattr__(self, name: str) -> torch.Tensor:
-        """A field."""
-        if name.startswith("_"):  # copying and pickling ask before there are any
-            raise AttributeError(name)
-        try:
-            return self._fields[name]
-        except KeyError:
-            raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(self._fields)}.") from None
+        """Only reached by names that are no field.
+
+        Raises:
+            AttributeError: Always.
+        """
+        if name in _LOAD_FIELDS:
+            raise AttributeError(f"{name} is not computed for this effect: declare reads_load = True in its class.")
+        raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
     def __deepcopy__(self, memo: dict) -> DriveState:
         """A copy with tensors of its own; what shares memory with it still does in its copy."""
-        return DriveState(copy.deepcopy(self._fields, memo))
+        fields = {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
+        return DriveState(copy.deepcopy(fields, memo))
 
-    def __setattr__(self, name: str, value: torch.Tensor) -> None:
-        """Write into a field."""
-        field = getattr(self, name)
+
+def _field(name: str) -> property:
+    """Reading gives the tensor, assigning writes into it."""
+    read = operator.attrgetter(f"_{name}")
+
+    def write(state: DriveState, value: torch.Tensor) -> None:
+        field = read(state)
         if field is not value:
             field.copy_(value)
+
+    return property(read, write)
+
+
+_FIELDS = tuple(DriveState.__annotations__)
+for _name in _FIELDS:
+    setattr(DriveState, _name, _field(_name))

@@ -91,6 +91,8 @@ class Effect:
     """Whether it has fast dynamics of its own, so that the simulation must be implicit."""
     parts_motor_and_link: ClassVar[bool] = False
     """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
+    reads_load: ClassVar[bool] = False
+    """Whether it reads ``s.load_effort`` and what else the drive carries: without it they are not computed."""
     changes_armature: ClassVar[bool] = False
     """Whether it changes ``s.armature`` from step to step, and reads the link's inertia."""
     twins: ClassVar[tuple[str, ...]] = ()

@@ -55,6 +55,7 @@ class LoadDependentFriction(Effect):
     source = "Duclusaud et al., BAM (Rhoban), model M3"
     probes = ({"coefficient": 0.01},)
     two_sided = False
+    reads_load = True
     separates = "recordings at two loads"
     coefficient: torch.Tensor
 

@@ -31,6 +31,7 @@ class MountCompliance(Effect):
     shared = True
     is_stiff = True
     changes_armature = True
+    reads_load = True
     two_sided = False
     parameters = (
         EffectParameter(

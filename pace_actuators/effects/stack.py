@@ -78,21 +78,22 @@ class EffectStack:
             )
             self.effects.append(effect)
             self.cfgs.append(cfg)
-            self._view[effect] = self.state.of_rows(rows)
+            self._view[effect] = self.state.of_rows(rows, with_load=effect.reads_load)
             self._configure(effect, cfg)
         self._at = {
-            stage: [(effect, self._view[effect]) for effect in self.effects if effect.overrides(stage)]
+            stage: [
+                (getattr(effect, stage), self._view[effect])
+                for effect in sorted(self.effects, key=_side if stage == "transmission" else lambda _: 0)
+                if effect.overrides(stage)
+            ]
             for stage in _STAGES
         }
-        self._at["transmission"].sort(key=lambda pair: _side(pair[0]))
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
         """Whether friction or viscous friction change from step to step."""
         self.changes_armature = any(effect.changes_armature for effect in self.effects)
         """Whether the armature changes from step to step."""
         self.lags = [effect for effect in self.effects if effect.overrides("observation_lag")]
-        self.needs_load = any(
-            effect.overrides("friction") or effect.overrides("transmission") for effect in self.effects
-        )
+        self.needs_load = any(effect.reads_load for effect in self.effects)
         """Whether the torque of gravity and load must be given."""
 
     @property
@@ -112,8 +113,8 @@ class EffectStack:
 
     def run(self, stage: str) -> None:
         """Let all effects of a stage act."""
-        for effect, view in self._at[stage]:
-            getattr(effect, stage)(view)
+        for act, view in self._at[stage]:
+            act(view)
 
     def find(self, name: str) -> Effect:
         """The effect of that name.

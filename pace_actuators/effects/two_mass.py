@@ -47,6 +47,7 @@ class _TwoMass(Effect):
     is_stiff = True
     two_sided = False
     parts_motor_and_link = True
+    reads_load = True
     numerical_damping: ClassVar[float] = 0.05
     """Part of k h that is added to c: what is too fast for the step dies out, a resonance inside the band does not."""
     encoder_side: torch.Tensor

@@ -67,12 +67,11 @@ class SideBySide:
         bias = base[..., BASE.index("encoder_bias")]
         steps = where.any(dim=1).nonzero()[:, 0][::stride]
         index = {int(step): i for i, step in enumerate(steps)}
-        shape = (len(steps), self._num_candidates * count, bias.shape[1])
-        errors = torch.zeros(shape, dtype=torch.float32)
-        for step, (sim, real) in enumerate(rollout.samples_at_every_step()):
+        shape = (self._num_candidates, count, bias.shape[1])
+        errors, bias = torch.zeros(len(steps), *shape, dtype=torch.float32), bias.view(shape)
+        for step, sim in enumerate(rollout.positions_at_every_step()):
             if step in index:
-                errors[index[step]] = sim - bias - real
-        errors = errors.view(len(steps), self._num_candidates, count, -1)
+                errors[index[step]] = (sim.view(shape) - bias).sub_(self.dataset.measured[step])
         errors *= where[steps][:, None, :, None]
         return errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
 

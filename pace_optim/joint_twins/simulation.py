@@ -44,14 +44,21 @@ class TwinSimulation(Simulation):
         self.qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
         self.qfrc_applied = torch.zeros(num_envs, model.nv, dtype=torch.float64)
         self._implicit = torch.zeros(num_envs, model.nv, dtype=torch.float64)
-        self._load = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self._is_implicit = False
         self._constants_changed = False
         self._steps = 0
         self._columns = path.columns
         self._as_in_model = torch.equal(path.columns, torch.arange(model.nv))
-        self._count = path.position.shape[1]
+        self._shape = (-1, path.position.shape[1], len(path.columns))
+        self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
+        # one tensor an interval: taking them out of a list costs nothing at each step
+        self._inertia, self._torque = path.feel.inertia.unbind(), path.feel.torque.unbind()
+        self._stiffness, self._position = path.stiffness[: self._intervals].unbind(), path.position.unbind()
+        parts = [(part + 0.5) / self._steps_per_interval for part in range(self._steps_per_interval)]
+        self._middle = [torch.lerp(path.position[:-1], path.position[1:], part).unbind() for part in parts]
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
+        self.forward()
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Take over the parameters of an effect on the model, of joints with these degrees of freedom."""
@@ -65,7 +72,13 @@ class TwinSimulation(Simulation):
     @property
     def qfrc_bias(self) -> torch.Tensor:  # type: ignore[override]
         """Less the torque of gravity and of the other joints, (num_envs, nv) [N m]."""
-        return -self._load
+        load, stiffness, reference = self._felt
+        load = torch.addcmul(load, stiffness, self._joints(self.qpos) - reference)
+        if self._as_in_model:
+            return load.neg_().view(self.qvel.shape)
+        result = torch.zeros_like(self.qvel)
+        result[:, self._columns] = load.neg_().view(len(result), -1)
+        return result
 
     def expand(self, field: str) -> torch.Tensor:
         """The values per simulation of a field of the model; of those, the twins use what drives write."""
@@ -75,82 +88,80 @@ class TwinSimulation(Simulation):
         return self._fields[field]
 
     def write_passive(
-        self, columns: torch.Tensor, friction: torch.Tensor, viscous: torch.Tensor, implicit: torch.Tensor | None
+        self,
+        columns: torch.Tensor | slice,
+        friction: torch.Tensor,
+        viscous: torch.Tensor,
+        implicit: torch.Tensor | None,
     ) -> None:
         """Write what drives leave to the simulation."""
         self.expand("dof_frictionloss")[:, columns] = friction
         self.expand("dof_damping")[:, columns] = viscous
-        self._implicit[:, columns] = 0.0 if implicit is None else implicit
+        if implicit is not None:
+            self._is_implicit = True
+            self._implicit[:, columns] = implicit
 
     def step(self) -> None:
         """Advance by ``dt``."""
         self._constants_changed = False
-        path, n = self.path, len(self._columns)
-        k, part = divmod(self._steps, self._steps_per_interval)
-        k = min(k, len(path.feel.torque) - 1)
-        shape = (-1, self._count, n)
-        q, v = self._get(self.qpos).view(shape), self._get(self.qvel).view(shape)
+        h, (k, part) = self.cfg.dt, divmod(self._steps, self._steps_per_interval)
+        k = min(k, self._intervals - 1)
+        q, v = self._joints(self.qpos), self._joints(self.qvel)
         inertia, torque = self._feel(k)
-        effort = self._get(self.qfrc_applied).view(shape)
-        damping = self._get(self.expand("dof_damping")).view(shape)
-        friction = self._get(self.expand("dof_frictionloss")).view(shape)
-        implicit = self._get(self._implicit).view(shape)
-        stiffness = path.stiffness[min(k, len(path.stiffness) - 1)]
-        h = self.cfg.dt
-        total = inertia + self._get(self.expand("dof_armature")).view(shape)
-        resisting = total + h * (0.5 * damping + implicit)
-        end = path.position[k + 1]
-        reference = torch.lerp(path.position[k], end, (part + 0.5) / self._steps_per_interval)
-        bent = torch.add(q, v, alpha=0.5 * h).sub_(reference).mul_(stiffness)
-        push = bent.add_(effort + torque).addcmul_(damping + implicit, v, value=-1)
+        stiffness = self._stiffness[k]
+        damping = self._joints(self.expand("dof_damping"))
+        resisting = (inertia + self._joints(self.expand("dof_armature"))).add_(damping, alpha=0.5 * h)
+        if self._is_implicit:
+            implicit = self._joints(self._implicit)
+            resisting.add_(implicit, alpha=h)
+            damping = damping + implicit
+        bent = torch.add(q, v, alpha=0.5 * h).sub_(self._middle[part][k]).mul_(stiffness)
+        push = bent.add_(self._joints(self.qfrc_applied)).add_(torque).addcmul_(damping, v, value=-1)
         free = torch.addcdiv(v, push, resisting, value=h)
-        stop = h * friction / resisting
+        stop = torch.div(self._joints(self.expand("dof_frictionloss")), resisting).mul_(h)
         new = free - torch.clamp(free, -stop, stop)
-        q = torch.add(q, v + new, alpha=0.5 * h)
-        v = new
-        self._set(self.qpos, q.view(-1, n))
-        self._set(self.qvel, v.view(-1, n))
-        self._load[:, self._columns] = (torque + stiffness * (q - end)).view(-1, n)
+        self._set(self.qpos, torch.add(q, v, alpha=0.5 * h).add_(new, alpha=0.5 * h))
+        self._set(self.qvel, new)
+        self._felt = torque, stiffness, self._position[k + 1]
         self._steps += 1
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as :meth:`Simulation.felt_link`."""
-        k = self._steps // self._steps_per_interval
+        k = min(self._steps // self._steps_per_interval, self._intervals - 1)
         order = self._columns.tolist()
         place = [order.index(column) for column in columns.tolist()]
-        inertia = self._feel(min(k, len(self.path.feel.torque) - 1))[0]
-        inertia = inertia.expand(self.num_envs // self._count, -1, -1).reshape(self.num_envs, -1)[:, place]
-        stiffness = self.path.stiffness[min(k, len(self.path.stiffness) - 1)]
-        stiffness = stiffness.repeat(self.num_envs // self._count, 1)[:, place]
+        rows = (self.num_envs // self._shape[1], -1, -1)
+        inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)[:, place]
+        stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)[:, place]
         return inertia, -stiffness, inertia * self._stands_alone(columns)
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """What the joints feel at the start."""
-        path = self.path
-        self._load[:, self._columns] = path.feel.torque[0].repeat(self.num_envs // self._count, 1)
+        self._felt = self._feel(0)[1], self._stiffness[0], self._position[0]
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Back to the beginning of the reference."""
         self._steps = 0
+        self.forward()
 
     def close(self) -> None:
         """Nothing to release."""
 
     def _feel(self, k: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Inertia and torque in an interval, (candidates or 1, recordings, n)."""
-        path, shape = self.path, (-1, self._count, len(self._columns))
-        inertia, torque = path.feel.inertia[k], path.feel.torque[k]
+        inertia, torque = self._inertia[k], self._torque[k]
         for key, values in self._model_values.items():
-            change = path.model_effects[key]
-            inertia = inertia + values.view(shape) * change.inertia[k]
-            torque = torque + values.view(shape) * change.torque[k]
+            change = self.path.model_effects[key]
+            inertia = inertia + values.view(self._shape) * change.inertia[k]
+            torque = torque + values.view(self._shape) * change.torque[k]
         return inertia, torque
 
-    def _get(self, field: torch.Tensor) -> torch.Tensor:
-        return field if self._as_in_model else field.index_select(1, self._columns)
+    def _joints(self, field: torch.Tensor) -> torch.Tensor:
+        """The joints' columns of a field, (candidates, recordings, n)."""
+        return (field if self._as_in_model else field.index_select(1, self._columns)).view(self._shape)
 
     def _set(self, field: torch.Tensor, value: torch.Tensor) -> None:
         if self._as_in_model:
-            field.copy_(value)
+            field.copy_(value.view(field.shape))
         else:
-            field[:, self._columns] = value
+            field[:, self._columns] = value.view(len(field), -1)
