@@ -18,6 +18,7 @@ from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
 from pace_optim.diagnosis.model import start_values
+from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.search import validation_errors
 from pace_optim.diagnosis.verdict import ranking
 from pace_optim.joint_twins.problem import TwinProblem
@@ -119,8 +120,12 @@ def run_case(job: Job) -> dict[str, Any]:
     with_truth = None
     if true_effects and not job.case.background:
         same = set(true_effects) == set(final.model.effects)
-        known = final if same else _fit_with(found.twins, base, true_effects, truth)
-        with_truth = _rms(validation_errors(found.twins, [known])[0])
+        if not same:
+            follow = OwnMotion(problem=problem, candidates=candidate_effects()).follow
+            twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
+            with_truth = _rms(validation_errors(twins, [final])[0])
+        else:
+            with_truth = _rms(outcome.final_errors)
     shutil.rmtree(job.folder, ignore_errors=True)  # a case can be made again from its name
     return {
         "size": truth["size"],
@@ -145,11 +150,8 @@ def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]],
     model, physical, n = base.model, base.model.to_physical(base.x), base.model.num_joints
     for effect in effects:
         has = torch.tensor([name in str(truth["effects"][effect.name]) for name in twins.joint_names])
-        model = model.with_effect(effect, has)
-        physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
-    score = torch.full((n,), torch.inf, dtype=torch.float64)
-    start = Fitted(model=model, own=None, x=model.to_normalised(physical), score=score)
-    return fit_coarse_to_fine(twins, [start])[0]
+        model, physical = model.extended(physical, effect, has, start_values(effect, {}).repeat(n, 1))
+    return fit_coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
 
 
 def _rms(errors: BlockErrors) -> float:

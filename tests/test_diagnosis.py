@@ -227,9 +227,9 @@ def test_an_effect_in_one_slot_changes_no_other(bench):
     with_effects = [base.with_effect(e, torch.tensor([True])) for e in (STRIBECK, QUADRATIC)]
     values = torch.tensor([[*(CALM[name] for name in BASE)]], dtype=torch.float64)
     slots = [
-        Slot(model=base, own=None, rows=1),
-        Slot(model=with_effects[0], own=STRIBECK, rows=2),
-        Slot(model=with_effects[1], own=QUADRATIC, rows=1),
+        Slot(model=base, rows=1),
+        Slot(model=with_effects[0], rows=2),
+        Slot(model=with_effects[1], rows=1),
     ]
     batch = SideBySide(bench.twins, slots, training=True)
 
@@ -265,7 +265,7 @@ def test_a_fit_that_starts_at_the_truth_stays_there(bench):
     x = model.to_normalised(torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64))
     fitted = fit_side_by_side(
         bench.twins,
-        [Fitted(model=model, own=None, x=x, score=torch.full((1,), torch.inf, dtype=torch.float64))],
+        [Fitted(model=model, x=x, score=torch.full((1,), torch.inf, dtype=torch.float64))],
         max_iteration=2,
     )[0]
     assert float((fitted.x - x).abs().max()) < 0.02

@@ -40,8 +40,7 @@ def fit_base(
     """
     model = JointModel.base(problem)
     names = [effect.name for effect in effects if effect.overrides("write_model")]
-    x = model.to_normalised(joint_vectors(problem, physical))
-    fitted = Fitted(model=model, own=None, x=x, score=torch.full((len(x),), torch.inf, dtype=torch.float64))
+    fitted = Fitted.start(model, joint_vectors(problem, physical))
     for i in range(_ROUNDS):
         say(f"base model, round {i + 1}")
         path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)))

@@ -27,15 +27,22 @@ class Fitted:
     """A model fitted to the training recordings."""
 
     model: JointModel
-    own: type[Effect] | None
     x: torch.Tensor
     """Normalised, (n, P)."""
     score: torch.Tensor
-    """Mean square error of each joint, (n,) [rad²]."""
+    """Mean square error of each joint, (n,) [rad²]; infinite where it is not known yet."""
+    tried: type[Effect] | None = None
+    """The effect that is tried in it."""
     jacobian: torch.Tensor | None = None
     """Derivatives of the errors at x (P, K, R, n) float32, where wanted."""
     error: torch.Tensor | None = None
     """At x, (K, R, n) float32, where wanted."""
+
+    @classmethod
+    def start(cls, model: JointModel, physical: torch.Tensor, tried: type[Effect] | None = None) -> Fitted:
+        """A model at physical values (n, P), not fitted yet."""
+        unknown = torch.full((model.num_joints,), torch.inf, dtype=torch.float64)
+        return cls(model=model, x=model.to_normalised(physical), score=unknown, tried=tried)
 
 
 def fit_coarse_to_fine(
@@ -65,7 +72,7 @@ def fit_side_by_side(
         keep_jacobian: Whether the last Jacobian is kept.
         part: Only so much of the beginning of the recordings is simulated.
     """
-    slots = [Slot(model=s.model, own=s.own, rows=s.model.size + len(_TRIALS)) for s in starts]
+    slots = [Slot(model=s.model, rows=s.model.size + len(_TRIALS)) for s in starts]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train.clone()
     where[math.ceil(part * len(where)) :] = False
@@ -86,7 +93,7 @@ class _Way:
     """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
 
     def __init__(self, start: Fitted, samples: float, keep: bool):
-        self.model, self.own, self._samples, self._keep = start.model, start.own, samples, keep
+        self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
@@ -161,5 +168,10 @@ class _Way:
     def result(self) -> Fitted:
         """Where it ended."""
         return Fitted(
-            model=self.model, own=self.own, x=self.x, score=self.score, jacobian=self._jacobian, error=self._error
+            model=self.model,
+            x=self.x,
+            score=self.score,
+            tried=self.tried,
+            jacobian=self._jacobian,
+            error=self._error,
         )

@@ -13,9 +13,9 @@ from pace_actuators.effects import Effect, available_effects, get_effect
 from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import DataCheck, check_data
-from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.error_map import error_map
-from pace_optim.diagnosis.model import BASE
+from pace_optim.diagnosis.model import whole_values
+from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
@@ -23,8 +23,6 @@ from pace_optim.diagnosis.verdict import labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
-from pace_optim.joint_twins import reference_path, twin_problem
-from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem, load_problem
 from pace_optim.progress import ProgressLine
 
@@ -35,7 +33,6 @@ _FLOOR_MARGIN = 1.1
 class Findings:
     """What the search on the twins found."""
 
-    twins: TwinProblem
     outcome: Outcome
     data: DataCheck
     verdict: str
@@ -73,12 +70,13 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
     runs, ladder = [str(folder)], _ladder(found)
     if settings.refit and found.added:
         progress.say(f"fitting the whole robot with {', '.join(found.added)}")
+        final = found.outcome.final
         refit_settings = replace(
             run_settings,
             effects=found.added,
             optimizer="least_squares",
             physics_dt=physics_dt,
-            start=whole_values(found.outcome.final, problem.joint_names),
+            start=whole_values(final.model, final.x, problem.joint_names),
             log_dir=str(folder.parent.parent),
         )
         _, path = fit(refit_settings, progress)
@@ -100,7 +98,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
         ladder=ladder,
-        error_map=error_map(found.twins, found.outcome.final, found.data.floor),
+        error_map=error_map(found.outcome.problem, found.outcome.final, found.data.floor),
         wall_time_s=time.monotonic() - begin,
     )
     diagnosis.save(folder)
@@ -137,19 +135,11 @@ def search_effects(
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base)
 
-    def renewed(present: TwinProblem, model: Fitted) -> TwinProblem:
-        if max(len(tree) for tree in problem.trees) == 1:
-            return present
-        say("reference motion with what was found")
-        whole = problem.with_effects(labels(model.model, problem.joint_names))
-        values = whole.space.from_dict(whole_values(model, problem.joint_names))
-        changing = [effect.name for effect in candidates if effect.overrides("write_model")]
-        return twin_problem(problem, reference_path(whole, values, changing))
-
-    outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, renewed)
+    follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
+    outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)
     decision, explained = verdict(outcome, data.floor)
     added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
-    return Findings(twins=twins, outcome=outcome, data=data, verdict=decision, explained=explained, added=added)
+    return Findings(outcome=outcome, data=data, verdict=decision, explained=explained, added=added)
 
 
 def summary_of(found: Findings, problem: Problem) -> str:
@@ -182,27 +172,6 @@ def _ladder(found: Findings) -> list[dict]:
             {"model": " + ".join(found.added), "validation_rmse": float(outcome.final_errors.mse.mean().sqrt())}
         )
     return steps
-
-
-def whole_values(fitted: Fitted, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """What the joints alone ended with, as the parameters of the whole robot; the delay is their median."""
-    model = fitted.model
-    physical = model.to_physical(fitted.x)
-    values: dict[str, dict[str, float]] = {}
-    for k, name in enumerate(BASE):
-        column = physical[:, k]
-        values[name] = (
-            {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
-        )
-    for effect, has in zip(model.effects, model.has, strict=True):
-        own = physical[:, model.columns(effect)]
-        for k, parameter in enumerate(effect.parameters):
-            key = f"{effect.name}.{parameter.name}"
-            if effect.shared:
-                values[key] = {"all": float(own[has][:, k].median())}
-            else:
-                values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
-    return values
 
 
 def _joints(found: Findings, problem: Problem) -> dict[str, dict]:

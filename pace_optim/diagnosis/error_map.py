@@ -77,7 +77,7 @@ def _residual_torques(
     problem: TwinProblem, model: Fitted
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Missing torque (K, n), what it may depend on, the fold of each sample (K,), and the RMS error (n,)."""
-    batch = SideBySide(problem, [Slot(model=model.model, own=None, rows=1)], training=False)
+    batch = SideBySide(problem, [Slot(model=model.model, rows=1)], training=False)
     data, path = batch.dataset, problem.path
     physical = model.model.to_physical(model.x)
     errors = batch.simulate([physical[None]], data.sampled)[0].numpy().astype(float)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -69,8 +70,12 @@ class JointModel:
             start += len(other.parameters)
         return slice(start, start + len(effect.parameters))
 
-    def with_effect(self, effect: type[Effect], has: torch.Tensor) -> JointModel:
-        """The same with one more effect on some joints, (n,) bool."""
+    def with_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
+        """The same with an effect on some joints, (n,) bool, beside those that have it already."""
+        if effect in self.effects:
+            has = self.has.clone()
+            has[self.effects.index(effect)] |= joints
+            return replace(self, has=has)
         n = self.num_joints
         bounds = [
             torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64).expand(n, -1)
@@ -78,11 +83,37 @@ class JointModel:
         ]
         return JointModel(
             effects=(*self.effects, effect),
-            has=torch.cat([self.has, has[None]]),
+            has=torch.cat([self.has, joints[None]]),
             lower=torch.cat([self.lower, bounds[0]], dim=1),
             upper=torch.cat([self.upper, bounds[1]], dim=1),
             log=torch.cat([self.log, torch.tensor([p.scale == "log" for p in effect.parameters])]),
         )
+
+    def extended(
+        self, physical: torch.Tensor, effect: type[Effect], joints: torch.Tensor, values: torch.Tensor
+    ) -> tuple[JointModel, torch.Tensor]:
+        """The same with an effect on some more joints, and the physical values (n, P) with those of the effect.
+
+        Args:
+            physical: Of this model, (n, P).
+            effect: The effect.
+            joints: Which joints get it, (n,) bool.
+            values: Of the effect, (n, parameters).
+        """
+        model = self.with_effect(effect, joints)
+        if effect not in self.effects:
+            return model, torch.cat([physical, values], dim=1)
+        physical = physical.clone()
+        physical[joints, self.columns(effect)] = values[joints]
+        return model, physical
+
+    def may_get(self, effect: type[Effect]) -> torch.Tensor:
+        """Joints that can have an effect beside those that they have, (n,) bool; only one can part motor and link."""
+        excluded = torch.zeros(self.num_joints, dtype=torch.bool)
+        for other, has in zip(self.effects, self.has, strict=True):
+            if other is effect or (other.parts_motor_and_link and effect.parts_motor_and_link):
+                excluded |= has
+        return ~excluded
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:
         """Physical values of normalised ones (…, n, P)."""
@@ -108,3 +139,23 @@ def start_values(effect: type[Effect], values: dict[str, float]) -> torch.Tensor
     return torch.tensor(
         [min(max(values.get(p.name, p.start), p.lower), p.upper) for p in effect.parameters], dtype=torch.float64
     )
+
+
+def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Normalised values (n, P) as the parameters of the whole robot; the delay is the joints' median."""
+    physical = model.to_physical(x)
+    values: dict[str, dict[str, float]] = {}
+    for k, name in enumerate(BASE):
+        column = physical[:, k]
+        values[name] = (
+            {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
+        )
+    for effect, has in zip(model.effects, model.has, strict=True):
+        own = physical[:, model.columns(effect)]
+        for k, parameter in enumerate(effect.parameters):
+            key = f"{effect.name}.{parameter.name}"
+            if effect.shared:
+                values[key] = {"all": float(own[has][:, k].median())}
+            else:
+                values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
+    return values

@@ -50,13 +50,14 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
     model = now.model
     if now.error is None or now.jacobian is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
-    slots, values = [Slot(model=model, own=None, rows=1)], [model.to_physical(now.x)[None]]
+    physical = model.to_physical(now.x)
+    slots, values = [Slot(model=model, rows=1)], [physical[None]]
     probes: list[tuple[type[Effect], torch.Tensor]] = []
-    everywhere = torch.ones(model.num_joints, dtype=torch.bool)
     for effect in effects:
         points = [_probe_values(effect, point, effort) for point in probe_points(effect)]
-        slots.append(Slot(model=model.with_effect(effect, everywhere), own=effect, rows=len(points)))
-        values.append(torch.stack([torch.cat([model.to_physical(now.x), each], dim=1) for each in points]))
+        extended = [model.extended(physical, effect, model.may_get(effect), each) for each in points]
+        slots.append(Slot(model=extended[0][0], rows=len(points)))
+        values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train
@@ -66,7 +67,7 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
     scores, sizes = _explained(now.error, jacobian, errors[1:] - errors[:1], blocks)
     result = []
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
-        allowed = size > 0 if not effect.two_sided else torch.ones_like(size, dtype=torch.bool)
+        allowed = model.may_get(effect) & ((size > 0) | effect.two_sided)
         result.append(Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size))
     return result
 

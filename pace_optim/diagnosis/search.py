@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -10,7 +10,6 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
@@ -24,7 +23,7 @@ WORST_JOINTS = 4
 PER_JOINT = 4
 """How many of them."""
 FAR_FROM_FLOOR = 50.0
-"""An error that is this many times the floor is beyond what screening can judge: all effects are refitted."""
+"""An error that is this many times the floor is beyond what screening can judge: refits begin with all effects."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
 NEXT_FLOOR = 1.3
@@ -62,6 +61,8 @@ class Round:
 class Outcome:
     """Where the search ended."""
 
+    problem: TwinProblem
+    """The joints along the motion of the robot with the final model."""
     base: Fitted
     base_errors: BlockErrors
     final: Fitted
@@ -77,7 +78,7 @@ def add_effects(
     floor: torch.Tensor,
     max_effects: int,
     say: Callable[[str], None] = lambda _: None,
-    renewed: Callable[[TwinProblem, Fitted], TwinProblem] = lambda problem, _: problem,
+    follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]] = lambda problem, now: (problem, now),
 ) -> Outcome:
     """Look for the effects that are missing.
 
@@ -89,15 +90,14 @@ def add_effects(
         floor: Below this RMSE of each joint there is nothing to find, (n,) [rad].
         max_effects: Most effects of a joint.
         say: Shows how far it is.
-        renewed: Gives the problem along the motion of the robot with the present model: a joint feels its neighbours.
+        follow: Gives the joints along the motion of the robot with the present model, and the model fitted there.
     """
     now, errors = base, validation_errors(problem, [base])[0]
-    outcome = Outcome(base=base, base_errors=errors, final=base, final_errors=errors)
+    outcome = Outcome(problem=problem, base=base, base_errors=errors, final=base, final_errors=errors)
     open_joints = torch.ones(base.model.num_joints, dtype=torch.bool)
     for depth in range(max_effects):
         open_joints &= errors.mse.sqrt() > (1.0 if depth == 0 else NEXT_FLOOR) * floor
-        parted = any(e.parts_motor_and_link for e in now.model.effects)
-        untried = [e for e in effects if e not in now.model.effects and not (parted and e.parts_motor_and_link)]
+        untried = [e for e in effects if bool((now.model.may_get(e) & open_joints).any())]
         if not bool(open_joints.any()) or not untried:
             break
         say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
@@ -110,18 +110,15 @@ def add_effects(
         if not bool(open_joints.any()):
             break
         now = _combined(problem, now, found, fitted)
-        along = renewed(problem, now)
-        if along is not problem:
-            problem = along
-            now = fit_side_by_side(problem, [now], max_iteration=4, keep_jacobian=True)[0]
+        problem, now = follow(problem, now)
         errors = validation_errors(problem, [now])[0]
-        outcome.final, outcome.final_errors = now, errors
+        outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
     return outcome
 
 
 def validation_errors(problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
     """Errors of fitted models on the recordings that were not trained on."""
-    slots = [Slot(model=m.model, own=m.own, rows=1) for m in models]
+    slots = [Slot(model=m.model, rows=1) for m in models]
     batch = SideBySide(problem, slots, training=False)
     where = batch.dataset.validation
     every = torch.zeros_like(where)
@@ -142,24 +139,24 @@ def _try(
 ) -> tuple[Round, dict[type[Effect], Fitted]] | None:
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
     excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
-    best = _best_probes(probes, excess, bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any()))
-    if not best:
+    listed = _short_list(_promising(probes, excess), excess)
+    far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
+    begin = list(dict.fromkeys([*listed, *(effects if far else ())]))
+    if not begin:
         return None
-    say(f"refitting with {', '.join(effect.name for effect in best)}")
-    starts = [_start(now, effect, chosen) for effect, lists in best.items() for chosen in lists]
-    fitted = fit_coarse_to_fine(problem, _better_starts(problem, starts))
+    say(f"refitting with {', '.join(effect.name for effect in begin)}")
+    begun = _begun(problem, now, probes, begin)
+    if far:
+        listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:PER_JOINT]]))
+    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed])
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
     first = not now.model.effects
     tried = len(effects) * int(open_joints.sum())
     trials: list[list[Trial]] = [[] for _ in range(n)]
     keep: dict[type[Effect], Fitted] = {}
-    for effect in best:
-        own = [(f, b) for f, b in zip(fitted, blocks, strict=True) if f.own is effect]
-        chosen, after = own[0]
-        for j in range(n):
-            if not bool(open_joints[j]):
-                continue
+    for effect, chosen, after in zip(listed, fitted, blocks, strict=True):
+        for j in (open_joints & now.model.may_get(effect)).nonzero()[:, 0].tolist():
             verdict = judge(errors, after, j, tried, first)
             values = chosen.model.to_physical(chosen.x)[j, chosen.model.columns(effect)].tolist()
             trials[j].append(
@@ -180,59 +177,60 @@ def _try(
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals), keep
 
 
-def _best_probes(
-    probes: Sequence[Probe], excess: torch.Tensor, everything: bool
-) -> dict[type[Effect], list[list[Probe]]]:
-    """Effects worth a refit, each with one or two starts: for every joint its best probe, and its second best.
+def _promising(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], torch.Tensor]:
+    """What each effect would explain of each joint's error, (n,) [rad²], by its best probe."""
+    best: dict[type[Effect], torch.Tensor] = {}
+    for probe in probes:
+        best[probe.effect] = torch.maximum(best.get(probe.effect, probe.score), probe.score)
+    return {effect: torch.where(score > SCREEN_THRESHOLD, score, 0.0) * excess for effect, score in best.items()}
+
+
+def _short_list(explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor) -> list[type[Effect]]:
+    """Effects that explain most of the whole robot's error, then those that explain most of the worst joints'.
 
     Args:
-        probes: What was screened.
-        excess: Squared error of each joint that could be explained, (n,) [rad²]; zero where there is nothing to find.
-        everything: Whether all effects are refitted: what small changes do says little of a large error.
+        explained: Squared error that each effect explains of each joint, (n,).
+        excess: Squared error of each joint that could be explained, (n,); zero where there is nothing to find.
     """
-    n = len(excess)
-    by_effect: dict[type[Effect], list[Probe]] = {}
-    for probe in probes:
-        by_effect.setdefault(probe.effect, []).append(probe)
-    scores = {effect: torch.stack([p.score for p in own]).max(dim=0).values for effect, own in by_effect.items()}
-    promising = {e: torch.where(s > SCREEN_THRESHOLD, s, 0.0) * excess for e, s in scores.items()}
-    wanted: dict[type[Effect], None] = {}
-    # what explains most of the whole robot's error, then what explains most of the worst joints'
-    total = sorted((e for e in promising if promising[e].sum() > 0), key=lambda e: -float(promising[e].sum()))
-    wanted.update(dict.fromkeys(total[:SHORT_LIST]))
+    total = {effect: float(values[excess > 0].sum()) for effect, values in explained.items()}
+    wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[:SHORT_LIST]
     for j in excess.argsort(descending=True)[:WORST_JOINTS].tolist():
-        own = sorted((e for e in promising if promising[e][j] > 0), key=lambda e: -float(promising[e][j]))
-        wanted.update(dict.fromkeys(own[:PER_JOINT]))
-    if everything:
-        wanted.update(dict.fromkeys(by_effect))
-    result = {}
-    for effect in wanted:
-        ranked = [sorted(by_effect[effect], key=lambda p: -float(p.score[j])) for j in range(n)]
-        count = min(2, len(by_effect[effect]))
-        result[effect] = [[ranked[j][k] for j in range(n)] for k in range(count)]
+        own = sorted((e for e in explained if explained[e][j] > 0), key=lambda e: -float(explained[e][j]))
+        wanted += own[:PER_JOINT]
+    return list(dict.fromkeys(wanted))
+
+
+def _begun(
+    problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]]
+) -> dict[type[Effect] | None, Fitted]:
+    """The present model with each effect after a few coarse steps, and without any (None).
+
+    Each effect starts at every joint's best two probes; the better one goes on, joint by joint.
+    """
+    starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
+    for effect in effects:
+        own = [probe for probe in probes if probe.effect is effect]
+        ranked = [sorted(own, key=lambda p: -float(p.score[j])) for j in range(now.model.num_joints)]
+        starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(min(2, len(own)))]
+    result: dict[type[Effect] | None, Fitted] = {}
+    for each in fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, max_iteration=4, part=0.4):
+        best = result.setdefault(each.tried, each)
+        better = each.score < best.score
+        best.x[better], best.score[better] = each.x[better], each.score[better]
     return result
 
 
-def _better_starts(problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
-    """Of the starts of each effect, the one that is better after a few coarse steps, joint by joint."""
-    fitted = fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, max_iteration=4, part=0.4)
-    result: dict[type[Effect], Fitted] = {}
-    for each in fitted:
-        if each.own is None:
-            continue
-        best = result.setdefault(each.own, each)
-        better = each.score < best.score
-        best.x[better], best.score[better] = each.x[better], each.score[better]
-    return list(result.values())
+def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], torch.Tensor]:
+    """By how much each effect has lowered each joint's squared error, (n,) [rad²]."""
+    without = begun[None].score
+    return {effect: (without - each.score).clamp(min=0.0) for effect, each in begun.items() if effect is not None}
 
 
 def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted:
     """The present model with an effect at each joint's probe."""
-    n = now.model.num_joints
-    model = now.model.with_effect(effect, torch.ones(n, dtype=torch.bool))
     own = torch.stack([starts_of(probe)[j] for j, probe in enumerate(probes)])
-    x = model.to_normalised(torch.cat([now.model.to_physical(now.x), own], dim=1))
-    return Fitted(model=model, own=effect, x=x, score=torch.full((n,), torch.inf, dtype=torch.float64))
+    physical = now.model.to_physical(now.x)
+    return Fitted.start(*now.model.extended(physical, effect, now.model.may_get(effect), own), tried=effect)
 
 
 def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
@@ -262,18 +260,12 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
 def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type[Effect], Fitted]) -> Fitted:
     """The present model with each joint's chosen effect, refitted unless all joints chose the same."""
     if len(set(found.chosen)) == 1 and found.chosen[0] is not None:
-        return replace(fitted[found.chosen[0]], own=None)
-    model, n = now.model, now.model.num_joints
-    physical = model.to_physical(now.x)
+        return replace(fitted[found.chosen[0]], tried=None)
+    model, physical, size = now.model, now.model.to_physical(now.x), now.model.size
     for effect in dict.fromkeys(e for e in found.chosen if e is not None):
         has = torch.tensor([e is effect for e in found.chosen])
         source = fitted[effect]
         values = source.model.to_physical(source.x)
-        model = model.with_effect(effect, has)
-        physical = torch.cat([physical, start_values(effect, {}).repeat(n, 1)], dim=1)
-        physical[has, model.columns(effect)] = values[has][:, source.model.columns(effect)]
-        physical[has, : now.model.size] = values[has, : now.model.size]
-    start = Fitted(
-        model=model, own=None, x=model.to_normalised(physical), score=torch.full((n,), torch.inf, dtype=torch.float64)
-    )
-    return fit_side_by_side(problem, [start], max_iteration=6, keep_jacobian=True)[0]
+        model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
+        physical[has, :size] = values[has, :size]
+    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]

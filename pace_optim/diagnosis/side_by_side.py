@@ -18,8 +18,6 @@ class Slot:
     """A model and how many parameter sets of it are simulated."""
 
     model: JointModel
-    own: type[Effect] | None
-    """The effect that only this slot has; the others of its model are common to all slots."""
     rows: int
 
 
@@ -34,11 +32,13 @@ class SideBySide:
 
         Args:
             problem: The joints simulated alone; its own effects are not used.
-            slots: The models; their common effects must be the same.
+            slots: The models; each may have one effect that is not common to all.
             training: Whether only recordings that are trained on are simulated.
         """
         self.slots = list(slots)
-        self._common = tuple(e for e in slots[0].model.effects if e is not slots[0].own)
+        first = slots[0].model.effects
+        self._common = tuple(e for e in first if all(e in slot.model.effects for slot in slots))
+        self._own = [next((e for e in slot.model.effects if e not in self._common), None) for slot in slots]
         evaluator_problem = problem.with_effects(self._cfgs(problem, training))
         evaluator = evaluator_problem.training_evaluator() if training else evaluator_problem.evaluator()
         self.dataset = evaluator.dataset
@@ -82,8 +82,8 @@ class SideBySide:
     def _groups(self) -> list[list[int]]:
         """Indices of neighbouring slots whose own effect is the same: one effect acts for all of them."""
         groups: list[list[int]] = []
-        for i, slot in enumerate(self.slots):
-            if groups and slot.own is not None and self.slots[groups[-1][0]].own is slot.own:
+        for i, own in enumerate(self._own):
+            if groups and own is not None and self._own[groups[-1][0]] is own:
                 groups[-1].append(i)
             else:
                 groups.append([i])
@@ -95,7 +95,7 @@ class SideBySide:
         start = 0
         for group in self._groups():
             end = start + sum(self.slots[i].rows for i in group) * count
-            own = self.slots[group[0]].own
+            own = self._own[group[0]]
             if own is not None:
                 cfgs.append(EffectCfg(effect=own.name, env_rows=slice(start, end)))
             start = end
@@ -126,22 +126,20 @@ class SideBySide:
                 robot.write_effect_to_sim(
                     actuator, by_place[common.name, None, None], values.repeat_interleave(count, dim=0)[:, ids]
                 )
-            groups = [group for group in self._groups() if self.slots[group[0]].own is not None]
-            for group in groups:
-                first = self.slots[group[0]]
+            for group in self._groups():
+                own = self._own[group[0]]
+                if own is None:
+                    continue
                 begin = sum(slot.rows for slot in self.slots[: group[0]]) * count
                 end = begin + sum(self.slots[i].rows for i in group) * count
-                if first.own is None:
-                    raise ValueError("This slot has no effect of its own.")
-                effect = by_place[first.own.name, begin, end]
-                values = torch.cat([_of_effect(self.slots[i].model, self.slots[i].own, physical[i]) for i in group])
-                robot.write_effect_to_sim(actuator, effect, values.repeat_interleave(count, dim=0)[:, ids])
+                values = torch.cat([_of_effect(self.slots[i].model, own, physical[i]) for i in group])
+                robot.write_effect_to_sim(
+                    actuator, by_place[own.name, begin, end], values.repeat_interleave(count, dim=0)[:, ids]
+                )
 
 
-def _of_effect(model: JointModel, effect: type[Effect] | None, physical: torch.Tensor) -> torch.Tensor:
+def _of_effect(model: JointModel, effect: type[Effect], physical: torch.Tensor) -> torch.Tensor:
     """An effect's values (rows, n, parameters), null where a joint does not have it."""
-    if effect is None:
-        raise ValueError("This slot has no effect of its own.")
     values = physical[..., model.columns(effect)]
     null = torch.tensor([p.start if p.null is None else p.null for p in effect.parameters], dtype=torch.float64)
     return torch.where(model.has[model.effects.index(effect)][:, None], values, null)

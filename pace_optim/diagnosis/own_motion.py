@@ -1,0 +1,51 @@
+"""Joints alone move along a reference: with what was found, along the motion that the robot now has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.model import whole_values
+from pace_optim.diagnosis.verdict import labels
+from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.problem import Problem
+
+_FAR = 0.02
+"""A joint without neighbours feels a reference that is this near [rad] as its own motion: gravity is linear there."""
+_ITERATIONS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnMotion:
+    """Renews the reference of the joints of a robot."""
+
+    problem: Problem
+    """The whole robot with the base model."""
+    candidates: Sequence[type[Effect]]
+    """Effects whose influence on the rigid bodies is wanted."""
+    say: Callable[[str], None] = lambda _: None
+    """Shows how far it is."""
+
+    def follow(self, twins: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted]:
+        """The joints along the motion of the whole robot with a model, and the model fitted there.
+
+        Args:
+            twins: The joints along the present reference.
+            now: The model, fitted along it.
+        """
+        self.say("motion of the robot with what was found")
+        problem = self.problem.with_effects(labels(now.model, self.problem.joint_names))
+        values = problem.space.from_dict(whole_values(now.model, now.x, problem.joint_names))
+        changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
+        path = reference_path(problem, values, changing)
+        alone = max(len(tree) for tree in problem.trees) == 1
+        if alone and float((path.position - twins.path.position).abs().max()) < _FAR:
+            return twins, now
+        along = twin_problem(self.problem, path)
+        now.score = torch.full_like(now.score, torch.inf)
+        return along, fit_side_by_side(along, [now], max_iteration=_ITERATIONS, keep_jacobian=True)[0]
