@@ -129,7 +129,14 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
 
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
     final = SimpleNamespace(model=SimpleNamespace(effects=tuple(effects), has=has))
-    return Outcome(base=final, base_errors=errors(before), final=final, final_errors=errors(after), rounds=list(rounds))
+    return Outcome(
+        problem=None,
+        base=final,
+        base_errors=errors(before),
+        final=final,
+        final_errors=errors(after),
+        rounds=list(rounds),
+    )
 
 
 @pytest.mark.parametrize(
@@ -265,7 +272,7 @@ def test_a_fit_that_starts_at_the_truth_stays_there(bench):
     x = model.to_normalised(torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64))
     fitted = fit_side_by_side(
         bench.twins,
-        [Fitted(model=model, x=x, score=torch.full((1,), torch.inf, dtype=torch.float64))],
+        [Fitted.start(model, model.to_physical(x))],
         max_iteration=2,
     )[0]
     assert float((fitted.x - x).abs().max()) < 0.02

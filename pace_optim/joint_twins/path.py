@@ -15,6 +15,7 @@ from pace_optim.problem import Problem
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
+    from pace_envs.articulation import Articulation
 
 _STEP = 1e-4
 """Change of a position for a derivative [rad]."""
@@ -92,6 +93,7 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
     q, v = torch.stack(positions), torch.stack(velocities)
     middle_q, middle_v = 0.5 * (q[:-1] + q[1:]), 0.5 * (v[:-1] + v[1:])
     motion = (middle_q, middle_v, (v[1:] - v[:-1]) / problem.control_dt)
+    written = _take_off(robot)
     models = _models(rollout.env)
     columns = robot.dof_columns.numpy()
     feel = _feel(models, columns, *motion)
@@ -99,7 +101,8 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
     changes = {}
     for name in model_effects:
         for parameter in get_effect(name).parameters:
-            changes[name, parameter.name] = _change(problem, columns, name, parameter.name, motion, feel)
+            key = name, parameter.name
+            changes[key] = _change(problem, columns, *key, written.get(key), motion, feel)
     rollout.env.close()
     return ReferencePath(
         position=q,
@@ -109,6 +112,21 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
         columns=torch.as_tensor(columns),
         control_dt=problem.control_dt,
     )
+
+
+def _take_off(robot: Articulation) -> dict[tuple[str, str], torch.Tensor]:
+    """Take effects off the rigid bodies; what they were, (n,) by (effect, parameter)."""
+    written: dict[tuple[str, str], torch.Tensor] = {}
+    for actuator in robot.actuators.values():
+        for effect in [] if actuator.effects is None else actuator.effects.effects:
+            if not effect.overrides("write_model"):
+                continue
+            for parameter in effect.parameters:
+                values = written.setdefault((effect.name, parameter.name), torch.zeros(robot.num_joints).double())
+                values[actuator.joint_indices] = getattr(effect, parameter.name)[0]
+    for effect_name, parameter_name in written:
+        robot.write_effect_parameter_to_sim(effect_name, parameter_name, torch.zeros(robot.num_envs, robot.num_joints))
+    return written
 
 
 def _models(env: ManagerBasedEnv) -> list[mujoco.MjModel]:
@@ -176,11 +194,16 @@ def _change(
     columns: np.ndarray,
     effect: str,
     parameter: str,
+    written: torch.Tensor | None,
     motion: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
     base: Feel,
 ) -> Feel:
-    """What a unit of a parameter of an effect on the model changes of each joint's own feel."""
-    value = probe_points(get_effect(effect))[0][parameter]
+    """What a unit of a parameter of an effect on the model changes of each joint's own feel.
+
+    Measured between null and the values that the effect has (n,), or where it has none, a probe's.
+    """
+    probe = torch.full((len(problem.joint_names),), probe_points(get_effect(effect))[0][parameter], dtype=torch.float64)
+    value = probe if written is None else torch.where(written == 0, probe, written)
     inertia, torque = torch.zeros_like(base.inertia), torch.zeros_like(base.torque)
     names = problem.joint_names
     changed = problem.with_effects([EffectCfg(effect=effect)])
@@ -188,7 +211,7 @@ def _change(
     for i in range(max(len(tree) for tree in problem.trees)):
         moved = [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
         values = torch.zeros(rollout.env.num_envs, len(names), dtype=torch.float64)
-        values[:, moved] = value
+        values[:, moved] = value[moved]
         rollout.robot.write_effect_parameter_to_sim(effect, parameter, values)
         there = _feel(_models(rollout.env), columns, *motion)
         inertia[..., moved] = ((there.inertia - base.inertia) / value)[..., moved]
