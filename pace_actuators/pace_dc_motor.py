@@ -243,12 +243,12 @@ class PaceDCMotor:
         Returns:
             The torque that is asked of the drive [N m], (num_envs, num_joints).
         """
-        position = self._delayed("positions", control_action.joint_positions)
+        position = self._delayed("positions", self._target_inside(control_action.joint_positions))
         velocity = self._delayed("velocities", control_action.joint_velocities)
         feed_forward = self._delayed("efforts", control_action.joint_efforts)
         stiffness, damping, encoder_vel = self.stiffness, self.damping, joint_vel
         if self.effects is not None:
-            position, encoder_vel, stiffness, damping = self._seen_by_controller(position, joint_vel)
+            encoder_vel, stiffness, damping = self._seen_by_controller(joint_vel)
         encoder_pos = self.sensed_position(joint_pos) - self.encoder_bias
         if position is None:  # no position target: velocity and effort control
             position = encoder_pos
@@ -515,17 +515,22 @@ class PaceDCMotor:
         stack.run("advance")
         self._step_begun = True
 
-    def _seen_by_controller(self, position: torch.Tensor | None, joint_vel: torch.Tensor) -> tuple:
-        """Target, speed and gains after the effects on them."""
+    def _target_inside(self, position: torch.Tensor | None) -> torch.Tensor | None:
+        """Target after the effects on it."""
+        stack = self.effects
+        if position is None or stack is None or not stack.has("command"):
+            return position
+        stack.state.joint_pos_target = position
+        stack.run("command")
+        return stack.state.joint_pos_target
+
+    def _seen_by_controller(self, joint_vel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Speed and gains after the effects on them."""
         stack = self.effects
         encoder_vel, stiffness, damping = joint_vel, self.stiffness, self.damping
         if stack is None:
-            return position, encoder_vel, stiffness, damping
+            return encoder_vel, stiffness, damping
         s = stack.state
-        if position is not None and stack.has("command"):
-            s.joint_pos_target = position
-            stack.run("command")
-            position = s.joint_pos_target
         if stack.has("sensed_velocity"):
             s.encoder_vel = joint_vel
             stack.run("sensed_velocity")
@@ -534,7 +539,7 @@ class PaceDCMotor:
             s.stiffness, s.damping = stiffness, damping
             stack.run("controller")
             stiffness, damping = s.stiffness, s.damping
-        return position, encoder_vel, stiffness, damping
+        return encoder_vel, stiffness, damping
 
     def _delayed(self, name: str, data: torch.Tensor | None) -> torch.Tensor | None:
         buffer = self._delay_buffers.get(name)

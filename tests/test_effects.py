@@ -128,7 +128,10 @@ def test_friction_laws():
     assert float(drive.motor.joint_viscous_friction) == 0.0  # never drives
     drive = Drive(["friction_asymmetry"], {"friction_asymmetry.effort": 0.4})
     assert [drive.one(v=v) + v for v in (2.0, -2.0)] == pytest.approx([-0.4, -0.4], rel=1e-4)
-    assert drive.one(v=0.0) == 0.0
+    assert float(drive.motor.joint_friction) == 0.5  # 0.9 forward, 0.1 backward
+    drive.motor.effects.find("friction_asymmetry").set_parameter("effort", 0.8)
+    assert drive.one() == pytest.approx(-0.65)
+    assert float(drive.motor.joint_friction) == pytest.approx(0.65)  # 1.3 forward, never less than none backward
 
 
 def test_friction_drifts_over_the_session():

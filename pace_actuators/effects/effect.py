@@ -146,7 +146,7 @@ class Effect:
         """Once per physics step, before all else: bring the own state to the present joint state."""
 
     def command(self, s: DriveState) -> None:
-        """Once per control step, after the command's delay: change ``s.joint_pos_target``."""
+        """Once per control step, before the command's delay: change ``s.joint_pos_target``."""
 
     def measurement(self, s: DriveState) -> None:
         """Whenever the encoder is read: change ``s.encoder_pos`` (before the bias)."""

@@ -11,9 +11,6 @@ from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, off
 from pace_actuators.effects.registry import register_effect
 
-_SLIDING_SPEED = 5e-3
-"""Above this speed a joint counts as sliding [rad/s]."""
-
 
 @register_effect
 class StribeckFriction(Effect):
@@ -66,7 +63,12 @@ class LoadDependentFriction(Effect):
 
 @register_effect
 class FrictionAsymmetry(Effect):
-    """Sliding friction differs between the directions: F_c + a one way, F_c - a the other."""
+    """Coulomb friction differs between the directions: F_c + a forward, F_c - a backward, never less than none.
+
+    Two levels are the same as one level and a constant torque, at rest and sliding, and are given to the simulator so:
+
+        F₊ = max(F_c + a, 0)   F₋ = max(F_c - a, 0)   F = (F₊ + F₋)/2   τ -> τ - (F₊ - F₋)/2
+    """
 
     name = "friction_asymmetry"
     stage = "friction"
@@ -76,13 +78,15 @@ class FrictionAsymmetry(Effect):
     source = "BAM (Rhoban), directional friction"
     probes = ({"effort": 0.05},)
     twins = ("torque_offset",)
-    separates = "breaking away from rest in both directions, in another pose"
+    separates = "a second session: a torque stays when the friction changes"
     effort: torch.Tensor
 
-    def transmission(self, s: DriveState) -> None:
-        """Brake one way, help the other, while sliding: -(F_c + a sgn v) sgn v = -F_c sgn v - a."""
-        square = s.motor_vel**2
-        s.effort -= self.effort * (square / (square + _SLIDING_SPEED**2))
+    def friction(self, s: DriveState) -> None:
+        """Brake one way more than the other."""
+        forward = (s.friction + self.effort).clamp(min=0.0)
+        backward = (s.friction - self.effort).clamp(min=0.0)
+        s.effort -= 0.5 * (forward - backward)
+        s.friction = 0.5 * (forward + backward)
 
 
 @register_effect
