@@ -132,6 +132,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "noise": job.case.noise,
         "verdict": found.verdict,
         "added": found.added,
+        "absorbed": [effect.name for effect in found.absorbed],
         "explained": found.explained,
         "floor": float(found.data.floor.square().mean().sqrt()),
         "ranking": ranking(outcome, problem.joint_names),

@@ -67,7 +67,11 @@ def page() -> str:
     parts = [_HEAD, *(_row(f"`{e.name}`", e.stage, f"`{e.equation}`", e.source) for e in effects)]
     parts += [_PARAMETERS, *(_parameter(e, p) for e in effects for p in e.parameters)]
     parts += [_LOOKS, *(_row(f"`{e.name}`", e.looks, e.separates) for e in effects)]
-    twins = [_row(f"`{e.name}`", ", ".join(f"`{t}`" for t in e.twins), e.separates) for e in effects if e.twins]
+    twins = [
+        _row(f"`{e.name}`", ", ".join(f"`{like}`" for like in (*e.twins, e.absorbed_by) if like), e.separates)
+        for e in effects
+        if e.twins or e.absorbed_by
+    ]
     return "".join([*parts, _TWINS, *twins, _PARTLY])
 
 

@@ -97,6 +97,8 @@ class Effect:
     """Whether it changes ``s.armature`` from step to step, and reads the link's inertia."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
+    absorbed_by: ClassVar[str] = ""
+    """Base parameter that may take it up wholly, so that recordings of positions do not show it."""
     separates: ClassVar[str] = ""
     """Which further recording tells it from its likes."""
 

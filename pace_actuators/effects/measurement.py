@@ -106,6 +106,7 @@ class MeasurementDelay(Effect):
     probes = ({"delay": 0.001},)
     two_sided = False
     twins = ("other_delay",)
+    absorbed_by = "delay"
     separates = "time stamps taken by the drive itself"
     delay: torch.Tensor
 

@@ -55,6 +55,7 @@ class ComOffset(Effect):
     looks = "a lean that depends on the pose"
     source = "as payload"
     probes = ({"angle": 0.01},)
+    absorbed_by = "encoder_bias"
     separates = "an absolute reference of the position"
     angle: torch.Tensor
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from pace_actuators.effects import Effect
 from pace_optim.diagnosis.data_check import DataCheck
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.verdict import confounded_pairs
 from pace_optim.problem import Problem
 
 
-def advise(problem: Problem, outcome: Outcome, decision: str, data: DataCheck) -> list[str]:
+def advise(
+    problem: Problem, outcome: Outcome, decision: str, data: DataCheck, absorbed: Sequence[type[Effect]]
+) -> list[str]:
     """Sentences, the most useful first."""
     result = []
     for chosen, rival in confounded_pairs(outcome):
@@ -25,6 +30,11 @@ def advise(problem: Problem, outcome: Outcome, decision: str, data: DataCheck) -
             "All recordings have the same gains: errors of the gains and some delays cannot be seen. Record once with "
             "another proportional gain (stiffness in the recording)."
         )
+    result += [
+        f"A {effect.name} would not show in these recordings: the {effect.absorbed_by} takes it up. What would tell "
+        f"them apart: {effect.separates}."
+        for effect in absorbed
+    ]
     if decision == "unknown":
         result.append(
             "None of the known effects explains the error. The error map says which variable carries it: write an "

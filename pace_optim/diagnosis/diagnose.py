@@ -17,6 +17,7 @@ from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.result import Diagnosis
+from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.verdict import labels, ranking, verdict
@@ -35,6 +36,8 @@ class Findings:
 
     outcome: Outcome
     data: DataCheck
+    absorbed: list[type[Effect]]
+    """Effects that a base parameter takes up: these recordings would not show them."""
     verdict: str
     explained: float
     """Part of the error above the floor that the effects found explain."""
@@ -93,7 +96,8 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         ranking=ranking(found.outcome, problem.joint_names),
         joints=_joints(found, problem),
         data=found.data.sentences,
-        advice=advise(problem, found.outcome, found.verdict, found.data),
+        absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
+        advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         runs=runs,
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
@@ -134,12 +138,13 @@ def search_effects(
     torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base)
+    absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
 
     follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
     outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)
     decision, explained = verdict(outcome, data.floor)
     added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
-    return Findings(outcome=outcome, data=data, verdict=decision, explained=explained, added=added)
+    return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, added=added)
 
 
 def summary_of(found: Findings, problem: Problem) -> str:

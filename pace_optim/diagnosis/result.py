@@ -30,6 +30,8 @@ class Diagnosis:
     """For each joint its errors, floor and effects."""
     data: list[str]
     """What was noticed about the recordings."""
+    absorbed: dict[str, str] = field(default_factory=dict)
+    """Effects that these recordings would not show, with the base parameter that takes each up."""
     advice: list[str]
     """What to do or to record next."""
     runs: list[str]

@@ -18,6 +18,8 @@ _BLOCK_S = 0.2
 _STRIDE = 2
 _AT_BOUND = 1e-3
 _RIDGE = 1e-9
+_SEEN = 0.3
+"""Part of an effect's amplitude: with less than this left, a base parameter takes it up."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,9 +49,54 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
     """
-    model = now.model
-    if now.error is None or now.jacobian is None:
+    if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
+    probes, changes, where = _simulated(problem, now, effects, effort)
+    scores, sizes = _explained(now.error, _free_columns(now), changes, _blocks(where, problem.control_dt))
+    result = []
+    for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
+        allowed = now.model.may_get(effect) & ((size > 0) | effect.two_sided)
+        result.append(Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size))
+    return result
+
+
+def absorbed_effects(
+    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+) -> list[type[Effect]]:
+    """Effects that a base parameter takes up on every joint, so that these recordings would not show them.
+
+    Args:
+        problem: The joints simulated alone.
+        now: The base model, fitted, with its Jacobian.
+        effects: What is tried; only those count that name such a parameter.
+        effort: Typical torque of each joint, (n,) [N m].
+    """
+    suspects = [effect for effect in effects if effect.absorbed_by]
+    if not suspects:
+        return []
+    probes, changes, _ = _simulated(problem, now, suspects, effort)
+    jacobian, result = _free_columns(now), dict.fromkeys(suspects)
+    for (effect, _), change in zip(probes, changes, strict=True):
+        for j in range(now.model.num_joints):
+            columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
+            columns = columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12)
+            seen = own - _solve(_bordered(columns, own), len(columns)) @ columns
+            if float(seen.norm()) > _SEEN * float(own.norm()):
+                result.pop(effect, None)
+    return list(result)
+
+
+def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Gram matrix of some columns and, last, a target."""
+    together = torch.cat([columns, target[None]])
+    return together @ together.T
+
+
+def _simulated(
+    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+) -> tuple[list[tuple[type[Effect], torch.Tensor]], torch.Tensor, torch.Tensor]:
+    """All probes with their values, what they change (probes, K, R, n), and where the samples are (T, R)."""
+    model = now.model
     physical = model.to_physical(now.x)
     slots, values = [Slot(model=model, rows=1)], [physical[None]]
     probes: list[tuple[type[Effect], torch.Tensor]] = []
@@ -60,16 +107,8 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
         values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
     batch = SideBySide(problem, slots, training=True)
-    where = batch.dataset.train
-    errors = batch.simulate(values, where, _STRIDE)
-    blocks = _blocks(where, problem.control_dt)
-    jacobian = _free_columns(now, now.jacobian)
-    scores, sizes = _explained(now.error, jacobian, errors[1:] - errors[:1], blocks)
-    result = []
-    for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
-        allowed = model.may_get(effect) & ((size > 0) | effect.two_sided)
-        result.append(Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size))
-    return result
+    errors = batch.simulate(values, batch.dataset.train, _STRIDE)
+    return probes, errors[1:] - errors[:1], batch.dataset.train
 
 
 def _probe_values(effect: type[Effect], point: dict[str, float], effort: torch.Tensor) -> torch.Tensor:
@@ -104,9 +143,11 @@ def _blocks(where: torch.Tensor, control_dt: float) -> torch.Tensor:
     return torch.where(where[steps], fold, -1)
 
 
-def _free_columns(now: Fitted, jacobian: torch.Tensor) -> torch.Tensor:
+def _free_columns(now: Fitted) -> torch.Tensor:
     """The Jacobian (P, K, R, n), without entries that sit at a bound."""
-    columns = jacobian.clone()
+    if now.jacobian is None:
+        raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
+    columns = now.jacobian.clone()
     fixed = (now.x.abs() > 1 - _AT_BOUND) | ~now.model.free
     for j, p in fixed.nonzero().tolist():
         columns[p, ..., j] = 0.0
