@@ -31,6 +31,9 @@ from pace_optim.tensorboard_log import TensorBoardLog
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
 
+_NEAR = LeastSquaresCfg(score_tolerance=0.02)
+"""For a vector that is known to be near the best."""
+
 
 def fit(settings: FitSettings, progress: ProgressLine | None = None) -> tuple[FitResult, Path]:
     """Identify a robot.
@@ -195,8 +198,8 @@ class _Fit:
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
 
     def _refine_from(self, x: torch.Tensor) -> Outcome:
-        """Refine a known vector: it needs no coarse stage."""
-        self.descents = least_squares(self.evaluator, self.colouring, [x], on_iteration=self._after_iteration)
+        """Refine a known vector: it needs no coarse stage, and few steps."""
+        self.descents = least_squares(self.evaluator, self.colouring, [x], _NEAR, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
 
     def _write_checkpoint(self) -> None:
@@ -298,7 +301,8 @@ class _Fit:
 
     def _check_consistency(self, outcome: Outcome, score: float) -> Consistency:
         """Fit each recording alone, where there are several and the optimizer can afford it."""
-        if self.settings.optimizer == "cmaes" or outcome.stop_reasons == ["interrupted"]:
+        wanted = self.settings.check_consistency and self.settings.optimizer != "cmaes"
+        if not wanted or outcome.stop_reasons == ["interrupted"]:
             return Consistency()
         result = check_consistency(self.problem, outcome.x, score, self.progress.say)
         if result.recordings:

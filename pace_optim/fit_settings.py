@@ -59,6 +59,9 @@ class FitSettings:
     start: dict[str, dict[str, float]] | None = None
     """Parameters to start least squares from, as in ``result.json``; ``None``: from the middle of the bounds."""
 
+    check_consistency: bool = True
+    """Whether each of several recordings is fitted alone too, to see whether they agree."""
+
     log_dir: str = "logs/pace"
     """Where runs are kept."""
 

@@ -35,6 +35,12 @@ def main() -> None:
     parser.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
     parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
     parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")
+    parser.add_argument(
+        "--no_consistency",
+        dest="check_consistency",
+        action="store_false",
+        help="do not fit each recording alone to see whether they agree",
+    )
     parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
     parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")

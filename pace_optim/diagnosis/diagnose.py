@@ -80,6 +80,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
             optimizer="least_squares",
             physics_dt=physics_dt,
             start=whole_values(final.model, final.x, problem.joint_names),
+            check_consistency=False,  # the run has done it
             log_dir=str(folder.parent.parent),
         )
         _, path = fit(refit_settings, progress)
