@@ -21,10 +21,11 @@ from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.next_experiment import rivals_of
 from pace_optim.diagnosis.screening import _FOLDS, _explained
 from pace_optim.diagnosis.search import Outcome, Round, Trial
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
-from pace_optim.diagnosis.verdict import confounded_pairs, labels, ranking, verdict
+from pace_optim.diagnosis.verdict import labels, ranking, verdict
 from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem import load_problem
@@ -188,7 +189,8 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
         [trial(QUADRATIC, 0, 2e-4), trial(STRIBECK, 0, 2.1e-4), trial(GAIN, 0, 9e-4, significant=False)],
         [trial(STRIBECK, 1, 3e-4), trial(QUADRATIC, 1, 8e-4), trial(GAIN, 1, 9e-4, significant=False)],
     ]
-    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[QUADRATIC], []])
+    models = {STRIBECK: "with stribeck", QUADRATIC: "with quadratic"}
+    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[QUADRATIC], []], models=models)
     outcome = outcome_of([1e-3] * 2, [3e-4] * 2, [STRIBECK], rounds=[this])
     entries = ranking(outcome, ("hip", "knee"))
     assert [e["effect"] for e in entries] == ["stribeck_friction", "quadratic_friction", "torque_gain"]
@@ -197,7 +199,9 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     assert entries[0]["confounded_with"] == ["quadratic_friction"]
     assert entries[1]["confounded_with"] == ["stribeck_friction"]
     assert entries[0]["joints"] == ["hip", "knee"]
-    assert confounded_pairs(outcome) == [(STRIBECK, QUADRATIC)]
+    pair = rivals_of(outcome)[0]
+    assert (pair.chosen, pair.rival, pair.joints) == (STRIBECK, QUADRATIC, [0])
+    assert pair.models == ("with stribeck", "with quadratic")
     json.dumps(entries)
 
 

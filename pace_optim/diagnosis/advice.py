@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.next_experiment import next_experiments
 from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.verdict import confounded_pairs
 from pace_optim.problem import Problem
 
 
 def advise(
-    problem: Problem, outcome: Outcome, decision: str, data: DataCheck, absorbed: Sequence[type[Effect]]
+    problem: Problem, outcome: Outcome, decision: str, data: DataCheck, absorbed: Iterable[type[Effect]]
 ) -> list[str]:
     """Sentences, the most useful first."""
-    result = []
-    for chosen, rival in confounded_pairs(outcome):
-        separates = chosen.separates or rival.separates
-        how = f" Record {separates} to tell them apart." if separates else ""
-        result.append(f"These recordings cannot tell {chosen.name} from {rival.name}.{how}")
+    result = next_experiments(problem, outcome, data.noise)
     if data.loads == 1:
         result.append(
             "All recordings carry the same load: friction that grows with the load, and a wrong torque or mass, cannot "

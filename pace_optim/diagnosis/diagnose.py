@@ -36,8 +36,8 @@ class Findings:
 
     outcome: Outcome
     data: DataCheck
-    absorbed: list[type[Effect]]
-    """Effects that a base parameter takes up: these recordings would not show them."""
+    absorbed: dict[type[Effect], torch.Tensor]
+    """Effects that a base parameter takes up, and on which joints (n,): these recordings would not show them there."""
     verdict: str
     explained: float
     """Part of the error above the floor that the effects found explain."""
@@ -140,6 +140,7 @@ def search_effects(
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base)
     absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
+    base.model = replace(base.model, barred=absorbed)
 
     follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
     outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)

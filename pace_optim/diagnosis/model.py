@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -28,6 +28,8 @@ class JointModel:
     """(n, P), physical."""
     log: torch.Tensor
     """Which entries have a logarithmic scale, (P,) bool."""
+    barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
+    """Effects that some joints cannot get, (n,) bool."""
 
     @classmethod
     def base(cls, problem: Problem) -> JointModel:
@@ -81,7 +83,8 @@ class JointModel:
             torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64).expand(n, -1)
             for side in ("lower", "upper")
         ]
-        return JointModel(
+        return replace(
+            self,
             effects=(*self.effects, effect),
             has=torch.cat([self.has, joints[None]]),
             lower=torch.cat([self.lower, bounds[0]], dim=1),
@@ -109,7 +112,7 @@ class JointModel:
 
     def may_get(self, effect: type[Effect]) -> torch.Tensor:
         """Joints that can have an effect beside those that they have, (n,) bool; only one can part motor and link."""
-        excluded = torch.zeros(self.num_joints, dtype=torch.bool)
+        excluded = self.barred.get(effect, torch.zeros(self.num_joints, dtype=torch.bool)).clone()
         for other, has in zip(self.effects, self.has, strict=True):
             if other is effect or (other.parts_motor_and_link and effect.parts_motor_and_link):
                 excluded |= has

@@ -17,7 +17,7 @@ from pace_optim.problem import Problem
 
 _FAR = 0.02
 """A joint without neighbours feels a reference that is this near [rad] as its own motion: gravity is linear there."""
-_ITERATIONS = 4
+_ITERATIONS = 10
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

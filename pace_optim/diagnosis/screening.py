@@ -62,8 +62,8 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
 
 def absorbed_effects(
     problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
-) -> list[type[Effect]]:
-    """Effects that a base parameter takes up on every joint, so that these recordings would not show them.
+) -> dict[type[Effect], torch.Tensor]:
+    """Effects that a base parameter takes up, and on which joints (n,): these recordings would not show them there.
 
     Args:
         problem: The joints simulated alone.
@@ -73,17 +73,18 @@ def absorbed_effects(
     """
     suspects = [effect for effect in effects if effect.absorbed_by]
     if not suspects:
-        return []
+        return {}
     probes, changes, _ = _simulated(problem, now, suspects, effort)
-    jacobian, result = _free_columns(now), dict.fromkeys(suspects)
+    jacobian = _free_columns(now)
+    result = {effect: torch.ones(now.model.num_joints, dtype=torch.bool) for effect in suspects}
     for (effect, _), change in zip(probes, changes, strict=True):
         for j in range(now.model.num_joints):
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
             columns = columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12)
             seen = own - _solve(_bordered(columns, own), len(columns)) @ columns
             if float(seen.norm()) > _SEEN * float(own.norm()):
-                result.pop(effect, None)
-    return list(result)
+                result[effect][j] = False
+    return {effect: joints for effect, joints in result.items() if bool(joints.any())}
 
 
 def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -55,6 +55,8 @@ class Round:
     chosen: list[type[Effect] | None]
     rivals: list[list[type[Effect]]]
     """For each joint, effects that do as well as the chosen one."""
+    models: dict[type[Effect], Fitted] = field(default_factory=dict)
+    """The present model with each effect that was refitted."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -101,15 +103,14 @@ def add_effects(
         if not bool(open_joints.any()) or not untried:
             break
         say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
-        this = _try(problem, now, errors, untried, effort, floor, open_joints, say)
-        if this is None:
+        found = _try(problem, now, errors, untried, effort, floor, open_joints, say)
+        if found is None:
             break
-        found, fitted = this
         outcome.rounds.append(found)
         open_joints &= torch.tensor([effect is not None for effect in found.chosen])
         if not bool(open_joints.any()):
             break
-        now = _combined(problem, now, found, fitted)
+        now = _combined(problem, now, found)
         problem, now = follow(problem, now)
         errors = validation_errors(problem, [now])[0]
         outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
@@ -136,7 +137,7 @@ def _try(
     floor: torch.Tensor,
     open_joints: torch.Tensor,
     say: Callable[[str], None],
-) -> tuple[Round, dict[type[Effect], Fitted]] | None:
+) -> Round | None:
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
     excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
     listed = _short_list(_promising(probes, excess), excess)
@@ -174,7 +175,7 @@ def _try(
             )
         keep[effect] = chosen
     chosen_effects, rivals = _choose(trials)
-    return Round(trials=trials, chosen=chosen_effects, rivals=rivals), keep
+    return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)
 
 
 def _promising(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], torch.Tensor]:
@@ -257,14 +258,14 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
     return chosen, rivals
 
 
-def _combined(problem: TwinProblem, now: Fitted, found: Round, fitted: dict[type[Effect], Fitted]) -> Fitted:
+def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
     """The present model with each joint's chosen effect, refitted unless all joints chose the same."""
     if len(set(found.chosen)) == 1 and found.chosen[0] is not None:
-        return replace(fitted[found.chosen[0]], tried=None)
+        return replace(found.models[found.chosen[0]], tried=None)
     model, physical, size = now.model, now.model.to_physical(now.x), now.model.size
     for effect in dict.fromkeys(e for e in found.chosen if e is not None):
         has = torch.tensor([e is effect for e in found.chosen])
-        source = fitted[effect]
+        source = found.models[effect]
         values = source.model.to_physical(source.x)
         model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
         physical[has, :size] = values[has, :size]

@@ -92,15 +92,6 @@ def ranking(outcome: Outcome, joint_names: Sequence[str]) -> list[dict[str, Any]
     )
 
 
-def confounded_pairs(outcome: Outcome) -> list[tuple[type[Effect], type[Effect]]]:
-    """Effects that were chosen, each with one that does as well."""
-    pairs = []
-    for this in outcome.rounds:
-        for chosen, rivals in zip(this.chosen, this.rivals, strict=True):
-            pairs += [(chosen, rival) for rival in rivals if chosen is not None]
-    return list(dict.fromkeys(pairs))
-
-
 def _evidence(trials: Sequence[Trial], effect: type[Effect]) -> str:
     before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
     strongest = max(trials, key=lambda t: t.ratio)
