@@ -73,7 +73,7 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
             continue
         choice = choices[best]
         result.append(
-            f"{_alike(pair, problem)} {choice.words} would: there they predict motions that differ by "
+            f"{_alike(pair, problem)} {choice.words} would tell them apart: they predict motions that differ by "
             f"{1e3 * float(apart[best]):.2g} mrad, {times:.0f} times the noise. scripts/data_collection.py --task "
             f"{problem.task} {choice.arguments} --command_only --export_command next.csv"
         )
@@ -172,4 +172,4 @@ def _alike(pair: Rivals, problem: Problem) -> str:
 
 def _hint(pair: Rivals) -> str:
     separates = pair.chosen.separates or pair.rival.separates
-    return f"What would: {separates}." if separates else ""
+    return f"What would tell them apart: {separates}." if separates else ""
