@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,8 +22,8 @@ from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.next_experiment import rivals_of
-from pace_optim.diagnosis.screening import _FOLDS, _explained
+from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
+from pace_optim.diagnosis.screening import _FOLDS, _explained, absorbed_effects
 from pace_optim.diagnosis.search import Outcome, Round, Trial
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.verdict import labels, ranking, verdict
@@ -216,7 +217,12 @@ def bench():
     recordings = [record(target, CALM, cfg=fine) for target in (chirp(5.0), chirp(4.0, 0.2, 3.0))]
     problem = make_problem(recordings[:1], validation=recordings[1:]).with_physics_dt(DT / 2)
     truth = physical(problem, CALM)
-    return SimpleNamespace(problem=problem, truth=truth, twins=twin_problem(problem, reference_path(problem, truth)))
+    return SimpleNamespace(
+        problem=problem,
+        truth=truth,
+        truth_values=torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64),
+        twins=twin_problem(problem, reference_path(problem, truth, ["com_offset"])),
+    )
 
 
 def test_normalised_values_go_there_and_back(bench):
@@ -231,6 +237,55 @@ def test_normalised_values_go_there_and_back(bench):
 def test_joints_without_an_effect_do_not_fit_it(bench):
     model = JointModel.base(bench.problem).with_effect(STRIBECK, torch.tensor([False]))
     assert model.free[0].tolist() == [True] * len(BASE) + [False] * 2
+
+
+def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(bench):
+    one = JointModel.base(bench.problem)
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    base = replace(one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1))
+    values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
+    model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
+    model, physical = model.extended(physical, STRIBECK, torch.tensor([False, True]), values + 1)
+    assert model.size == len(BASE) + 2 and model.has.all()
+    assert physical[:, model.columns(STRIBECK)].tolist() == [[1.0, 0.1], [3.0, 1.3]]
+
+
+def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):
+    backlash, elasticity = get_effect("backlash"), get_effect("joint_elasticity")
+    model = JointModel.base(bench.problem).with_effect(backlash, torch.tensor([True]))
+    assert not model.may_get(elasticity) and not model.may_get(backlash) and model.may_get(STRIBECK)
+    assert not replace(model, barred={STRIBECK: torch.tensor([True])}).may_get(STRIBECK)
+
+
+def test_rivals_are_sent_to_the_recording_where_they_part(bench):
+    base = JointModel.base(bench.problem)
+    values = bench.truth_values
+    models = []
+    for effect, own in ((STRIBECK, [0.3, 0.1]), (QUADRATIC, [0.05])):
+        model, physical = base.extended(values, effect, torch.tensor([True]), torch.tensor([own], dtype=torch.float64))
+        models.append(Fitted.start(model, physical))
+    trials = [[trial(STRIBECK, 0, 2e-4), trial(QUADRATIC, 0, 2e-4)]]
+    this = Round(
+        trials=trials,
+        chosen=[STRIBECK],
+        rivals=[[QUADRATIC]],
+        models=dict(zip((STRIBECK, QUADRATIC), models, strict=True)),
+    )
+    outcome = outcome_of([1e-3], [2e-4], [STRIBECK], rounds=[this])
+    apart = distances(bench.problem, rivals_of(outcome)[0], [c.recording for c in menu(bench.problem, 0)])
+    (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1e-4], dtype=torch.float64))
+    assert f"{1e3 * float(apart.max()):.2g} mrad" in sentence and "scripts/data_collection.py --task" in sentence
+    (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1.0], dtype=torch.float64))
+    assert "Nor would any of" in sentence
+
+
+def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
+    fitted = fit_side_by_side(bench.twins, [Fitted.start(JointModel.base(bench.problem), bench.truth_values)], 2, True)[
+        0
+    ]
+    effects = [get_effect(name) for name in ("stribeck_friction", "measurement_delay", "com_offset")]
+    found = absorbed_effects(bench.twins.with_physics_dt(DT), fitted, effects, torch.tensor([5.0], dtype=torch.float64))
+    assert [effect.name for effect in found] == ["measurement_delay", "com_offset"]
 
 
 def test_an_effect_in_one_slot_changes_no_other(bench):
