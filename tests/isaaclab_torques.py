@@ -126,8 +126,11 @@ def main(wheel: str, result: str, output: str) -> None:
 
     robot = Articulation(actuator)
     robot._apply_actuator_model()
-    out["load"] = actuator.motor.effects.state.load_effort.numpy()
     out["written_friction"], out["applied"] = robot.friction[0].numpy(), robot.applied
+    motor = PaceDCMotorCfg(joint_names_expr=".*", physics_dt=DT, effects=("load_dependent_friction",))
+    loaded = build(PaceDCMotorActuatorCfg(motor=motor))
+    Articulation(loaded)._apply_actuator_model()
+    out["load"] = loaded.motor.effects.state.load_effort.numpy()
 
     # against Isaac Lab's own actuators, with what they have too
     plain = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0}
