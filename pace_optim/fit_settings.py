@@ -24,7 +24,8 @@ class FitSettings:
     """Recordings that are never trained on; none keeps the last 30 % of each for that."""
 
     effects: list[str] = field(default_factory=list)
-    """Physical effects identified beside the base parameters: ``name``, ``name@joints`` or ``name@shared``."""
+    """Physical effects identified beside the base parameters: ``name``, ``name@joints``, ``name@shared`` or
+    ``name@joints@shared``."""
 
     num_envs: int = 512
     """Simulations at once in a search; refining takes as many as it needs."""

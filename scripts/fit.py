@@ -24,7 +24,11 @@ def main() -> None:
     )
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
-        "--effects", nargs="+", default=[], metavar="NAME", help="effects to add: NAME, NAME@JOINTS or NAME@shared"
+        "--effects",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared",
     )
     parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")

@@ -16,7 +16,7 @@ from run_folders import make_result
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
 from pace_optim.atomic import write_json
-from pace_optim.diagnosis import candidate_effects
+from pace_optim.diagnosis import candidate_effects, sharing
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
@@ -130,7 +130,7 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
         return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
 
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
-    final = SimpleNamespace(model=SimpleNamespace(effects=tuple(effects), has=has))
+    final = SimpleNamespace(model=SimpleNamespace(effects=tuple(effects), has=has, shared={GAIN}))
     return Outcome(
         problem=None,
         base=final,
@@ -168,7 +168,7 @@ def test_the_part_explained_is_of_what_lies_above_the_floor():
 
 def test_effects_are_named_as_fit_takes_them():
     outcome = outcome_of([1.0] * 3, [1.0] * 3, [STRIBECK, GAIN], [[True] * 3, [True, False, True]])
-    assert labels(outcome.final.model, ("a", "b", "c")) == ["stribeck_friction", "torque_gain@a|c"]
+    assert labels(outcome.final.model, ("a", "b", "c")) == ["stribeck_friction", "torque_gain@a|c@shared"]
 
 
 def trial(effect, joint, after, significant=True):
@@ -248,6 +248,33 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
     model, physical = model.extended(physical, STRIBECK, torch.tensor([False, True]), values + 1)
     assert model.size == len(BASE) + 2 and model.has.all()
     assert physical[:, model.columns(STRIBECK)].tolist() == [[1.0, 0.1], [3.0, 1.3]]
+
+
+def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
+    base = JointModel.base(bench.problem)
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    model = replace(base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1))
+    both = torch.tensor([True, True])
+    found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
+    model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, found)
+    final = Fitted.start(model, physical)
+    final.jacobian = torch.randn(model.size, 40, 3, 2, generator=torch.Generator().manual_seed(0))
+    final.jacobian[..., 0] *= 10  # the first joint knows its values better
+    weights = torch.ones(1).double()
+    errors = BlockErrors(square=torch.tensor([[1e-8, 1e-8]]).double(), weight=weights)
+    for cost, shared in ((1.0, True), (1.2, False)):
+        after = BlockErrors(square=cost * errors.square, weight=weights)
+        monkeypatch.setattr(sharing, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+        monkeypatch.setattr(sharing, "validation_errors", lambda *_, after=after: [after])
+        outcome = Outcome(problem=None, base=final, base_errors=errors, final=final, final_errors=errors)
+        sharing.share(outcome)
+        assert (STRIBECK in outcome.final.model.shared) is shared
+        values = outcome.final.model.to_physical(outcome.final.x)[:, model.columns(STRIBECK)]
+        if shared:
+            assert values[0] == pytest.approx(values[1]) and values[0] == pytest.approx(found[0], rel=0.01)
+            assert bool(outcome.final.model.free.all())
+        else:
+            assert values == pytest.approx(found)
 
 
 def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):

@@ -240,7 +240,7 @@ def test_names_and_places_are_read():
     assert EffectCfg.parse("torque_gain@shared").shared
     assert EffectCfg.parse("clock_skew").shared
     assert not EffectCfg.parse("torque_gain").shared
-    for text in ("torque_gain", "torque_gain@a|b", "torque_gain@shared", "clock_skew"):
+    for text in ("torque_gain", "torque_gain@a|b", "torque_gain@shared", "torque_gain@a|b@shared", "clock_skew"):
         assert EffectCfg.parse(text).label == text
     own = get_effect("test_effects:CableDrag")
     assert own.name == "cable_drag_of_test" and get_effect(own.name) is own
@@ -268,7 +268,10 @@ def test_an_effect_of_ones_own_acts():
         (lambda: get_effect("stribek_friction"), "no effect 'stribek_friction'. Did you mean 'stribeck_friction'?"),
         (lambda: get_effect("no_such_module:X"), "cannot be imported"),
         (lambda: get_effect("math:pi"), "is no effect"),
-        (lambda: EffectCfg.parse("torque_gain@"), "names no joints after '@'"),
+        (
+            lambda: EffectCfg.parse("torque_gain@"),
+            "'torque_gain@' is not understood. Write torque_gain, torque_gain@JOINTS",
+        ),
         (lambda: effect_cfgs(["torque_gain@a", "torque_gain@b"]), "named twice"),
         (lambda: Drive([EffectCfg(effect="torque_gain", values={"gane": 1.0})]), "no parameter 'gane'"),
         (lambda: Drive(["torque_gain"], {"torque_gain.gane": 1.0}), "no parameter 'gane'. Available: gain"),

@@ -34,17 +34,21 @@ class EffectCfg:
 
     @classmethod
     def parse(cls, text: str) -> EffectCfg:
-        """Read ``name``, ``name@joints`` (a regular expression) or ``name@shared`` (one value for all joints).
+        """Read ``name``, ``name@joints`` (a regular expression), ``name@shared`` or ``name@joints@shared`` (one value).
 
         Raises:
             ValueError: If there is no such effect.
         """
-        name, at, joints = text.partition("@")
+        name, *rest = text.split("@")
         effect = get_effect(name)
-        if at and not joints:
-            raise ValueError(f"{text!r} names no joints after '@'. Write {name}@JOINTS or {name}@{SHARED}.")
-        shared = effect.shared or joints == SHARED
-        return cls(effect=name, joint_names_expr=".*" if shared or not at else joints, shared=shared)
+        shared = rest[-1:] == [SHARED]
+        joints = rest[:-1] if shared else rest
+        if len(joints) > 1 or "" in joints:
+            raise ValueError(
+                f"{text!r} is not understood. Write {name}, {name}@JOINTS, {name}@{SHARED} or {name}@JOINTS@{SHARED}."
+            )
+        whole = effect.shared or not joints
+        return cls(effect=name, joint_names_expr=".*" if whole else joints[0], shared=shared or effect.shared)
 
     @property
     def effect_class(self) -> type[Effect]:
@@ -54,11 +58,10 @@ class EffectCfg:
     @property
     def label(self) -> str:
         """The text that :meth:`parse` reads."""
-        if self.shared:
-            return self.effect if self.effect_class.shared else f"{self.effect}@{SHARED}"
         expr = self.joint_names_expr
         text = expr if isinstance(expr, str) else "|".join(expr)
-        return self.effect if text == ".*" else f"{self.effect}@{text}"
+        joints = "" if text == ".*" else f"@{text}"
+        return self.effect + joints + (f"@{SHARED}" if self.shared and not self.effect_class.shared else "")
 
     def joints(self, joint_names: Sequence[str]) -> list[str]:
         """The joints that have it, in order; none if the expressions match none of these."""

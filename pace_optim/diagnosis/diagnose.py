@@ -20,6 +20,7 @@ from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
+from pace_optim.diagnosis.sharing import share
 from pace_optim.diagnosis.verdict import labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
@@ -144,6 +145,7 @@ def search_effects(
 
     follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
     outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)
+    share(outcome)
     decision, explained = verdict(outcome, data.floor)
     added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
     return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, added=added)

@@ -30,6 +30,8 @@ class JointModel:
     """Which entries have a logarithmic scale, (P,) bool."""
     barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
     """Effects that some joints cannot get, (n,) bool."""
+    shared: frozenset[type[Effect]] = frozenset()
+    """Effects with one value for all joints that have them, beside those that are so by their nature."""
 
     @classmethod
     def base(cls, problem: Problem) -> JointModel:
@@ -157,7 +159,7 @@ def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> di
         own = physical[:, model.columns(effect)]
         for k, parameter in enumerate(effect.parameters):
             key = f"{effect.name}.{parameter.name}"
-            if effect.shared:
+            if effect.shared or effect in model.shared:
                 values[key] = {"all": float(own[has][:, k].median())}
             else:
                 values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from pace_actuators.effects import Effect
+from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome, Trial
 
@@ -38,14 +38,17 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
 
 
 def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
-    """The effects found as ``fit.py --effects`` takes them: ``name`` or ``name@joints``."""
+    """The effects found as ``fit.py --effects`` takes them."""
     result = []
     for effect, has in zip(model.effects, model.has, strict=True):
         own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
-        if effect.shared or len(own) == len(joint_names):
-            result.append(effect.name)
-        else:
-            result.append(f"{effect.name}@{'|'.join(own)}")
+        everywhere = len(own) == len(joint_names)
+        cfg = EffectCfg(
+            effect=effect.name,
+            joint_names_expr=".*" if effect.shared or everywhere else own,
+            shared=effect.shared or effect in model.shared,
+        )
+        result.append(cfg.label)
     return result
 
 
