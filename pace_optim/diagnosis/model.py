@@ -94,6 +94,12 @@ class JointModel:
             log=torch.cat([self.log, torch.tensor([p.scale == "log" for p in effect.parameters])]),
         )
 
+    def without_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
+        """The same without an effect on some joints, (n,) bool; its entries stay."""
+        has = self.has.clone()
+        has[self.effects.index(effect)] &= ~joints
+        return replace(self, has=has)
+
     def extended(
         self, physical: torch.Tensor, effect: type[Effect], joints: torch.Tensor, values: torch.Tensor
     ) -> tuple[JointModel, torch.Tensor]:

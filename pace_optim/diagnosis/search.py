@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -22,10 +21,15 @@ WORST_JOINTS = 4
 """Joints whose own best candidates are refitted too."""
 PER_JOINT = 4
 """How many of them."""
+FROM_SCREENING = 2
+"""How many of the best screened go on in any case, where refits began with all effects."""
 FAR_FROM_FLOOR = 50.0
-"""An error that is this many times the floor is beyond what screening can judge: refits begin with all effects."""
+"""An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
+do for the first one."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
+SUPERFLUOUS = 1.05
+"""An older effect is dropped where the validation RMSE without it is no larger than this multiple."""
 NEXT_FLOOR = 1.3
 """Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 
@@ -113,8 +117,48 @@ def add_effects(
         now = _combined(problem, now, found)
         problem, now = follow(problem, now)
         errors = validation_errors(problem, [now])[0]
+        now, errors = pruned(problem, now, errors, found.chosen)
         outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
     return outcome
+
+
+def pruned(
+    problem: TwinProblem, now: Fitted, errors: BlockErrors, newest: Sequence[type[Effect] | None]
+) -> tuple[Fitted, BlockErrors]:
+    """Drop what the newest effects made superfluous: an older effect without which a joint's error is no larger.
+
+    Args:
+        problem: The joints simulated alone.
+        now: The present model.
+        errors: Its errors.
+        newest: Each joint's newest effect, which stays.
+    """
+    model, n = now.model, now.model.num_joints
+    latest = torch.tensor([e is not None for e in newest])
+    older = []
+    for effect, has in zip(model.effects, model.has, strict=True):
+        joints = has & latest & torch.tensor([e is not effect for e in newest])
+        if bool(joints.any()):
+            older.append((effect, joints))
+    if not older:
+        return now, errors
+    starts = [Fitted.start(model.without_effect(e, joints), model.to_physical(now.x), tried=e) for e, joints in older]
+    fitted = fit_coarse_to_fine(problem, starts)
+    dropped, x = model, now.x.clone()
+    after = validation_errors(problem, fitted)
+    for j in range(n):
+        without = [k for k, (_, joints) in enumerate(older) if bool(joints[j])]
+        if not without:
+            continue
+        best = min(without, key=lambda k: float(after[k].mse[j]))
+        if float(after[best].mse[j]) <= SUPERFLUOUS**2 * float(errors.mse[j]):
+            dropped = dropped.without_effect(older[best][0], torch.arange(n) == j)
+            x[j] = fitted[best].x[j]
+    if dropped is model:
+        return now, errors
+    left = Fitted.start(dropped, dropped.to_physical(x))
+    now = fit_side_by_side(problem, [left], max_iteration=4, keep_jacobian=True)[0]
+    return now, validation_errors(problem, [now])[0]
 
 
 def validation_errors(problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
@@ -141,18 +185,19 @@ def _try(
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
     excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
     listed = _short_list(_promising(probes, excess), excess)
-    far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
-    begin = list(dict.fromkeys([*listed, *(effects if far else ())]))
+    first = not now.model.effects
+    wide = first or bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
+    begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
     if not begin:
         return None
-    say(f"refitting with {', '.join(effect.name for effect in begin)}")
+    say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
     begun = _begun(problem, now, probes, begin)
-    if far:
-        listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:PER_JOINT]]))
+    if wide:
+        listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]]))
+    say(f"refitting with {_names(listed)}")
     fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed])
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
-    first = not now.model.effects
     tried = len(effects) * int(open_joints.sum())
     trials: list[list[Trial]] = [[] for _ in range(n)]
     keep: dict[type[Effect], Fitted] = {}
@@ -219,6 +264,10 @@ def _begun(
         better = each.score < best.score
         best.x[better], best.score[better] = each.x[better], each.score[better]
     return result
+
+
+def _names(effects: Sequence[type[Effect]]) -> str:
+    return ", ".join(effect.name for effect in effects)
 
 
 def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], torch.Tensor]:

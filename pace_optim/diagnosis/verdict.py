@@ -59,7 +59,13 @@ def ranking(outcome: Outcome, joint_names: Sequence[str]) -> list[dict[str, Any]
         effects = dict.fromkeys(t.effect for own in this.trials for t in own)
         for effect in effects:
             own = [t for trials in this.trials for t in trials if t.effect is effect]
-            added = [j for j, chosen in enumerate(this.chosen) if chosen is effect]
+            final = outcome.final.model
+            kept = (
+                final.has[final.effects.index(effect)].tolist()
+                if effect in final.effects
+                else [False] * final.has.shape[1]
+            )
+            added = [j for j, chosen in enumerate(this.chosen) if chosen is effect and kept[j]]
             good = [t for t in own if t.significant]
             shown = [t for t in own if t.joint in added] or good or own
             confounded = sorted(
