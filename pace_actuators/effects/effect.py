@@ -83,6 +83,8 @@ class Effect:
     """Where the equation comes from."""
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
+    structural: ClassVar[str] = ""
+    """Parameter of which every probed value starts a fit of its own: no descent leads from one to the other."""
     two_sided: ClassVar[bool] = True
     """Whether it can also act with the opposite sign of its probes."""
     shared: ClassVar[bool] = False

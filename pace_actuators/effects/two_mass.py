@@ -45,6 +45,7 @@ class _TwoMass(Effect):
 
     stage = "transmission"
     is_stiff = True
+    structural = "encoder_side"
     two_sided = False
     parts_motor_and_link = True
     reads_load = True

@@ -18,10 +18,10 @@ from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.screening import absorbed_effects
-from pace_optim.diagnosis.search import Outcome, add_effects
+from pace_optim.diagnosis.search import Outcome, add_effects, keep_on
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.verdict import labels, ranking, verdict
+from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
@@ -71,7 +71,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
     ).with_effects(())
     base = {name: result.parameters[name] for name in problem.space.slices}
     found = search_effects(problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say)
-    runs, ladder = [str(folder)], _ladder(found)
+    runs, ladder = [str(folder)], _ladder(found, problem.joint_names)
     if settings.refit and found.added:
         progress.say(f"fitting the whole robot with {', '.join(found.added)}")
         final = found.outcome.final
@@ -147,6 +147,8 @@ def search_effects(
     outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)
     share(outcome)
     decision, explained = verdict(outcome, data.floor)
+    if decision == "effect":
+        keep_on(outcome, explained_joints(outcome, data.floor))
     added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
     return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, added=added)
 
@@ -162,25 +164,28 @@ def summary_of(found: Findings, problem: Problem) -> str:
             f"floor of noise and numerics {floor:.3g} mrad."
         )
     if found.verdict == "unknown":
+        paying = labels(found.outcome.final.model, problem.joint_names)
+        shares = f"what pays, {', '.join(paying)}, explains" if paying else "the effects tried explain"
         return (
             f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
-            f"mrad, the floor {floor:.3g} mrad, and the effects tried explain {100 * max(0.0, found.explained):.0f} % "
-            "of what lies between."
+            f"mrad, the floor {floor:.3g} mrad, and {shares} {100 * max(0.0, found.explained):.0f} % of what lies "
+            "between."
         )
-    return (
+    summary = (
         f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
+    if after > UNKNOWN_RATIO * floor:
+        summary += " Something else is missing too, which no known effect explains."
+    return summary
 
 
-def _ladder(found: Findings) -> list[dict]:
+def _ladder(found: Findings, names: Sequence[str]) -> list[dict]:
     outcome = found.outcome
-    steps = [{"model": "base model", "validation_rmse": float(outcome.base_errors.mse.mean().sqrt())}]
-    if found.added:
-        steps.append(
-            {"model": " + ".join(found.added), "validation_rmse": float(outcome.final_errors.mse.mean().sqrt())}
-        )
-    return steps
+    steps = [("base model", outcome.base_errors)]
+    if paying := labels(outcome.final.model, names):
+        steps.append((" + ".join(paying), outcome.final_errors))
+    return [{"model": model, "validation_rmse": float(errors.mse.mean().sqrt())} for model, errors in steps]
 
 
 def _joints(found: Findings, problem: Problem) -> dict[str, dict]:

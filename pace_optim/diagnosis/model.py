@@ -162,6 +162,8 @@ def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> di
             {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
         )
     for effect, has in zip(model.effects, model.has, strict=True):
+        if not bool(has.any()):
+            continue
         own = physical[:, model.columns(effect)]
         for k, parameter in enumerate(effect.parameters):
             key = f"{effect.name}.{parameter.name}"

@@ -162,6 +162,21 @@ def pruned(
     return now, validation_errors(problem, [now])[0]
 
 
+def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
+    """Go back to the base model on all joints but these, (n,) bool."""
+    model, base = outcome.final.model, outcome.base
+    others = ~joints & model.has.any(dim=0)
+    if not bool(others.any()):
+        return
+    for effect in model.effects:
+        model = model.without_effect(effect, others)
+    x, errors = outcome.final.x.clone(), outcome.final_errors
+    x[others, : base.model.size] = base.x[others]
+    square = torch.where(others, outcome.base_errors.square, errors.square)
+    outcome.final = replace(outcome.final, model=model, x=x)
+    outcome.final_errors = replace(errors, square=square)
+
+
 def validation_errors(problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
     """Errors of fitted models on the recordings that were not trained on."""
     slots = [Slot(model=m.model, rows=1) for m in models]
@@ -252,19 +267,33 @@ def _begun(
 ) -> dict[type[Effect] | None, Fitted]:
     """The present model with each effect after a few coarse steps, and without any (None).
 
-    Each effect starts at every joint's best two probes; the better one goes on, joint by joint.
+    Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
+    goes on, joint by joint.
     """
     starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
     for effect in effects:
         own = [probe for probe in probes if probe.effect is effect]
-        ranked = [sorted(own, key=lambda p: -float(p.score[j])) for j in range(now.model.num_joints)]
-        starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(min(2, len(own)))]
+        ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
+        starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(len(ranked[0]))]
     result: dict[type[Effect] | None, Fitted] = {}
     for each in fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, max_iteration=4, part=0.4):
         best = result.setdefault(each.tried, each)
         better = each.score < best.score
         best.x[better], best.score[better] = each.x[better], each.score[better]
     return result
+
+
+def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
+    """A joint's best two probes of an effect, or the best of each structure."""
+    ranked = sorted(probes, key=lambda probe: -float(probe.score[joint]))
+    structural = probes[0].effect.structural
+    if not structural:
+        return ranked[:2]
+    place = [parameter.name for parameter in probes[0].effect.parameters].index(structural)
+    best: dict[float, Probe] = {}
+    for probe in ranked:
+        best.setdefault(float(probe.values[joint, place]), probe)
+    return list(best.values())
 
 
 def _names(effects: Sequence[type[Effect]]) -> str:

@@ -16,6 +16,8 @@ UNKNOWN_RATIO = 3.0
 """An unexplained error above this many times the floor is a finding of its own."""
 EXPLAINED = 0.5
 """Less than this part of the error above the floor, and the effects found are not what is missing."""
+SHARE = 0.2
+"""Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
 
 
 def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
@@ -25,16 +27,32 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
     """
-    before, after = outcome.base_errors.mse, outcome.final_errors.mse
-    excess = (before - floor**2).clamp(min=0.0)
-    left = (after - floor**2).clamp(min=0.0)
+    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
     explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
-    worst = float((after.sqrt() / floor).max())
-    if outcome.final.model.effects and (explained >= EXPLAINED or worst <= UNKNOWN_RATIO):
-        return "effect", explained
-    if worst > UNKNOWN_RATIO:
+    if bool(outcome.final.model.has.any()):
+        good = explained_joints(outcome, floor)
+        if float(excess[good].sum()) >= SHARE * float(excess.sum()):
+            return "effect", explained
+    if float((outcome.final_errors.mse.sqrt() / floor).max()) > UNKNOWN_RATIO:
         return "unknown", explained
     return "nothing_missing", explained
+
+
+def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints on which the effects found are what is missing, (n,) bool.
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    after = outcome.final_errors.mse
+    excess, left = _above(outcome.base_errors.mse, floor), _above(after, floor)
+    near = after.sqrt() <= UNKNOWN_RATIO * floor
+    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) | near)
+
+
+def _above(mse: torch.Tensor, floor: torch.Tensor) -> torch.Tensor:
+    return (mse - floor**2).clamp(min=0.0)
 
 
 def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
@@ -42,6 +60,8 @@ def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
     result = []
     for effect, has in zip(model.effects, model.has, strict=True):
         own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
+        if not own:
+            continue
         everywhere = len(own) == len(joint_names)
         cfg = EffectCfg(
             effect=effect.name,
