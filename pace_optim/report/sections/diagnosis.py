@@ -134,7 +134,7 @@ def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> str:
             ]
         )
     head = ["effect", "", f"validation [{unit}]", "joints", "cannot be told from", "evidence"]
-    return table(head, rows, "recordings")
+    return table(head, rows, "evidence")
 
 
 def _few(names: list[str]) -> str:
