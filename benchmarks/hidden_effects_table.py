@@ -125,7 +125,7 @@ def _errors(lines: Sequence[Line], groups: Sequence[str]) -> str:
 
 
 def _times(lines: Sequence[Line]) -> str:
-    parts = ("recordings", "base_fit", "diagnosis", "true_fit")
+    parts = ("recordings", "diagnosis", "true_fit")
     return "seconds a case, medians: " + ", ".join(
         f"{part} {_median([line['seconds'][part] for line in lines])}" for part in parts
     )

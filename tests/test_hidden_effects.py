@@ -27,7 +27,7 @@ def line(group, effects, verdict, added=(), confounded=(), seed=0):
         "ranking": ranking,
         "size": 1e-3,
         "rmse": {"before": 1e-3, "after": 1.1e-4, "truth": 1e-4 if effects else None},
-        "seconds": {"recordings": 1.0, "base_fit": 2.0, "diagnosis": 3.0, "true_fit": 4.0},
+        "seconds": {"recordings": 1.0, "diagnosis": 3.0, "true_fit": 4.0},
     }
 
 
