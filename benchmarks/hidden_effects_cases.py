@@ -19,7 +19,7 @@ from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
 from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.own_motion import OwnMotion
-from pace_optim.diagnosis.search import validation_errors
+from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.diagnosis.verdict import ranking
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.plant import Case, library_effects, outside_effects, write_case

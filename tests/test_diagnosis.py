@@ -13,20 +13,20 @@ import torch
 from problems import BENCH, CALM, DT, chirp, env_cfg, make_problem, physical, record
 from run_folders import make_result
 
-from pace_actuators.effects import get_effect
+from pace_actuators.effects import get_effect, probe_points
 from pace_envs import set_physics_dt
 from pace_optim.atomic import write_json
-from pace_optim.diagnosis import candidate_effects, sharing
+from pace_optim.diagnosis import candidate_effects, pruning, sharing
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
-from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
-from pace_optim.diagnosis.screening import _FOLDS, _explained, absorbed_effects
-from pace_optim.diagnosis.search import Outcome, Round, Trial
+from pace_optim.diagnosis.screening import _FOLDS, Probe, _explained, absorbed_effects
+from pace_optim.diagnosis.search import Outcome, Round, Trial, _ranked
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
-from pace_optim.diagnosis.verdict import labels, ranking, verdict
+from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
 from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem import load_problem
@@ -275,6 +275,45 @@ def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
             assert bool(outcome.final.model.free.all())
         else:
             assert values == pytest.approx(found)
+
+
+def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench, monkeypatch):
+    base = JointModel.base(bench.problem)
+    values, yes = bench.truth_values, torch.tensor([True])
+    for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1])):
+        base, values = base.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
+    now, weights = Fitted.start(base, values), torch.ones(1).double()
+    before = BlockErrors(square=torch.tensor([[1e-8]]).double(), weight=weights)
+    for cost, kept in ((1.05, [False, True]), (1.3, [True, True])):
+        after = BlockErrors(square=cost * before.square, weight=weights)
+        for name in ("fit_coarse_to_fine", "fit_side_by_side"):
+            monkeypatch.setattr(pruning, name, lambda _, starts, **kwargs: starts)
+        monkeypatch.setattr(pruning, "validation_errors", lambda *_, after=after: [after])
+        left, _ = pruning.pruned(bench.twins, now, before, [QUADRATIC])
+        assert left.model.has[:, 0].tolist() == kept
+        assert labels(left.model, ["servo"]) == [e.name for e, k in zip((STRIBECK, QUADRATIC), kept, strict=True) if k]
+        assert ("stribeck_friction.effort" in whole_values(left.model, left.x, ["servo"])) is kept[0]
+
+
+def test_the_effects_of_joints_that_they_do_not_explain_are_not_kept():
+    outcome = outcome_of([1.0, 1.0, 1.0], [0.1, 0.9, 1.0], [STRIBECK], [[True, True, False]])
+    floor = torch.full((3,), 0.05, dtype=torch.float64)
+    assert verdict(outcome, floor)[0] == "effect"
+    assert explained_joints(outcome, floor).tolist() == [True, False, False]
+    assert verdict(outcome_of([0.1, 1.0], [0.06, 1.0], [STRIBECK], [[True, False]]), floor[:2])[0] == "unknown"
+
+
+def test_every_structure_that_an_effect_can_have_starts_a_fit():
+    elasticity = get_effect("joint_elasticity")
+    probes = [
+        Probe(effect=effect, values=start_values(effect, point)[None], score=torch.tensor([score]), size=torch.ones(1))
+        for effect in (elasticity, STRIBECK)
+        for score, point in enumerate(probe_points(effect))
+    ]
+    sides = [float(p.values[0, 2]) for p in _ranked([p for p in probes if p.effect is elasticity], 0)]
+    assert sorted(sides) == [0.0, 1.0]
+    own = [p for p in probes if p.effect is STRIBECK]
+    assert [float(p.score) for p in _ranked(own, 0)] == [len(own) - 1, len(own) - 2]
 
 
 def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):

@@ -18,10 +18,10 @@ from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.screening import absorbed_effects
-from pace_optim.diagnosis.search import Outcome, add_effects, keep_on
+from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, labels, ranking, verdict
+from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings

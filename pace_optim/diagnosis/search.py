@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
+from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
 SCREEN_THRESHOLD = 0.03
@@ -29,8 +30,6 @@ FAR_FROM_FLOOR = 50.0
 do for the first one."""
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
-SUPERFLUOUS = 1.05
-"""An older effect is dropped where the validation RMSE without it is no larger than this multiple."""
 NEXT_FLOOR = 1.3
 """Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 
@@ -121,71 +120,6 @@ def add_effects(
         now, errors = pruned(problem, now, errors, found.chosen)
         outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
     return outcome
-
-
-def pruned(
-    problem: TwinProblem, now: Fitted, errors: BlockErrors, newest: Sequence[type[Effect] | None]
-) -> tuple[Fitted, BlockErrors]:
-    """Drop what the newest effects made superfluous: an older effect without which a joint's error is no larger.
-
-    Args:
-        problem: The joints simulated alone.
-        now: The present model.
-        errors: Its errors.
-        newest: Each joint's newest effect, which stays.
-    """
-    model, n = now.model, now.model.num_joints
-    latest = torch.tensor([e is not None for e in newest])
-    older = []
-    for effect, has in zip(model.effects, model.has, strict=True):
-        joints = has & latest & torch.tensor([e is not effect for e in newest])
-        if bool(joints.any()):
-            older.append((effect, joints))
-    if not older:
-        return now, errors
-    starts = [Fitted.start(model.without_effect(e, joints), model.to_physical(now.x), tried=e) for e, joints in older]
-    fitted = fit_coarse_to_fine(problem, starts)
-    dropped, x = model, now.x.clone()
-    after = validation_errors(problem, fitted)
-    for j in range(n):
-        without = [k for k, (_, joints) in enumerate(older) if bool(joints[j])]
-        if not without:
-            continue
-        best = min(without, key=lambda k: float(after[k].mse[j]))
-        if float(after[best].mse[j]) <= SUPERFLUOUS**2 * float(errors.mse[j]):
-            dropped = dropped.without_effect(older[best][0], torch.arange(n) == j)
-            x[j] = fitted[best].x[j]
-    if dropped is model:
-        return now, errors
-    left = Fitted.start(dropped, dropped.to_physical(x))
-    now = fit_side_by_side(problem, [left], max_iteration=4, keep_jacobian=True)[0]
-    return now, validation_errors(problem, [now])[0]
-
-
-def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
-    """Go back to the base model on all joints but these, (n,) bool."""
-    model, base = outcome.final.model, outcome.base
-    others = ~joints & model.has.any(dim=0)
-    if not bool(others.any()):
-        return
-    for effect in model.effects:
-        model = model.without_effect(effect, others)
-    x, errors = outcome.final.x.clone(), outcome.final_errors
-    x[others, : base.model.size] = base.x[others]
-    square = torch.where(others, outcome.base_errors.square, errors.square)
-    outcome.final = replace(outcome.final, model=model, x=x)
-    outcome.final_errors = replace(errors, square=square)
-
-
-def validation_errors(problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
-    """Errors of fitted models on the recordings that were not trained on."""
-    slots = [Slot(model=m.model, rows=1) for m in models]
-    batch = SideBySide(problem, slots, training=False)
-    where = batch.dataset.validation
-    every = torch.zeros_like(where)
-    every[: batch.dataset.last_step(where)] = True
-    errors = batch.simulate([m.model.to_physical(m.x)[None] for m in models], every)
-    return [block_errors(error, where[: errors.shape[1]], problem.control_dt) for error in errors]
 
 
 def _try(

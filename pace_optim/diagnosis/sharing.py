@@ -9,7 +9,8 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
-from pace_optim.diagnosis.search import Outcome, validation_errors
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.validation import validation_errors
 
 _COST = 1.05
 """Squared validation error, as a multiple of that with a value for each joint, that one value for all may cost."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -53,6 +54,21 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
 
 def _above(mse: torch.Tensor, floor: torch.Tensor) -> torch.Tensor:
     return (mse - floor**2).clamp(min=0.0)
+
+
+def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
+    """Go back to the base model on all joints but these, (n,) bool."""
+    model, base = outcome.final.model, outcome.base
+    others = ~joints & model.has.any(dim=0)
+    if not bool(others.any()):
+        return
+    for effect in model.effects:
+        model = model.without_effect(effect, others)
+    x, errors = outcome.final.x.clone(), outcome.final_errors
+    x[others, : base.model.size] = base.x[others]
+    square = torch.where(others, outcome.base_errors.square, errors.square)
+    outcome.final = replace(outcome.final, model=model, x=x)
+    outcome.final_errors = replace(errors, square=square)
 
 
 def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
