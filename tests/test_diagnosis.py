@@ -21,6 +21,7 @@ from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
+from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
 from pace_optim.diagnosis.screening import _FOLDS, Probe, _explained, absorbed_effects
@@ -301,6 +302,20 @@ def test_the_effects_of_joints_that_they_do_not_explain_are_not_kept():
     assert verdict(outcome, floor)[0] == "effect"
     assert explained_joints(outcome, floor).tolist() == [True, False, False]
     assert verdict(outcome_of([0.1, 1.0], [0.06, 1.0], [STRIBECK], [[True, False]]), floor[:2])[0] == "unknown"
+
+
+def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):
+    heavy = bench.truth_values.clone()
+    model = JointModel.base(bench.problem)
+    heavy[:, BASE.index("armature")] = model.upper[:, BASE.index("armature")]
+    coarse, now = bench.twins.with_physics_dt(DT), Fitted.start(model, heavy)
+    starts = far_starts(coarse, now, [STRIBECK, get_effect("joint_elasticity")])
+    assert [start.tried.name for start in starts] == ["stribeck_friction", "joint_elasticity"]
+    slots = [Slot(model=model, rows=1), *(Slot(model=start.model, rows=1) for start in starts)]
+    batch = SideBySide(coarse, slots, training=True)
+    rows = [heavy[None], *(start.model.to_physical(start.x)[None] for start in starts)]
+    errors = batch.simulate(rows, batch.dataset.train).square().mean(dim=(1, 2, 3)).sqrt()
+    assert float(errors[1]) < 0.7 * float(errors[0]) and float(errors[2]) < 0.7 * float(errors[0])
 
 
 def test_every_structure_that_an_effect_can_have_starts_a_fit():

@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.validation import validation_errors
@@ -136,12 +137,13 @@ def _try(
     excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
     listed = _short_list(_promising(probes, excess), excess)
     first = not now.model.effects
-    wide = first or bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
+    far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
+    wide = first or far
     begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
     if not begin:
         return None
     say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
-    begun = _begun(problem, now, probes, begin)
+    begun = _begun(problem, now, probes, begin, far)
     if wide:
         listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]]))
     say(f"refitting with {_names(listed)}")
@@ -197,24 +199,33 @@ def _short_list(explained: Mapping[type[Effect], torch.Tensor], excess: torch.Te
 
 
 def _begun(
-    problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]]
+    problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
 ) -> dict[type[Effect] | None, Fitted]:
     """The present model with each effect after a few coarse steps, and without any (None).
 
     Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
-    goes on, joint by joint.
+    goes on, joint by joint. Far from the floor the best of many points is another start.
     """
+    coarse = problem.with_physics_dt(problem.control_dt)
     starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
     for effect in effects:
         own = [probe for probe in probes if probe.effect is effect]
         ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
         starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(len(ranked[0]))]
+    if far:
+        starts = _neighbours_together([*starts, *far_starts(coarse, now, effects)])
     result: dict[type[Effect] | None, Fitted] = {}
-    for each in fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, max_iteration=4, part=0.4):
+    for each in fit_side_by_side(coarse, starts, max_iteration=4, part=0.4):
         best = result.setdefault(each.tried, each)
         better = each.score < best.score
         best.x[better], best.score[better] = each.x[better], each.score[better]
     return result
+
+
+def _neighbours_together(starts: Sequence[Fitted]) -> list[Fitted]:
+    """Starts of the same effect one after another: one effect then acts for all of them."""
+    order = list(dict.fromkeys(start.tried for start in starts))
+    return sorted(starts, key=lambda start: order.index(start.tried))
 
 
 def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
