@@ -16,7 +16,7 @@ from run_folders import make_result
 from pace_actuators.effects import get_effect, probe_points
 from pace_envs import set_physics_dt
 from pace_optim.atomic import write_json
-from pace_optim.diagnosis import candidate_effects, pruning, sharing
+from pace_optim.diagnosis import candidate_effects, pruning, search, sharing
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
@@ -316,6 +316,17 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     rows = [heavy[None], *(start.model.to_physical(start.x)[None] for start in starts)]
     errors = batch.simulate(rows, batch.dataset.train).square().mean(dim=(1, 2, 3)).sqrt()
     assert float(errors[1]) < 0.7 * float(errors[0]) and float(errors[2]) < 0.7 * float(errors[0])
+
+
+def test_a_search_ends_where_no_effect_gains_anything(bench, monkeypatch):
+    model = JointModel.base(bench.problem)
+    base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
+    same = torch.ones(1, dtype=torch.float64)
+    begun = {None: SimpleNamespace(score=same), STRIBECK: SimpleNamespace(score=2 * same)}
+    monkeypatch.setattr(search, "_begun", lambda *_: begun)
+    monkeypatch.setattr(search, "_promising", lambda *_: {STRIBECK: 0 * same})
+    outcome = search.add_effects(bench.twins, base, [STRIBECK], 5 * same, 1e-9 * same, 2)
+    assert outcome.rounds == [] and outcome.final is base
 
 
 def test_every_structure_that_an_effect_can_have_starts_a_fit():

@@ -146,6 +146,8 @@ def _try(
     begun = _begun(problem, now, probes, begin, far)
     if wide:
         listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]]))
+    if not listed:  # no effect does better than the base parameters alone
+        return None
     say(f"refitting with {_names(listed)}")
     fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed])
     blocks = validation_errors(problem, fitted)
