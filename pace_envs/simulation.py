@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -50,10 +51,15 @@ class SimulationCfg:
     """Whether geoms collide."""
 
     num_threads: int = 0
-    """Threads of the physics; 0 means one per processor. Results do not depend on it."""
+    """Threads of the physics; 0 means one per processor that the process may use. Results do not depend on it."""
 
     class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None
     """What builds the simulation; ``None`` means :class:`Simulation`."""
+
+
+def available_processors() -> int:
+    """How many processors this process may use: fewer than there are where it is pinned to some."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Simulation:
@@ -90,7 +96,7 @@ class Simulation:
         self.model = self._compile(spec)
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(_ignore_warning)
-        self.batch = batch.Batch(self.model, num_envs, nthread=cfg.num_threads)
+        self.batch = batch.Batch(self.model, num_envs, nthread=cfg.num_threads or available_processors())
         self.qpos = self.bind("qpos")
         self.qvel = self.bind("qvel")
         self.qfrc_applied = self.bind("qfrc_applied")

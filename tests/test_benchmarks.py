@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,16 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import drive_problem
 import identification
 import sysid_peer
+import transfer
+import transfer_robot
+import transfer_table
 from mujoco import sysid
 from solver_trace import Trace, table
 
+from pace_actuators import ActuatorActions, PaceDCMotor
+from pace_actuators.effects import EffectCfg
+from pace_envs import load_env_cfg
+from pace_optim.plant import plant_robot
 from pace_optim.problem import load_problem
 
 needs_peer = pytest.mark.skipif(not hasattr(sysid, "optimize"), reason="the extra `benchmark` is not installed")
@@ -106,3 +114,43 @@ def test_physics_is_timed_only_inside_the_context(case):
     once = spent[0]
     case.problem.evaluator().residuals(case.truth[None])
     assert spent[0] == once > 0
+
+
+def test_the_real_robots_drive_is_the_torque_law_in_other_code():
+    cfg, robot, truth = load_env_cfg(transfer.TASK), plant_robot(transfer.ROBOT), transfer.truth_of(0)
+    transfer_robot.make_real(cfg, robot, truth)
+    assert round(1 / (cfg.sim.dt * cfg.decimation)) == 50 and cfg.sim.dt == transfer_robot.PHYSICS_DT
+    drive = cfg.scene.robot.actuators["legs"]
+    assert drive.control_decimation * cfg.sim.dt == pytest.approx(robot.control_dt)
+    build = {"num_envs": 3, "physics_dt": cfg.sim.dt, "dtype": torch.float64}
+    real = drive.class_type(drive, robot.joint_names, slice(None), **build)
+    gain = EffectCfg(effect="torque_gain", values={"gain": truth.effects["torque_gain"]["gain"]})
+    model_cfg = replace(drive, class_type=None, delay_s=truth.base.delay, effects=[gain])
+    model = PaceDCMotor(model_cfg, robot.joint_names, slice(None), **build)
+    draw = torch.Generator().manual_seed(0)
+
+    def normal(size: float) -> torch.Tensor:
+        return size * torch.randn(3, robot.num_joints, generator=draw, dtype=torch.float64)
+
+    for step in range(200):
+        if step % drive.control_decimation == 0:
+            target = normal(0.5)
+        if step == 100:
+            real.reset(torch.tensor([1]))
+            model.reset(torch.tensor([1]))
+        q, v = normal(0.3), normal(5.0)
+        torques = [each.compute(ActuatorActions(joint_positions=target), q, v).joint_efforts for each in (real, model)]
+        assert torch.allclose(*torques, atol=1e-6)
+    assert float(torques[0].abs().max()) > 50.0
+
+
+def test_the_transfer_table_has_both_worlds_and_their_gap(tmp_path):
+    world = {"velocity_error": 0.2, "falls_per_episode": 0.01, "cost_of_transport": 0.5}
+    lines = [
+        {"policy": "a nominal", "seed": s, "own": world, "real": world | {"velocity_error": 0.3 + 0.1 * s}}
+        for s in range(2)
+    ]
+    table = transfer_table.make_table(lines)
+    assert "| a nominal | 2 | 0.200 (0.200 to 0.200), 0.350 (0.300 to 0.400), 0.150 | 1.0 (" in table
+    transfer_table.plot_transfer(lines, tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").stat().st_size > 5000

@@ -24,6 +24,7 @@ from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
+from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.screening import _FOLDS, Probe, _explained, absorbed_effects
 from pace_optim.diagnosis.search import Outcome, Round, Trial, _ranked
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
@@ -316,6 +317,35 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     rows = [heavy[None], *(start.model.to_physical(start.x)[None] for start in starts)]
     errors = batch.simulate(rows, batch.dataset.train).square().mean(dim=(1, 2, 3)).sqrt()
     assert float(errors[1]) < 0.7 * float(errors[0]) and float(errors[2]) < 0.7 * float(errors[0])
+
+
+@pytest.mark.parametrize(("name", "value"), [("payload", 0.3), ("stribeck_friction", 1.0)])
+def test_joints_along_the_motion_of_a_robot_with_an_effect_move_as_it_does(bench, name, value):
+    effect = get_effect(name)
+    own = start_values(effect, {effect.parameters[0].name: value})[None]
+    model, physical = JointModel.base(bench.problem).extended(bench.truth_values, effect, torch.tensor([True]), own)
+    whole = bench.problem.with_effects([name])
+    names = bench.problem.joint_names
+    values = whole.space.from_dict(whole_values(model, model.to_normalised(physical), names))
+    path = reference_path(whole, values, [name] if effect.overrides("write_model") else [])
+    batch = SideBySide(twin_problem(bench.problem, path), [Slot(model=model, rows=1)], training=False)
+    moved = batch.simulate([physical[None]], torch.ones_like(batch.dataset.train))[0]
+    expected = path.position - CALM["encoder_bias"] - batch.dataset.measured
+    assert float((moved - expected).abs().max()) < 5e-4
+    assert float((path.position - bench.twins.path.position).abs().max()) > 3e-3  # the effect is seen
+
+
+def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
+    heavy = bench.truth.clone()
+    heavy[bench.problem.space["armature"]] *= 3
+    elsewhere = twin_problem(bench.problem, reference_path(bench.problem, heavy))
+    now = Fitted.start(JointModel.base(bench.problem), bench.truth_values)
+    follow = OwnMotion(problem=bench.problem, candidates=[]).follow
+    along, fitted = follow(elsewhere, now)
+    assert float((along.path.position - bench.twins.path.position).abs().max()) < 1e-9
+    assert float(fitted.score.sqrt()) < 1e-4 and fitted.jacobian is not None
+    again, same = follow(along, fitted)
+    assert again is along and same is fitted  # it has not moved
 
 
 def test_a_search_ends_where_no_effect_gains_anything(bench, monkeypatch):

@@ -111,6 +111,16 @@ def test_the_controllers_speed_is_filtered():
         assert drive.one(v=1.0) == pytest.approx(math.expm1(-k * DT / 0.01))
 
 
+def test_the_targets_rate_is_limited_before_it_is_delayed():
+    targets, limit, delay = [0.0, 0.0, 0.31, 0.31, 0.31, -0.2, -0.2, -0.2], 40.0, 1.3
+    drive = Drive(["command_rate_limit"], {"command_rate_limit.velocity": limit}, delay=delay)
+    inside = [targets[0]]
+    for target in targets[1:]:
+        inside.append(inside[-1] + max(-limit * DT, min(limit * DT, target - inside[-1])))
+    late = [0.7 * inside[max(k - 1, 0)] + 0.3 * inside[max(k - 2, 0)] for k in range(len(inside))]
+    assert [drive.one(target) / 100.0 for target in targets] == pytest.approx(late)
+
+
 def test_friction_laws():
     drive = Drive(["stribeck_friction"], {"stribeck_friction.effort": 1.5, "stribeck_friction.velocity": 0.2})
     for v in (0.0, 0.1, -0.2, 3.0):

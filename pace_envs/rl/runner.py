@@ -12,6 +12,7 @@ from rsl_rl.runners import OnPolicyRunner
 
 from pace_envs.mdp import UniformVelocityCommand
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+from pace_envs.simulation import available_processors
 
 _MOST_THREADS = 8  # for networks this small
 
@@ -33,7 +34,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         """Build the networks; ``learning_threads`` defaults to the number of processors, up to 8."""
         super().__init__(env, train_cfg, log_dir, device=str(env.device))
         self.logger.git_status_repos.clear()  # no copy of somebody's uncommitted work in every run
-        self.learning_threads = learning_threads or min(os.cpu_count() or 1, _MOST_THREADS)
+        self.learning_threads = learning_threads or min(available_processors(), _MOST_THREADS)
         self.alg.update = _with_threads(self.alg.update, self.learning_threads)
 
     def save(self, path: str, infos: dict | None = None) -> None:

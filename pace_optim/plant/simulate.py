@@ -150,14 +150,14 @@ class _Session:
             for effect in stages["command"]:
                 target = effect.command(target, dt)
             targets[k] = target
-            error = _delayed(targets, k, drives.command_delay / dt) - reading
+            error = delayed(targets, k, drives.command_delay / dt) - reading
             for effect in stages["speed_feedback"]:
                 rate = effect.speed_feedback(rate, dt)
             torque = drives.stiffness * error - drives.damping * rate
             for effect in stages["controller"]:
                 torque = effect.controller(torque, error, dt)
             torques[k] = torque
-            torque = _delayed(torques, k, drives.effort_delay / dt)
+            torque = delayed(torques, k, drives.effort_delay / dt)
             for _ in range(substeps):
                 dynamics.step(torque, h)
             applied[k] = dynamics.state.torque
@@ -275,7 +275,7 @@ class _Session:
             )
 
 
-def _delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
+def delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
     """History at instant k - delay [control steps], linear between instants; the first value before the start."""
     if not delay.any():
         return history[k]
