@@ -5,39 +5,22 @@ from __future__ import annotations
 import dataclasses
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.drive_parameters import DriveParameters
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.identified import delay_in_steps, step_notes
-from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
 
 _INVERSION_STEPS = 6
 """Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
-
-_NOT_NEGATIVE = (lambda x: (x >= 0) & x.isfinite(), "a finite number >= 0")
-_DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
-    "stiffness": _NOT_NEGATIVE,
-    "damping": _NOT_NEGATIVE,
-    "armature": _NOT_NEGATIVE,
-    "friction": _NOT_NEGATIVE,
-    "viscous_friction": _NOT_NEGATIVE,
-    "saturation_effort": (
-        lambda x: (x >= 0) & x.isfinite(),
-        "a finite number >= 0, or None for no torque-speed curve",
-    ),
-    "effort_limit": (lambda x: x >= 0, "a number >= 0, or inf"),
-    "velocity_limit": (lambda x: x > 0, "a number > 0, or inf"),
-    "encoder_bias": (torch.isfinite, "a finite number"),
-}
-"""Which values a field of the configuration may have, and how to say so."""
 
 
 class PaceDCMotor:
@@ -127,29 +110,29 @@ class PaceDCMotor:
         self._num_envs = num_envs
         self._device = torch.device(device)
         self._dtype = dtype
-        self._check_choices()
+        parameters = DriveParameters(cfg, joint_names, num_envs, self._device, dtype)
 
-        self.stiffness = self._parameter("stiffness", stiffness)
-        self.damping = self._parameter("damping", damping)
-        self.armature = self._parameter("armature", armature)
-        self.friction = self._parameter("friction", friction)
+        self.stiffness = parameters.read("stiffness", stiffness)
+        self.damping = parameters.read("damping", damping)
+        self.armature = parameters.read("armature", armature)
+        self.friction = parameters.read("friction", friction)
         self.dynamic_friction = (
             self.friction.clone()
             if dynamic_friction is None or cfg.friction is not None
-            else self._tensor(dynamic_friction, "dynamic_friction")
+            else parameters.tensor(dynamic_friction, "dynamic_friction")
         )
-        self.viscous_friction = self._parameter("viscous_friction", viscous_friction)
-        self.effort_limit = self._parameter("effort_limit", effort_limit)
+        self.viscous_friction = parameters.read("viscous_friction", viscous_friction)
+        self.effort_limit = parameters.read("effort_limit", effort_limit)
         self.effort_limit_sim = self.effort_limit.clone()
-        self.velocity_limit = self._parameter("velocity_limit", velocity_limit)
+        self.velocity_limit = parameters.read("velocity_limit", velocity_limit)
         self.velocity_limit_sim = self.velocity_limit.clone()
         if cfg.saturation_effort is None:
             # no torque-speed curve was asked for: a (finite) stall torque at the limit and no fall with speed
             self.saturation_effort = self.effort_limit.clamp(max=torch.finfo(dtype).max)
             self.velocity_limit = torch.full_like(self.velocity_limit, torch.inf)
         else:
-            self.saturation_effort = self._parameter("saturation_effort", torch.inf)
-        self.encoder_bias = self._parameter("encoder_bias", 0.0)
+            self.saturation_effort = parameters.read("saturation_effort", torch.inf)
+        self.encoder_bias = parameters.read("encoder_bias", 0.0)
         self.torque_enable: torch.Tensor | None = None
         self.holds_line = False
         self.centred = False
@@ -205,7 +188,7 @@ class PaceDCMotor:
             A copy of ``control_action`` whose ``joint_efforts`` are the torques at the joints [N m].
         """
         if self.effects is not None:
-            self._begin_step(joint_pos, joint_vel)
+            self.effects.begin_step(joint_pos, joint_vel)
         asked = self.computed_effort
         if self._calls_until_control == 0:
             before, first = asked, self._first_call
@@ -218,8 +201,7 @@ class PaceDCMotor:
         effort = self.drive_effort(asked, joint_pos, joint_vel)
         if self.effects is not None:
             effort = self.transmitted_effort(effort)
-            self.effects.state.time += self.effects.dt
-            self._step_begun = False
+            self.effects.end_step()
         self.applied_effort = self._held_effort = effort
         if self._speed_slope is not None:
             if self.effects is not None and self.effects.changes_passive:  # the line is in it
@@ -243,12 +225,15 @@ class PaceDCMotor:
         Returns:
             The torque that is asked of the drive [N m], (num_envs, num_joints).
         """
-        position = self._delayed("positions", self._target_inside(control_action.joint_positions))
+        target = control_action.joint_positions
+        if target is not None and self.effects is not None:
+            target = self.effects.target_inside(target)
+        position = self._delayed("positions", target)
         velocity = self._delayed("velocities", control_action.joint_velocities)
         feed_forward = self._delayed("efforts", control_action.joint_efforts)
         stiffness, damping, encoder_vel = self.stiffness, self.damping, joint_vel
         if self.effects is not None:
-            encoder_vel, stiffness, damping = self._seen_by_controller(joint_vel)
+            encoder_vel, stiffness, damping = self.effects.seen_by_controller(joint_vel, stiffness, damping)
         encoder_pos = self.sensed_position(joint_pos) - self.encoder_bias
         if position is None:  # no position target: velocity and effort control
             position = encoder_pos
@@ -258,11 +243,7 @@ class PaceDCMotor:
             effort += feed_forward
         if self.cfg.delay_mode == "effort":
             effort = self._delay_buffers["torque"].compute(effort)
-        if self.effects is not None and self.effects.has("effort_command"):
-            self.effects.state.effort = effort
-            self.effects.run("effort_command")
-            effort = self.effects.state.effort.clone()
-        return effort
+        return effort if self.effects is None else self.effects.asked_of_drive(effort)
 
     def drive_effort(
         self, effort_command: torch.Tensor, joint_pos: torch.Tensor, joint_vel: torch.Tensor
@@ -278,12 +259,8 @@ class PaceDCMotor:
             The motor's torque [N m], (num_envs, num_joints).
         """
         asked, slope = effort_command, None
-        if self.effects is not None and self.effects.has("drive"):
-            s = self.effects.state
-            s.effort = asked
-            s.speed_slope.zero_()
-            self.effects.run("drive")
-            asked, slope = s.effort, s.speed_slope
+        if self.effects is not None:
+            asked, slope = self.effects.given_by_drive(asked)
         speed = joint_vel if self.effects is None else self.effects.state.motor_vel
         effort = clip_effort(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
         if self.holds_line:
@@ -306,24 +283,9 @@ class PaceDCMotor:
             The torque at the joint [N m]; friction that the simulator is to apply is in ``joint_friction`` and
             ``joint_viscous_friction``.
         """
-        stack = self.effects
-        if stack is None or not stack.changes_passive:
+        if self.effects is None or not self.effects.changes_passive:
             return effort
-        s = stack.state
-        s.motor_effort, s.effort = effort, effort
-        s.friction, s.viscous_friction = self.friction, self.viscous_friction
-        s.implicit_damping.zero_()
-        if self._speed_slope is not None:
-            s.effort += self._speed_slope * s.motor_vel
-            s.viscous_friction += self._speed_slope
-        if stack.changes_armature:
-            s.armature = self.armature
-            stack.run("armature")
-        stack.run("friction")
-        stack.run("transmission")
-        torch.clamp(s.friction, min=0.0, out=s.friction)
-        torch.clamp(s.viscous_friction, min=0.0, out=s.viscous_friction)
-        return s.effort.clone()
+        return self.effects.at_the_joint(effort, self.friction, self.viscous_friction, self._speed_slope)
 
     @property
     def held_effort(self) -> torch.Tensor:
@@ -384,12 +346,7 @@ class PaceDCMotor:
         Args:
             joint_pos: q [rad], (num_envs, num_joints).
         """
-        if self.effects is None or not self.distorts_measurement:
-            return joint_pos
-        s = self.effects.state
-        s.encoder_pos, s.joint_pos = joint_pos, joint_pos
-        self.effects.run("measurement")
-        return s.encoder_pos
+        return joint_pos if self.effects is None else self.effects.sensed_position(joint_pos)
 
     def position_that_shows(self, encoder_pos: torch.Tensor) -> torch.Tensor:
         """The joint position at which the encoder shows a value before its bias: inverse of :meth:`sensed_position`.
@@ -412,7 +369,7 @@ class PaceDCMotor:
         """
         if self.effects is None:
             return joint_pos
-        self._begin_step(joint_pos, joint_vel)
+        self.effects.begin_step(joint_pos, joint_vel)
         return self.sensed_position(joint_pos)
 
     def set_load_effort(self, load_effort: torch.Tensor) -> None:
@@ -439,14 +396,8 @@ class PaceDCMotor:
 
     def update_effects(self) -> None:
         """Take over changed parameters of the base model and of the effects."""
-        if self.effects is None:
-            return
-        s = self.effects.state
-        s.base_armature, s.base_friction, s.base_viscous_friction = self.armature, self.friction, self.viscous_friction
-        for effect in self.effects.effects:
-            effect.prepare()
-        s.armature, s.friction, s.viscous_friction = self.armature, self.friction, self.viscous_friction
-        self.effects.run("armature")
+        if self.effects is not None:
+            self.effects.take_over(self.armature, self.friction, self.viscous_friction)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments; parameters stay."""
@@ -458,7 +409,6 @@ class PaceDCMotor:
             self._first_call = True
         if self.effects is not None:
             self.effects.reset(env_ids)
-            self._step_begun = False
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it."""
@@ -485,7 +435,6 @@ class PaceDCMotor:
 
     def _make_effects(self, physics_dt: float | None) -> EffectStack | None:
         cfgs = [cfg for cfg in effect_cfgs(self.cfg.effects) if _applies(cfg, self._joint_names)]
-        self._step_begun = False
         if not cfgs:
             return None
         if physics_dt is None:
@@ -504,43 +453,6 @@ class PaceDCMotor:
             dtype=self._dtype,
         )
 
-    def _begin_step(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> None:
-        """Bring the effects' own states to the present instant, once per physics step."""
-        stack = self.effects
-        if stack is None or self._step_begun:
-            return
-        s = stack.state
-        s.joint_pos, s.joint_vel = joint_pos, joint_vel
-        s.motor_pos, s.motor_vel = joint_pos, joint_vel
-        stack.run("advance")
-        self._step_begun = True
-
-    def _target_inside(self, position: torch.Tensor | None) -> torch.Tensor | None:
-        """Target after the effects on it."""
-        stack = self.effects
-        if position is None or stack is None or not stack.has("command"):
-            return position
-        stack.state.joint_pos_target = position
-        stack.run("command")
-        return stack.state.joint_pos_target
-
-    def _seen_by_controller(self, joint_vel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Speed and gains after the effects on them."""
-        stack = self.effects
-        encoder_vel, stiffness, damping = joint_vel, self.stiffness, self.damping
-        if stack is None:
-            return encoder_vel, stiffness, damping
-        s = stack.state
-        if stack.has("sensed_velocity"):
-            s.encoder_vel = joint_vel
-            stack.run("sensed_velocity")
-            encoder_vel = s.encoder_vel
-        if stack.has("controller"):
-            s.stiffness, s.damping = stiffness, damping
-            stack.run("controller")
-            stiffness, damping = s.stiffness, s.damping
-        return encoder_vel, stiffness, damping
-
     def _delayed(self, name: str, data: torch.Tensor | None) -> torch.Tensor | None:
         buffer = self._delay_buffers.get(name)
         if buffer is None:
@@ -554,35 +466,6 @@ class PaceDCMotor:
             if name != "positions":
                 buffer.compute(torch.zeros_like(data))
         return buffer.compute(data)
-
-    def _parameter(self, field: str, default: torch.Tensor | float) -> torch.Tensor:
-        value: JointValue | None = getattr(self.cfg, field)
-        if value is None:
-            result = self._tensor(default, field)
-        else:
-            result = self._tensor(resolve_joint_values(value, self._joint_names, field=field), field)
-        valid, expected = _DOMAINS[field]
-        bad = ~valid(result)
-        if bool(bad.any()):
-            joint = self._joint_names[int(bad.any(dim=0).nonzero()[0])]
-            raise ValueError(f"{field} of {joint} is {result[bad][0].item():g}, expected {expected}.")
-        return result
-
-    def _tensor(self, value: torch.Tensor | float, field: str) -> torch.Tensor:
-        tensor = torch.as_tensor(value, dtype=self._dtype, device=self._device)
-        try:
-            return tensor.expand(self._num_envs, self.num_joints).clone()
-        except RuntimeError:
-            raise ValueError(
-                f"{field} has shape {tuple(tensor.shape)}, expected a number, ({self.num_joints},) or "
-                f"({self._num_envs}, {self.num_joints})."
-            ) from None
-
-    def _check_choices(self) -> None:
-        if self.cfg.delay_mode not in ("command", "effort"):
-            raise ValueError(f"Unknown delay_mode {self.cfg.delay_mode!r}. Available: 'command', 'effort'.")
-        if not (isinstance(self.cfg.control_decimation, int) and self.cfg.control_decimation >= 1):
-            raise ValueError(f"control_decimation is {self.cfg.control_decimation!r}, expected an integer >= 1.")
 
 
 def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:

@@ -88,6 +88,7 @@ class EffectStack:
             ]
             for stage in _STAGES
         }
+        self._step_begun = False
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
         """Whether friction or viscous friction change from step to step."""
         self.changes_armature = any(effect.changes_armature for effect in self.effects)
@@ -131,6 +132,7 @@ class EffectStack:
 
     def reset(self, env_ids: Any = None) -> None:
         """Forget the history of all or some environments."""
+        self._step_begun = False
         if env_ids is None:
             for effect in self.effects:
                 effect.reset_state(slice(None))
@@ -141,6 +143,111 @@ class EffectStack:
             own = chosen[effect.rows]
             if bool(own.any()):
                 effect.reset_state(own)
+
+    def take_over(self, armature: torch.Tensor, friction: torch.Tensor, viscous_friction: torch.Tensor) -> None:
+        """Take over changed parameters of the base model, (num_envs, num_joints) each, and of the effects."""
+        s = self.state
+        s.base_armature, s.base_friction, s.base_viscous_friction = armature, friction, viscous_friction
+        for effect in self.effects:
+            effect.prepare()
+        s.armature, s.friction, s.viscous_friction = armature, friction, viscous_friction
+        self.run("armature")
+
+    def begin_step(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> None:
+        """Bring the effects' own states to the present instant, once per physics step."""
+        if self._step_begun:
+            return
+        s = self.state
+        s.joint_pos, s.joint_vel = joint_pos, joint_vel
+        s.motor_pos, s.motor_vel = joint_pos, joint_vel
+        self.run("advance")
+        self._step_begun = True
+
+    def end_step(self) -> None:
+        """Let the time go on to the next instant."""
+        self.state.time += self.dt
+        self._step_begun = False
+
+    def target_inside(self, position: torch.Tensor) -> torch.Tensor:
+        """The target after the effects on it [rad]."""
+        if not self._at["command"]:
+            return position
+        self.state.joint_pos_target = position
+        self.run("command")
+        return self.state.joint_pos_target
+
+    def sensed_position(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """What the encoder shows, before its bias is subtracted [rad]."""
+        if not self._at["measurement"]:
+            return joint_pos
+        s = self.state
+        s.encoder_pos, s.joint_pos = joint_pos, joint_pos
+        self.run("measurement")
+        return s.encoder_pos
+
+    def seen_by_controller(
+        self, joint_vel: torch.Tensor, stiffness: torch.Tensor, damping: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Speed and gains after the effects on them."""
+        s = self.state
+        if self._at["sensed_velocity"]:
+            s.encoder_vel = joint_vel
+            self.run("sensed_velocity")
+            joint_vel = s.encoder_vel
+        if self._at["controller"]:
+            s.stiffness, s.damping = stiffness, damping
+            self.run("controller")
+            stiffness, damping = s.stiffness, s.damping
+        return joint_vel, stiffness, damping
+
+    def asked_of_drive(self, effort: torch.Tensor) -> torch.Tensor:
+        """The controller's torque after the effects on it [N m]."""
+        if not self._at["effort_command"]:
+            return effort
+        self.state.effort = effort
+        self.run("effort_command")
+        return self.state.effort.clone()
+
+    def given_by_drive(self, effort: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The torque before the motor's limits [N m], and how fast it falls with the speed where effects limit it."""
+        if not self._at["drive"]:
+            return effort, None
+        s = self.state
+        s.effort = effort
+        s.speed_slope.zero_()
+        self.run("drive")
+        return s.effort, s.speed_slope
+
+    def at_the_joint(
+        self,
+        effort: torch.Tensor,
+        friction: torch.Tensor,
+        viscous_friction: torch.Tensor,
+        speed_slope: torch.Tensor | None,
+    ) -> torch.Tensor:
+        """The torque after friction and transmission [N m]; what the simulator is to apply itself is in ``state``.
+
+        Args:
+            effort: The motor's torque [N m].
+            friction: Coulomb friction of the base model [N m].
+            viscous_friction: Of the base model [N m s/rad].
+            speed_slope: How fast the motor's torque falls with the speed between two calls; ``None`` for not at all.
+        """
+        s = self.state
+        s.motor_effort, s.effort = effort, effort
+        s.friction, s.viscous_friction = friction, viscous_friction
+        s.implicit_damping.zero_()
+        if speed_slope is not None:
+            s.effort += speed_slope * s.motor_vel
+            s.viscous_friction += speed_slope
+        if self.changes_armature:
+            s.armature = s.base_armature
+            self.run("armature")
+        self.run("friction")
+        self.run("transmission")
+        torch.clamp(s.friction, min=0.0, out=s.friction)
+        torch.clamp(s.viscous_friction, min=0.0, out=s.viscous_friction)
+        return s.effort.clone()
 
     def observation_lag(self, time: torch.Tensor) -> torch.Tensor | None:
         """How late the samples of a recording are [s], (num_envs, num_joints); ``None`` if no effect says so.
