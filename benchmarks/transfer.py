@@ -134,6 +134,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3, help="policies of each kind (default 3)")
     parser.add_argument("--iterations", type=int, default=400, help="of each training (default 400)")
+    parser.add_argument("--policies", default="abcd", help="which of them, by letter (default abcd)")
     parser.add_argument("--robots", type=int, default=96, help="that walk 20 s each (default 96)")
     parser.add_argument("--robot_seed", type=int, default=0, help='draws the "real" robot')
     parser.add_argument("--workers", type=int, default=2, help="trainings at once (default 2)")
@@ -142,11 +143,12 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only print what is done")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    args.folder = args.folder.resolve()
     args.folder.mkdir(parents=True, exist_ok=True)
     results = args.folder / "results.jsonl"
     if not args.table:
         fits = identify(args.folder, args.robot_seed)
-        jobs = [(variant, seed) for seed in range(args.seeds) for variant in VARIANTS]
+        jobs = [(variant, seed) for seed in range(args.seeds) for variant in VARIANTS if variant[0] in args.policies]
         shares = [set(share.tolist()) for share in np.array_split(sorted(os.sched_getaffinity(0)), args.workers)]
         with ThreadPoolExecutor(args.workers) as pool:
             free = list(shares)
