@@ -26,8 +26,9 @@ from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_val
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.screening import _FOLDS, Probe, _explained, absorbed_effects
-from pace_optim.diagnosis.search import Outcome, Round, Trial, _ranked
+from pace_optim.diagnosis.search import Outcome, _ranked
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.trials import Round, Trial
 from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
 from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot

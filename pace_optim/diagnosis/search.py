@@ -13,6 +13,8 @@ from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
+from pace_optim.diagnosis.swapping import swapped
+from pace_optim.diagnosis.trials import RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -29,39 +31,8 @@ FROM_SCREENING = 2
 FAR_FROM_FLOOR = 50.0
 """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
 do for the first one."""
-RIVAL = 1.10
-"""Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
 NEXT_FLOOR = 1.3
 """Nearer to the floor than this a further effect could not lower the error by as much as it must."""
-
-
-@dataclass(kw_only=True, eq=False)
-class Trial:
-    """One effect, refitted on top of the present model, on one joint."""
-
-    effect: type[Effect]
-    joint: int
-    screen_score: float
-    mse_before: float
-    """On validation [rad²]."""
-    mse_after: float
-    ratio: float
-    """RMSE before / after."""
-    t: float
-    significant: bool
-    values: dict[str, float]
-
-
-@dataclass(kw_only=True, eq=False)
-class Round:
-    """What was tried on top of a model, joint by joint; each joint's list begins with its best."""
-
-    trials: list[list[Trial]]
-    chosen: list[type[Effect] | None]
-    rivals: list[list[type[Effect]]]
-    """For each joint, effects that do as well as the chosen one."""
-    models: dict[type[Effect], Fitted] = field(default_factory=dict)
-    """The present model with each effect that was refitted."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -118,6 +89,9 @@ def add_effects(
         now = _combined(problem, now, found)
         problem, now = follow(problem, now)
         errors = validation_errors(problem, [now])[0]
+        if (exchanged := swapped(problem, now, errors, outcome.rounds)) is not None:
+            problem, now = follow(problem, exchanged)
+            errors = validation_errors(problem, [now])[0]
         now, errors = pruned(problem, now, errors, found.chosen)
         outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
     return outcome

@@ -11,7 +11,8 @@ import torch
 
 from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.model import JointModel
-from pace_optim.diagnosis.search import Outcome, Trial
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.trials import Trial
 
 UNKNOWN_RATIO = 3.0
 """An unexplained error above this many times the floor is a finding of its own."""

@@ -1,0 +1,127 @@
+"""Another effect in place of one that was found: better beside a newer effect, or the one that most joints want."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.model import BASE
+from pace_optim.diagnosis.trials import RIVAL, Round, Trial
+from pace_optim.diagnosis.validation import validation_errors
+from pace_optim.joint_twins.problem import TwinProblem
+
+_BEHIND = 3.0
+"""An effect whose RMSE was this many times the chosen one's is not tried again in its place."""
+_PER_JOINT = 3
+"""How many effects are tried in place of one that a newer effect has joined."""
+
+_Exchange = dict[int, type[Effect]]
+"""Joint -> the effect that another one takes the place of."""
+
+
+def swapped(problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequence[Round]) -> Fitted | None:
+    """Try what each joint could have had instead, now that the rest is known; ``None`` if nothing is better.
+
+    When an effect was chosen, its neighbours moved as the base model does, and effects that were found since were
+    missing: what came close then may be the right one. Where both do equally well, joints agree on the effect that most
+    of them want.
+
+    Args:
+        problem: The joints simulated alone, along the motion of the present model.
+        now: The present model.
+        errors: Its errors.
+        rounds: What was tried; their choices are updated.
+    """
+    exchanges = _exchanges(now, rounds)
+    if not exchanges:
+        return None
+    starts = [_start(now, effect, joints, rounds) for effect, joints in exchanges.items()]
+    fitted = fit_coarse_to_fine(problem, starts)
+    after = dict(zip(exchanges, validation_errors(problem, fitted), strict=True))
+    models = dict(zip(exchanges, fitted, strict=True))
+    chosen = _choose(now, errors, exchanges, {effect: block.mse for effect, block in after.items()})
+    if not chosen:
+        return None
+    model, physical = now.model, now.model.to_physical(now.x)
+    for j, effect in chosen.items():
+        old, here, source = exchanges[effect][j], torch.arange(model.num_joints) == j, models[effect]
+        values = source.model.to_physical(source.x)
+        model, physical = model.extended(physical, effect, here, values[:, source.model.columns(effect)])
+        model = model.without_effect(old, here)
+        physical[j, : now.model.size] = values[j, : now.model.size]
+        _note(rounds, j, old, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
+    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+
+
+def _exchanges(now: Fitted, rounds: Sequence[Round]) -> dict[type[Effect], _Exchange]:
+    """What is tried in place of what, joint by joint."""
+    model = now.model
+    in_use = {effect for effect, has in zip(model.effects, model.has, strict=True) if bool(has.any())}
+    result: dict[type[Effect], _Exchange] = {}
+    for this in rounds:
+        for j, old in enumerate(this.chosen):
+            if old is None or old not in in_use or not bool(model.has[model.effects.index(old), j]):
+                continue
+            several = int(model.has[:, j].sum()) > 1
+            without = model.without_effect(old, torch.arange(model.num_joints) == j)
+            near = [t for t in _near(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
+            wanted = [t.effect for k, t in enumerate(near) if t.effect in in_use or (several and k < _PER_JOINT)]
+            for effect in wanted:
+                result.setdefault(effect, {}).setdefault(j, old)
+    return result
+
+
+def _near(trials: Sequence[Trial], chosen: type[Effect]) -> list[Trial]:
+    """Significant trials of a joint that came near to the chosen effect, best first."""
+    most = next(t.mse_after for t in trials if t.effect is chosen) * _BEHIND**2
+    return [t for t in trials if t.effect is not chosen and t.significant and t.mse_after <= most]
+
+
+def _start(now: Fitted, effect: type[Effect], joints: _Exchange, rounds: Sequence[Round]) -> Fitted:
+    """The present model with an effect, as it was fitted in its round, in place of others."""
+    model, physical = now.model, now.model.to_physical(now.x)
+    for j, old in joints.items():
+        here = torch.arange(model.num_joints) == j
+        this = next(r for r in rounds if r.chosen[j] is old)
+        source = this.models[effect]
+        values = source.model.to_physical(source.x)
+        model, physical = model.extended(physical, effect, here, values[:, source.model.columns(effect)])
+        model = model.without_effect(old, here)
+        physical[j, : len(BASE)] = values[j, : len(BASE)]
+    return Fitted.start(model, physical, tried=effect)
+
+
+def _choose(
+    now: Fitted,
+    errors: BlockErrors,
+    exchanges: dict[type[Effect], _Exchange],
+    after: dict[type[Effect], torch.Tensor],
+) -> dict[int, type[Effect]]:
+    """Joints that change, with their new effect: the best of each; among rivals, the one that most joints want."""
+    model = now.model
+    near: dict[int, dict[type[Effect], float]] = {}
+    for j in sorted({j for joints in exchanges.values() for j in joints}):
+        options = {effect: float(after[effect][j]) for effect, joints in exchanges.items() if j in joints}
+        options |= {joints[j]: float(errors.mse[j]) for joints in exchanges.values() if j in joints}
+        least = min(options.values())
+        near[j] = {effect: mse for effect, mse in options.items() if mse <= RIVAL**2 * least}
+    wanted: dict[type[Effect], int] = {}
+    for j in range(model.num_joints):
+        own = near.get(j, [e for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])])
+        for effect in own:
+            wanted[effect] = wanted.get(effect, 0) + 1
+    total = {effect: sum(options.get(effect, 0.0) for options in near.values()) for effect in wanted}
+    best = {j: min(options, key=lambda e: (-wanted[e], total[e])) for j, options in near.items()}
+    return {j: effect for j, effect in best.items() if j in exchanges.get(effect, {})}
+
+
+def _note(rounds: Sequence[Round], joint: int, old: type[Effect], new: type[Effect], tie: bool) -> None:
+    """Write the exchange into the round that had chosen the old effect."""
+    this = next(r for r in rounds if r.chosen[joint] is old)
+    this.chosen[joint] = new
+    others = [effect for effect in this.rivals[joint] if effect is not new]
+    this.rivals[joint] = [*others, old] if tie else others
