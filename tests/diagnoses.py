@@ -1,10 +1,24 @@
-"""A synthetic diagnosis for the tests of what reads one."""
+"""Synthetic diagnoses, and parts of them."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
-from run_folders import JOINTS
+import numpy as np
+import torch
+from problems import BENCH, CALM
+from run_folders import JOINTS, make_result
+
+from pace_actuators.effects import Effect, get_effect
+from pace_optim.atomic import write_json
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.model import BASE
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.trials import Trial
+from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
+from pace_optim.problem import load_problem
+from pace_optim.recording import save_recording
 
 
 def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
@@ -70,3 +84,63 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         "simulated_steps": 0,
         "wall_time_s": 12.0,
     }
+
+
+def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True) -> Trial:
+    """An effect that was tried on a joint, with its RMSE after [rad]."""
+    return Trial(
+        effect=effect,
+        joint=joint,
+        screen_score=0.5,
+        mse_before=1e-6,
+        mse_after=after**2,
+        ratio=1e-3 / after,
+        t=4.0,
+        significant=significant,
+        values={},
+    )
+
+
+def outcome_of(before, after, effects=(), has=None, rounds=()):
+    """Where a search could have ended: RMSE of each joint before and after."""
+
+    def errors(rmse):
+        return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
+
+    has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
+    final = SimpleNamespace(model=SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")}))
+    return Outcome(
+        problem=None,
+        base=final,
+        base_errors=errors(before),
+        final=final,
+        final_errors=errors(after),
+        rounds=list(rounds),
+    )
+
+
+def hidden_run(folder, effect, seed=0, duration=4.0):
+    """A short battery from the independent plant, and the folder of a run that was fitted to it."""
+    robot = plant_robot(BENCH)
+    suite = make_suite(robot, "battery", seed=seed, duration=duration)
+    cfg = PlantCfg(control_dt=robot.control_dt, noise=1e-4, seed=seed)
+    effects = () if effect is None else (effect,)
+    drawn = draw_visible(robot, suite.runs, effects, np.random.default_rng(seed), cfg=cfg)
+    paths = [str(save_recording(folder / f"{i}_{r.name}.npz", r)) for i, r in enumerate(drawn.recordings)]
+    data, validation = paths[: len(suite.train)], paths[len(suite.train) :]
+    run = folder / "logs" / "run"
+    run.mkdir(parents=True)
+    names = [*BASE[:-1]]
+    values = {name: {"servo": CALM[name]} for name in names} | {"delay": {"all": CALM["delay"]}}
+    result = {
+        "parameters": values,
+        "std": {name: dict.fromkeys(own) for name, own in values.items()},
+        "at_bound": [],
+        "indistinguishable": [],
+        "correlation": {"labels": [], "matrix": []},
+        "rmse": {part: {"servo": 0.004, "all": 0.004} for part in ("train", "validation")},
+    }
+    make_result(task=BENCH, joint_names=["servo"], **result).save(run / "result.json")
+    settings = {"task": BENCH, "data": data, "validation": validation, "log_dir": str(folder / "logs")}
+    write_json(run / "settings.json", {"settings": settings, "digests": {}})
+    return SimpleNamespace(folder=run, problem=load_problem(BENCH, data=data, validation=validation))
