@@ -16,8 +16,14 @@ class ProgressLine:
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._between = seconds_between_lines
-        self._last_line = 0.0
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the clock anew, for a fit that begins now."""
         self._start = time.perf_counter()
+        self._last_line = 0.0
+        self._phase = ""
+        self._phase_began = self._latest = (0.0, 0)
 
     @property
     def elapsed(self) -> float:
@@ -37,11 +43,15 @@ class ProgressLine:
         """
         elapsed = self.elapsed
         filled = round(20 * done / max(1, total))
-        left = elapsed / max(1, done) * (total - done)
+        if phase != self._phase:  # it has been going on since the last one's end
+            self._phase, self._phase_began = phase, self._latest
+        self._latest = (elapsed, steps)
+        seconds, own_steps = elapsed - self._phase_began[0], steps - self._phase_began[1]
+        left = seconds / max(1, done) * (total - done)
         text = (
             f"{phase} [{'#' * filled}{'.' * (20 - filled)}] {done}/{total}  best {best:.3e} rad²"
             + ("" if spread is None else f"  spread {spread:.2g}")
-            + f"  {steps / max(elapsed, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {left:.0f} s left"
+            + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {left:.0f} s left"
         )
         if self._live:
             self.say(text)
@@ -51,6 +61,7 @@ class ProgressLine:
 
     def say(self, text: str) -> None:
         """Show a step that has no counter."""
+        self._latest = (self.elapsed, self._latest[1])
         if self._live:
             width = shutil.get_terminal_size().columns - 1
             self._stream.write("\r" + text[:width].ljust(width))

@@ -1,6 +1,7 @@
 """Fits end to end on the bench: what is found, what is written, and interruption."""
 
 import dataclasses
+import io
 import json
 import math
 import pickle
@@ -338,3 +339,16 @@ def test_a_fit_in_which_everything_diverges_says_so(recordings, tmp_path):
     path = save_recording(tmp_path / "wild.npz", recording)
     with pytest.raises(ValueError, match=r"simulation diverges.*Lower the bounds"):
         run(tmp_path, str(path), optimizer="least_squares")
+
+
+def test_the_time_left_is_that_of_the_phase(monkeypatch):
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("pace_optim.progress.time.perf_counter", lambda: now[0])
+    line = ProgressLine(out)
+    now[0] = 100.0
+    line.say("something before")
+    now[0] = 120.0
+    line.show("refine", done=2, total=10, best=1e-6, spread=None, steps=2_000_000)
+    assert "2/10" in out.getvalue() and "100k steps/s  120 s, at most 80 s left" in out.getvalue()
+    line.restart()
+    assert line.elapsed == 0.0

@@ -84,6 +84,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
             check_consistency=False,  # the run has done it
             log_dir=str(folder.parent.parent),
         )
+        progress.restart()
         _, path = fit(refit_settings, progress)
         runs.append(str(path))
     if result.effects:

@@ -56,7 +56,7 @@ def _ladder(content: dict[str, Any]) -> str:
     rows, before = [], None
     for step in steps:
         error = step["validation_rmse"]
-        gain = "" if before is None or error <= 0 else f"{before / error:.2f}"
+        gain = "" if before is None or error <= 0 else f"{before / error:.3g}"
         rows.append([f"<b>{esc(step['model'])}</b>", f"{factor * error:#.3g}", gain])
         before = error
     rows.append(["floor of noise and numerics", f"{factor * floor:#.3g}", ""])

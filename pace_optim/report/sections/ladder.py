@@ -109,7 +109,7 @@ def _table(steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float
         cells = [f"<b>{esc(step['name'])}</b>"]
         for part in parts:
             ratio = step["ratio_to_previous"].get(part)
-            cells += [f"{factor * step['rmse'][part]['all']:#.3g}", "" if ratio is None else f"{ratio:.2f}"]
+            cells += [f"{factor * step['rmse'][part]['all']:#.3g}", "" if ratio is None else f"{ratio:.3g}"]
         rows.append(cells)
     rows.append(["noise floor", *[f"{factor * floor['all']:#.3g}", ""] * len(parts)])
     head = ["model"]
