@@ -14,7 +14,7 @@ from pace_envs import set_physics_dt
 from pace_optim.diagnosis import pruning, search, sharing, swapping
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
@@ -276,6 +276,16 @@ def test_a_fit_that_starts_at_the_truth_stays_there(bench):
         max_iteration=2,
     )[0]
     assert float((fitted.x - x).abs().max()) < 0.02
+
+
+def test_models_far_behind_are_left_at_the_coarse_step(bench):
+    model = JointModel.base(bench.problem)
+    heavy = bench.truth_values.clone()
+    heavy[:, BASE.index("armature")] *= 4
+    held = replace(model, lower=heavy, upper=heavy)
+    far, near = fit_coarse_to_fine(bench.twins, [Fitted.start(held, heavy), Fitted.start(model, bench.truth_values)])
+    assert far.jacobian is None and near.jacobian is not None
+    assert float(far.score.sqrt()) > 3 * float(near.score.sqrt())
 
 
 def test_an_error_map_names_the_variable_that_friction_depends_on(tmp_path):

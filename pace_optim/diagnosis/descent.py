@@ -18,6 +18,8 @@ _STEP = 1e-4
 _TRIALS = (1.0, 30.0, 1e3)
 _ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
+_BEHIND = 2.0
+"""RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
 _STRIDE = 2
 """Only every so many control steps count in a fit."""
 
@@ -48,9 +50,19 @@ class Fitted:
 def fit_coarse_to_fine(
     problem: TwinProblem, starts: Sequence[Fitted], coarse_iterations: int = 8, fine_iterations: int = 3
 ) -> list[Fitted]:
-    """Go most of the way at the control step, which costs half, and the rest at the problem's physics step."""
+    """Go most of the way at the control step, which costs half, and the rest at the problem's physics step.
+
+    Models that the control step shows to be far behind the best one on every joint stay where it left them.
+    """
     coarse = fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, coarse_iterations)
-    return fit_side_by_side(problem, coarse, fine_iterations, keep_jacobian=True)
+    scores = torch.stack([each.score for each in coarse])
+    near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
+    fine = iter(
+        fit_side_by_side(
+            problem, [each for each, yes in zip(coarse, near, strict=True) if yes], fine_iterations, keep_jacobian=True
+        )
+    )
+    return [next(fine) if yes else each for each, yes in zip(coarse, near, strict=True)]
 
 
 def fit_side_by_side(

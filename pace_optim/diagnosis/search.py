@@ -260,8 +260,9 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
     """The present model with each joint's chosen effect, refitted unless all joints chose the same."""
-    if len(set(found.chosen)) == 1 and found.chosen[0] is not None:
-        return replace(found.models[found.chosen[0]], tried=None)
+    one = found.models[found.chosen[0]] if len(set(found.chosen)) == 1 and found.chosen[0] is not None else None
+    if one is not None and one.jacobian is not None:
+        return replace(one, tried=None)
     model, physical, size = now.model, now.model.to_physical(now.x), now.model.size
     for effect in dict.fromkeys(e for e in found.chosen if e is not None):
         has = torch.tensor([e is effect for e in found.chosen])
