@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import torch
 
-from pace_actuators import ActuatorActions, PaceDCMotor, match_names, resolve_joint_values
+from pace_actuators import ActuatorActions, PaceDCMotor, resolve_joint_values
 from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
+from pace_envs.indexing import EnvIds, JointIds, assign, find_names, indices, pick, zeros_like
+from pace_envs.joint_layout import JointLayout
 from pace_envs.link_model import LinkModel
-from pace_envs.simulation import EnvIds, Simulation
-
-JointIds = Sequence[int] | torch.Tensor | slice | None
+from pace_envs.simulation import Simulation
 
 
 def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
@@ -56,7 +55,10 @@ class Articulation:
         """
         self.cfg = cfg
         self._sim = sim
-        self._find_joints_in_model(sim.model)
+        layout = JointLayout.of_model(sim.model, cfg.joint_order, cfg.mjcf_path)
+        self._layout, self.joint_names, self.dof_columns = layout, list(layout.joint_names), layout.dof_columns
+        self._body_ids = list(range(1, sim.model.nbody))
+        self.body_names = [sim.model.body(i).name for i in self._body_ids]
         n, device = self.num_joints, sim.device
         init = cfg.init_state
         limits = torch.full((n, 2), torch.inf, dtype=torch.float64, device=device)
@@ -69,8 +71,8 @@ class Articulation:
         default_pos = resolve_joint_values(init.joint_pos, self.joint_names, field="init_state.joint_pos", default=0.0)
         default_vel = resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
         self.data = ArticulationData(
-            joint_pos=sim.qpos[:, self._qpos_view] if self._side_by_side else zeros.clone(),
-            joint_vel=sim.qvel[:, self._dof_view] if self._side_by_side else zeros.clone(),
+            joint_pos=sim.qpos[:, self._layout.qpos_view] if self._layout.side_by_side else zeros.clone(),
+            joint_vel=sim.qvel[:, self._layout.dof_view] if self._layout.side_by_side else zeros.clone(),
             default_joint_pos=default_pos.repeat(sim.num_envs, 1),
             default_joint_vel=default_vel.repeat(sim.num_envs, 1),
             joint_pos_limits=limits,
@@ -79,8 +81,8 @@ class Articulation:
             computed_torque=zeros.clone(),
             applied_torque=zeros.clone(),
         )
-        if self._root is not None:
-            q, v = self._root
+        if self._layout.root is not None:
+            q, v = self._layout.root
             self.data.root_pos_w, self.data.root_quat_w = sim.qpos[:, q : q + 3], sim.qpos[:, q + 3 : q + 7]
             self.data.root_lin_vel_w, self.data.root_ang_vel_b = (
                 sim.qvel[:, v : v + 3],
@@ -104,7 +106,7 @@ class Articulation:
     @property
     def is_fixed_base(self) -> bool:
         """Whether the base is held in place."""
-        return self._root is None
+        return self._layout.root is None
 
     def find_joints(
         self, name_keys: str | Sequence[str], *, preserve_order: bool = False
@@ -121,20 +123,20 @@ class Articulation:
         Raises:
             ValueError: If an expression matches no joint.
         """
-        return _find(name_keys, self.joint_names, preserve_order, "joint")
+        return find_names(name_keys, self.joint_names, preserve_order, "joint")
 
     def find_bodies(
         self, name_keys: str | Sequence[str], *, preserve_order: bool = False
     ) -> tuple[list[int], list[str]]:
         """Bodies whose names match regular expressions: model body indices and names."""
-        found, names = _find(name_keys, self.body_names, preserve_order, "body")
+        found, names = find_names(name_keys, self.body_names, preserve_order, "body")
         return [self._body_ids[i] for i in found], names
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put all or some environments' robots back to their initial state and clear their drives."""
         rows = slice(None) if env_ids is None else torch.as_tensor(self._sim.resolve_env_ids(env_ids)).long()
         init = self.cfg.init_state
-        if self._root is not None:
+        if self._layout.root is not None:
             self.write_root_state_to_sim(
                 torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64),
                 env_ids,
@@ -157,8 +159,8 @@ class Articulation:
         env_ids: EnvIds = None,
     ) -> None:
         """Write positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable."""
-        self._write(self._sim.qpos, self._qpos_columns, position, joint_ids, env_ids)
-        self._write(self._sim.qvel, self._dof_columns, velocity, joint_ids, env_ids)
+        self._write(self._sim.qpos, self._layout.qpos_columns, position, joint_ids, env_ids)
+        self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids)
         self._refresh()
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
@@ -172,9 +174,9 @@ class Articulation:
         Raises:
             ValueError: If the base is fixed.
         """
-        if self._root is None:
+        if self._layout.root is None:
             raise ValueError("This robot's base is fixed: it has no root state to write.")
-        rows, (q, v) = _indices(env_ids), self._root
+        rows, (q, v) = indices(env_ids), self._layout.root
         self._sim.qpos[rows, q : q + 7] = root_state[..., :7]
         self._sim.qvel[rows, v : v + 6] = root_state[..., 7:]
 
@@ -201,9 +203,9 @@ class Articulation:
 
     def add_body_mass(self, name_keys: str | Sequence[str], mass: float, env_ids: EnvIds = None) -> None:
         """Add a known mass to bodies, at their centres of mass [kg]; effects on the model do not scale it."""
-        rows, (ids, _) = _indices(env_ids), self.find_bodies(name_keys)
-        _assign(self._added_mass, rows, torch.tensor(ids), self._added_mass[rows][:, ids] + mass)
-        _assign(
+        rows, (ids, _) = indices(env_ids), self.find_bodies(name_keys)
+        assign(self._added_mass, rows, torch.tensor(ids), self._added_mass[rows][:, ids] + mass)
+        assign(
             self._sim.expand("body_mass"), rows, torch.tensor(ids), self._sim.expand("body_mass")[rows][:, ids] + mass
         )
         self._sim.constants_changed()
@@ -215,21 +217,21 @@ class Articulation:
         if joint_ids is None and env_ids is None:
             self.data.joint_pos_target.copy_(target)
         else:
-            _assign(self.data.joint_pos_target, _indices(env_ids), _indices(joint_ids), target)
+            assign(self.data.joint_pos_target, indices(env_ids), indices(joint_ids), target)
 
     def set_joint_velocity_target(
         self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
     ) -> None:
         """Set velocity targets [rad/s]."""
         if self.data.joint_vel_target is None:
-            self.data.joint_vel_target = _zeros_like(self.data.joint_pos_target)
-        _assign(self.data.joint_vel_target, _indices(env_ids), _indices(joint_ids), target)
+            self.data.joint_vel_target = zeros_like(self.data.joint_pos_target)
+        assign(self.data.joint_vel_target, indices(env_ids), indices(joint_ids), target)
 
     def set_joint_effort_target(self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None) -> None:
         """Set feed-forward efforts [N m]."""
         if self.data.joint_effort_target is None:
-            self.data.joint_effort_target = _zeros_like(self.data.joint_pos_target)
-        _assign(self.data.joint_effort_target, _indices(env_ids), _indices(joint_ids), target)
+            self.data.joint_effort_target = zeros_like(self.data.joint_pos_target)
+        assign(self.data.joint_effort_target, indices(env_ids), indices(joint_ids), target)
 
     def write_data_to_sim(self) -> None:
         """Run the drives on the present targets and state, and apply their torques."""
@@ -238,9 +240,11 @@ class Articulation:
             ids, place = actuator.joint_indices, self._place_of(actuator)
             self._tell_link(actuator)
             action = ActuatorActions(
-                _of(data.joint_pos_target, ids), _of(data.joint_vel_target, ids), _of(data.joint_effort_target, ids)
+                pick(data.joint_pos_target, ids),
+                pick(data.joint_vel_target, ids),
+                pick(data.joint_effort_target, ids),
             )
-            efforts = actuator.compute(action, _of(data.joint_pos, ids), _of(data.joint_vel, ids)).joint_efforts
+            efforts = actuator.compute(action, pick(data.joint_pos, ids), pick(data.joint_vel, ids)).joint_efforts
             if isinstance(ids, slice):  # the only group: it drives every joint
                 data.computed_torque, data.applied_torque = actuator.computed_effort, efforts
             else:
@@ -259,7 +263,7 @@ class Articulation:
     @property
     def load_effort(self) -> torch.Tensor:
         """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
-        return -self._sim.qfrc_bias[:, self._dof_view if self._side_by_side else self._dof_columns]
+        return -self._sim.qfrc_bias[:, self._layout.dof_view if self._layout.side_by_side else self._layout.dof_columns]
 
     @property
     def effects(self) -> list[str]:
@@ -276,7 +280,7 @@ class Articulation:
         for actuator in distorted:
             ids = actuator.joint_indices
             self._tell_link(actuator)
-            result[:, ids] = actuator.observe(_of(self.data.joint_pos, ids), _of(self.data.joint_vel, ids))
+            result[:, ids] = actuator.observe(pick(self.data.joint_pos, ids), pick(self.data.joint_vel, ids))
         return result
 
     def write_effect_parameter_to_sim(
@@ -335,17 +339,17 @@ class Articulation:
         return list(range(self.num_joints)) if isinstance(ids, slice) else torch.as_tensor(ids).tolist()
 
     def _columns_of(self, actuator: PaceDCMotor) -> torch.Tensor:
-        return self._dof_columns[actuator.joint_indices]
+        return self._layout.dof_columns[actuator.joint_indices]
 
     def _place_of(self, actuator: PaceDCMotor) -> torch.Tensor | slice:
         """Its columns in the model's arrays; a slice, which is faster, where it drives all joints side by side."""
-        whole = self._side_by_side and isinstance(actuator.joint_indices, slice)
-        return self._dof_view if whole else self._columns_of(actuator)
+        whole = self._layout.side_by_side and isinstance(actuator.joint_indices, slice)
+        return self._layout.dof_view if whole else self._columns_of(actuator)
 
     def _tell_link(self, actuator: PaceDCMotor) -> None:
         """Give a drive what its effects read of the link."""
         if actuator.needs_load:
-            actuator.set_load_effort(_of(self.load_effort, actuator.joint_indices))
+            actuator.set_load_effort(pick(self.load_effort, actuator.joint_indices))
         if actuator.changes_armature:
             actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
 
@@ -370,41 +374,6 @@ class Articulation:
         self._write_friction(actuator, place)
         self._sim.constants_changed()
 
-    def _find_joints_in_model(self, model: mujoco.MjModel) -> None:
-        self._root = None
-        single = {}
-        for j in range(model.njnt):
-            name, kind = model.joint(j).name, mujoco.mjtJoint(int(model.jnt_type[j]))
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
-                self._root = (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
-            elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-                single[name] = j
-            else:
-                raise ValueError(f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives.")
-        if not single:
-            raise ValueError(f"The model {self.cfg.mjcf_path} has no joints to drive.")
-        order = self.cfg.joint_order or tuple(single)
-        unknown = [name for name in order if name not in single]
-        if unknown or len(set(order)) != len(order):
-            wrong = f"names unknown joints: {', '.join(unknown)}" if unknown else "names a joint twice"
-            raise ValueError(f"joint_order {wrong}. Joints of the model: {', '.join(single)}.")
-        self.joint_names = list(order)
-        ids = [single[name] for name in order]
-        self._qpos_columns = torch.tensor([int(model.jnt_qposadr[j]) for j in ids])
-        self._dof_columns = torch.tensor([int(model.jnt_dofadr[j]) for j in ids])
-        # where the joints lie side by side in the model, tensors are views of its arrays; else copies
-        self._qpos_view, self._dof_view = _span(self._qpos_columns), _span(self._dof_columns)
-        self._side_by_side = all(
-            torch.equal(columns, torch.arange(view.start, view.stop))
-            for columns, view in [
-                (self._qpos_columns, self._qpos_view),
-                (self._dof_columns, self._dof_view),
-            ]
-        )
-        self._body_ids = list(range(1, model.nbody))
-        self.body_names = [model.body(i).name for i in self._body_ids]
-        self.dof_columns = self._dof_columns.clone()
-
     def _build_actuators(self) -> None:
         n = self.num_joints
         columns = {
@@ -413,7 +382,8 @@ class Articulation:
             "friction": "dof_frictionloss",
         }
         model_values = {
-            key: torch.as_tensor(getattr(self._sim.model, field))[self._dof_columns] for key, field in columns.items()
+            key: torch.as_tensor(getattr(self._sim.model, field))[self._layout.dof_columns]
+            for key, field in columns.items()
         }
         self.actuators: dict[str, PaceDCMotor] = {}
         owner: dict[str, str] = {}
@@ -458,7 +428,7 @@ class Articulation:
         bad = ~((tensor >= 0) & tensor.isfinite())
         if bool(bad.any()):
             raise ValueError(f"{name} is {tensor[bad][0].item():g}, expected a finite number >= 0.")
-        self._write(self._sim.expand(field), self._dof_columns, tensor, joint_ids, env_ids)
+        self._write(self._sim.expand(field), self._layout.dof_columns, tensor, joint_ids, env_ids)
         self._sim.constants_changed()
         for actuator in self.actuators.values():  # their torque law may depend on it
             if actuator.changes_passive or actuator.effects is not None:
@@ -466,7 +436,7 @@ class Articulation:
                 own = getattr(actuator, name)
                 columns = self._columns_of(actuator)
                 written = torch.zeros_like(whole, dtype=torch.bool)
-                self._write(written, self._dof_columns, True, joint_ids, env_ids)
+                self._write(written, self._layout.dof_columns, True, joint_ids, env_ids)
                 setattr(actuator, name, torch.where(written[:, columns], whole[:, columns], own))
                 self._write_passive(actuator)
 
@@ -478,54 +448,9 @@ class Articulation:
         joint_ids: JointIds,
         env_ids: EnvIds,
     ) -> None:
-        _assign(field, _indices(env_ids), columns[_indices(joint_ids)], value)
+        assign(field, indices(env_ids), columns[indices(joint_ids)], value)
 
     def _refresh(self) -> None:
-        if not self._side_by_side:
-            torch.index_select(self._sim.qpos, 1, self._qpos_columns, out=self.data.joint_pos)
-            torch.index_select(self._sim.qvel, 1, self._dof_columns, out=self.data.joint_vel)
-
-
-def _indices(ids: EnvIds | JointIds) -> torch.Tensor | slice:
-    """What selects these rows or columns, in the caller's order: values belong to the ids one by one."""
-    if ids is None or isinstance(ids, slice):
-        return slice(None) if ids is None else ids
-    indices = torch.as_tensor(ids)
-    return indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
-
-
-def _of(tensor: torch.Tensor | None, ids: Any) -> Any:
-    """The columns of a drive's joints; the tensor itself where it drives them all."""
-    return tensor if tensor is None or isinstance(ids, slice) else tensor[:, ids]
-
-
-def _span(columns: torch.Tensor) -> slice:
-    first = int(columns[0])
-    return slice(first, first + len(columns))
-
-
-def _zeros_like(tensor: torch.Tensor) -> torch.Tensor:
-    with torch.inference_mode(False):  # can be written outside of the caller's inference mode too
-        return torch.zeros_like(tensor)
-
-
-def _assign(
-    field: torch.Tensor,
-    rows: torch.Tensor | slice,
-    columns: torch.Tensor | slice,
-    value: torch.Tensor | float,
-) -> None:
-    """``field[rows][:, columns] = value`` for any mix of slices and indices."""
-    if isinstance(rows, slice) or isinstance(columns, slice):
-        field[rows, columns] = torch.as_tensor(value, dtype=field.dtype)
-    else:
-        field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype)
-
-
-def _find(
-    keys: str | Sequence[str], names: Sequence[str], preserve_order: bool, what: str
-) -> tuple[list[int], list[str]]:
-    groups = match_names(keys, names, what=what)
-    found = [i for group in groups for i in group]
-    found = list(dict.fromkeys(found)) if preserve_order else sorted(set(found))
-    return found, [names[i] for i in found]
+        if not self._layout.side_by_side:
+            torch.index_select(self._sim.qpos, 1, self._layout.qpos_columns, out=self.data.joint_pos)
+            torch.index_select(self._sim.qvel, 1, self._layout.dof_columns, out=self.data.joint_vel)

@@ -88,7 +88,7 @@ class RslRlOnPolicyRunnerCfg:
     num_steps_per_env: int = 24
     """Environment steps per iteration."""
 
-    max_iterations: int = 1000
+    max_iterations: int = 600
     """Iterations of a training."""
 
     save_interval: int = 50

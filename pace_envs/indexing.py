@@ -1,0 +1,55 @@
+"""Rows of environments and columns of joints, however they are named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from pace_actuators import match_names
+from pace_envs.simulation import EnvIds
+
+JointIds = Sequence[int] | torch.Tensor | slice | None
+
+
+def indices(ids: EnvIds | JointIds) -> torch.Tensor | slice:
+    """What selects these rows or columns, in the caller's order: values belong to the ids one by one."""
+    if ids is None or isinstance(ids, slice):
+        return slice(None) if ids is None else ids
+    indices = torch.as_tensor(ids)
+    return indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
+
+
+def pick(tensor: torch.Tensor | None, ids: Any) -> Any:
+    """The columns of a drive's joints; the tensor itself where it drives them all."""
+    return tensor if tensor is None or isinstance(ids, slice) else tensor[:, ids]
+
+
+def zeros_like(tensor: torch.Tensor) -> torch.Tensor:
+    """Zeros that can be written in inference mode and outside of it."""
+    with torch.inference_mode(False):
+        return torch.zeros_like(tensor)
+
+
+def assign(
+    field: torch.Tensor,
+    rows: torch.Tensor | slice,
+    columns: torch.Tensor | slice,
+    value: torch.Tensor | float,
+) -> None:
+    """``field[rows][:, columns] = value`` for any mix of slices and indices."""
+    if isinstance(rows, slice) or isinstance(columns, slice):
+        field[rows, columns] = torch.as_tensor(value, dtype=field.dtype)
+    else:
+        field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype)
+
+
+def find_names(
+    keys: str | Sequence[str], names: Sequence[str], preserve_order: bool, what: str
+) -> tuple[list[int], list[str]]:
+    """Indices and names that match, in the order of the names or of the keys."""
+    groups = match_names(keys, names, what=what)
+    found = [i for group in groups for i in group]
+    found = list(dict.fromkeys(found)) if preserve_order else sorted(set(found))
+    return found, [names[i] for i in found]
