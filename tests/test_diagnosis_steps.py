@@ -346,7 +346,7 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
     ]
     this = Round(trials=trials, chosen=[GAIN, STRIBECK], rivals=[[], []], models=models)
     no_fits({STRIBECK: errors_of(2e-4, 1e-4), GAIN: errors_of(1e-4, rmse)})
-    result = swapping.swapped(bench.twins, now, errors_of(1e-4, 1e-4), [this])
+    result = swapping.swapped(bench.twins, now, errors_of(1e-4, 1e-4), [this], torch.full((2,), 1e-4))
     if not agree:
         assert result is None and this.chosen == [GAIN, STRIBECK]
         return
@@ -368,7 +368,10 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
     )
     second = Round(trials=[[make_trial(QUADRATIC, 0, 3e-4)]], chosen=[QUADRATIC], rivals=[[]])
     no_fits({GAIN: errors_of(1e-4)})
-    result = swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second])
+    floor = torch.tensor([1e-4])
+    # at the floor nothing is left to gain
+    assert swapping.swapped(bench.twins, now, errors_of(1.2e-4), [first, second], floor) is None
+    result = swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor)
     assert labels(result.model, ["servo"]) == ["quadratic_friction", "torque_gain"]
     physical = result.model.to_physical(result.x)[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
@@ -378,4 +381,4 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
     # a lone effect was the best of its round: nothing is tried in its place
     lone = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]))
     first.chosen = [STRIBECK]
-    assert swapping.swapped(bench.twins, lone, errors_of(3e-4), [first]) is None
+    assert swapping.swapped(bench.twins, lone, errors_of(3e-4), [first], floor) is None

@@ -14,7 +14,7 @@ from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.swapping import swapped
-from pace_optim.diagnosis.trials import RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -31,8 +31,6 @@ FROM_SCREENING = 2
 FAR_FROM_FLOOR = 50.0
 """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
 do for the first one."""
-NEXT_FLOOR = 1.3
-"""Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -89,7 +87,7 @@ def add_effects(
         now = _combined(problem, now, found)
         problem, now = follow(problem, now)
         errors = validation_errors(problem, [now])[0]
-        if (exchanged := swapped(problem, now, errors, outcome.rounds)) is not None:
+        if (exchanged := swapped(problem, now, errors, outcome.rounds, floor)) is not None:
             problem, now = follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
         now, errors = pruned(problem, now, errors, found.chosen)

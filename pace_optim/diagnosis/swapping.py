@@ -10,7 +10,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.model import BASE
-from pace_optim.diagnosis.trials import RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -23,7 +23,9 @@ _Exchange = dict[int, type[Effect]]
 """Joint -> the effect that another one takes the place of."""
 
 
-def swapped(problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequence[Round]) -> Fitted | None:
+def swapped(
+    problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequence[Round], floor: torch.Tensor
+) -> Fitted | None:
     """Try what each joint could have had instead, now that the rest is known; ``None`` if nothing is better.
 
     When an effect was chosen, its neighbours moved as the base model does, and effects that were found since were
@@ -35,8 +37,9 @@ def swapped(problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequ
         now: The present model.
         errors: Its errors.
         rounds: What was tried; their choices are updated.
+        floor: Nearer to this RMSE of each joint there is nothing to gain, (n,) [rad].
     """
-    exchanges = _exchanges(now, rounds)
+    exchanges = _exchanges(now, rounds, errors.mse.sqrt() > NEXT_FLOOR * floor)
     if not exchanges:
         return None
     starts = [_start(now, effect, joints, rounds) for effect, joints in exchanges.items()]
@@ -57,7 +60,7 @@ def swapped(problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequ
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
 
 
-def _exchanges(now: Fitted, rounds: Sequence[Round]) -> dict[type[Effect], _Exchange]:
+def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) -> dict[type[Effect], _Exchange]:
     """What is tried in place of what, joint by joint."""
     model = now.model
     in_use = {effect for effect, has in zip(model.effects, model.has, strict=True) if bool(has.any())}
@@ -66,7 +69,7 @@ def _exchanges(now: Fitted, rounds: Sequence[Round]) -> dict[type[Effect], _Exch
         for j, old in enumerate(this.chosen):
             if old is None or old not in in_use or not bool(model.has[model.effects.index(old), j]):
                 continue
-            several = int(model.has[:, j].sum()) > 1
+            several = int(model.has[:, j].sum()) > 1 and bool(unexplained[j])
             without = model.without_effect(old, torch.arange(model.num_joints) == j)
             near = [t for t in _near(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
             wanted = [t.effect for k, t in enumerate(near) if t.effect in in_use or (several and k < _PER_JOINT)]

@@ -9,6 +9,8 @@ from pace_optim.diagnosis.descent import Fitted
 
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
+NEXT_FLOOR = 1.3
+"""Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 
 
 @dataclass(kw_only=True, eq=False)
