@@ -133,7 +133,7 @@ def main() -> None:
     """Record, identify, train, judge, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3, help="policies of each kind (default 3)")
-    parser.add_argument("--iterations", type=int, default=400, help="of each training (default 400)")
+    parser.add_argument("--iterations", type=int, default=250, help="of each training (default 250)")
     parser.add_argument("--policies", default="abcd", help="which of them, by letter (default abcd)")
     parser.add_argument("--robots", type=int, default=96, help="that walk 20 s each (default 96)")
     parser.add_argument("--robot_seed", type=int, default=0, help='draws the "real" robot')
