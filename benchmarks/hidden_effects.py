@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import multiprocessing
+import os
 import sys
 import time
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +22,11 @@ import torch
 from hidden_effects_cases import GROUPS, ROBOTS, Job, make_jobs, run_job
 from hidden_effects_table import make_table
 
-from pace_envs.simulation import SimulationCfg
 
-
-def start_worker() -> None:
-    """One thread for each worker process: tensors and physics alike."""
+def start_worker(processors: SimpleQueue[int]) -> None:
+    """One thread for each worker process, tensors and physics alike, and a processor of its own."""
     torch.set_num_threads(1)
-    SimulationCfg.__init__.__kwdefaults__["num_threads"] = 1  # its default is one per processor
+    os.sched_setaffinity(0, {processors.get()})
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
@@ -44,7 +45,11 @@ def run_all(jobs: list[Job], results: Path, workers: int) -> None:
     print(f"{len(jobs)} cases, {len(jobs) - len(left)} done before")
     results.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    with multiprocessing.get_context("spawn").Pool(workers, start_worker) as pool, results.open("a") as file:
+    context = multiprocessing.get_context("spawn")
+    processors = context.SimpleQueue()
+    for _, processor in zip(range(workers), itertools.cycle(sorted(os.sched_getaffinity(0))), strict=False):
+        processors.put(processor)
+    with context.Pool(workers, start_worker, (processors,)) as pool, results.open("a") as file:
         for i, line in enumerate(pool.imap_unordered(run_job, left), start=1):
             file.write(json.dumps(line) + "\n")
             file.flush()

@@ -11,6 +11,7 @@ import torch
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.robots import apply_test_bench_load
+from pace_envs.simulation import available_processors
 
 MASS, LENGTH, GRAVITY = 1.0, 0.2, 9.81
 INERTIA = MASS * LENGTH**2
@@ -297,3 +298,11 @@ def test_after_closing_what_was_read_stays_readable():
     env.close()
     env.close()
     assert position.tolist() == [[0.0], [0.0]]
+
+
+def test_threads_are_those_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3}, raising=False)
+    assert available_processors() == 1
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 5)
+    assert available_processors() == 5
