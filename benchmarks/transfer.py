@@ -4,10 +4,10 @@
     python benchmarks/transfer.py --table
 
 A "real" ANYmal D has drives with a delay and a hidden effect (transfer_robot.py; the plant shares no code with the
-model). It is recorded in the air, identified and diagnosed. Policies are trained with the task's own drives (nominal),
-with those under the usual randomisation, with the identified base model, and with the diagnosed effect added; each then
-walks in the world it was trained in and on the "real" robot. Everything is kept in --folder: what is done is not done
-again.
+model). It is recorded in the air, identified and diagnosed. Of every seed a policy learns to walk with the task's own
+drives, and goes on four times: with the same drives (nominal), with those under the usual randomisation, with the
+identified base model, and with the diagnosed effect added. Each of the four then walks in the world it was trained in
+and on the "real" robot. Everything is kept in --folder: what is done is not done again.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ HIDDEN = {"torque_gain": {"gain": -0.25}}
 """All drives give a quarter less torque than they say."""
 TRAINED_ON = ("chirp_medium", "triangle", "steps", "chirp_mass")
 """Recordings of the battery that are fitted; its multisine and other steps validate."""
+START = "start"
+"""The policy of a seed that all its others go on from, with the task's own drives."""
 VARIANTS = {
     "a nominal": [],
     "b randomised": ["--randomize"],
@@ -81,12 +83,11 @@ def identify(folder: Path, seed: int) -> dict[str, str]:
     return runs
 
 
-def train(folder: Path, variant: str, seed: int, iterations: int, fits: dict[str, str], processors: set[int]) -> None:
+def train(folder: Path, policy: str, seed: int, iterations: int, options: list[str], processors: set[int]) -> None:
     """Train one policy on some of the processors."""
-    if run_of(folder, variant, seed) is not None:
+    if run_of(folder, policy, seed) is not None:
         return
-    options = [fits.get(word, word) for word in VARIANTS[variant]]
-    log = policies(folder, variant, seed)
+    log = policies(folder, policy, seed)
     command = [sys.executable, str(SCRIPTS / "train.py"), "--task", TASK, "--seed", str(seed), "--log_dir", str(log)]
     command += ["--max_iterations", str(iterations), *options]
     log.mkdir(parents=True, exist_ok=True)
@@ -95,17 +96,39 @@ def train(folder: Path, variant: str, seed: int, iterations: int, fits: dict[str
         subprocess.run(
             command, stdout=out, stderr=out, check=True, preexec_fn=lambda: os.sched_setaffinity(0, processors)
         )
-    print(f"{variant}, seed {seed}: trained in {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+    print(f"{policy}, seed {seed}: trained in {(time.perf_counter() - start) / 60:.1f} min", flush=True)
 
 
-def policies(folder: Path, variant: str, seed: int) -> Path:
+def train_all(args: argparse.Namespace, fits: dict[str, str]) -> None:
+    """Train what is not trained yet, as many at once as there are workers."""
+    free = [set(share.tolist()) for share in np.array_split(sorted(os.sched_getaffinity(0)), args.workers)]
+
+    def run(job: tuple[str, int]) -> None:
+        policy, seed = job
+        options, iterations = [], args.start_iterations
+        if policy != START:
+            options = [fits.get(word, word) for word in VARIANTS[policy]]
+            options += ["--start_from", str(run_of(args.folder, START, seed))]
+            iterations += args.iterations
+        processors = free.pop()
+        try:
+            train(args.folder, policy, seed, iterations, options, processors)
+        finally:
+            free.append(processors)
+
+    with ThreadPoolExecutor(args.workers) as pool:
+        list(pool.map(run, [(START, seed) for seed in range(args.seeds)]))
+        list(pool.map(run, [(policy, seed) for seed in range(args.seeds) for policy in VARIANTS]))
+
+
+def policies(folder: Path, policy: str, seed: int) -> Path:
     """Where a policy's training is kept."""
-    return folder / "policies" / f"{variant[0]}_{seed}"
+    return folder / "policies" / f"{policy.split()[0]}_{seed}"
 
 
-def run_of(folder: Path, variant: str, seed: int) -> Path | None:
+def run_of(folder: Path, policy: str, seed: int) -> Path | None:
     """The folder of a finished training."""
-    done = sorted(policies(folder, variant, seed).glob("*/*/exported/policy.json"))
+    done = sorted(policies(folder, policy, seed).glob("*/*/exported/policy.json"))
     return done[-1].parents[1] if done else None
 
 
@@ -133,8 +156,8 @@ def main() -> None:
     """Record, identify, train, judge, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3, help="policies of each kind (default 3)")
-    parser.add_argument("--iterations", type=int, default=250, help="of each training (default 250)")
-    parser.add_argument("--policies", default="abcd", help="which of them, by letter (default abcd)")
+    parser.add_argument("--start_iterations", type=int, default=400, help="of the common start (default 400)")
+    parser.add_argument("--iterations", type=int, default=100, help="of each policy after it (default 100)")
     parser.add_argument("--robots", type=int, default=96, help="that walk 20 s each (default 96)")
     parser.add_argument("--robot_seed", type=int, default=0, help='draws the "real" robot')
     parser.add_argument("--workers", type=int, default=2, help="trainings at once (default 2)")
@@ -148,26 +171,14 @@ def main() -> None:
     results = args.folder / "results.jsonl"
     if not args.table:
         fits = identify(args.folder, args.robot_seed)
-        jobs = [(variant, seed) for seed in range(args.seeds) for variant in VARIANTS if variant[0] in args.policies]
-        shares = [set(share.tolist()) for share in np.array_split(sorted(os.sched_getaffinity(0)), args.workers)]
-        with ThreadPoolExecutor(args.workers) as pool:
-            free = list(shares)
-
-            def run(job: tuple[str, int]) -> None:
-                share = free.pop()
-                try:
-                    train(args.folder, *job, args.iterations, fits, share)
-                finally:
-                    free.append(share)
-
-            list(pool.map(run, jobs))
+        train_all(args, fits)
         known = {(line["policy"], line["seed"]) for line in read(results)}
-        for variant, seed in jobs:
-            if (variant, seed) not in known:
-                line = judge(args.folder, args.robot_seed, args.robots, variant, seed)
+        for job in ((policy, seed) for seed in range(args.seeds) for policy in VARIANTS):
+            if job not in known:
+                line = judge(args.folder, args.robot_seed, args.robots, *job)
                 with results.open("a") as file:
                     file.write(json.dumps(line) + "\n")
-                print(f"{variant}, seed {seed}: judged", flush=True)
+                print(f"{job[0]}, seed {job[1]}: judged", flush=True)
     lines = read(results)
     print(make_table(lines))
     plot_transfer(lines, args.plot or args.folder / "transfer.png")

@@ -27,6 +27,9 @@ def main() -> None:
         "--randomize_identified", type=float, metavar="K", help="drives within K of their error bars (usually 1)"
     )
     parser.add_argument("--physics_dt", type=float, metavar="S", help="step of physics and drives (default: the fit's)")
+    parser.add_argument(
+        "--start_from", metavar="CHECKPOINT", help="go on from this policy in a new run, such as with other drives"
+    )
     parser.add_argument("--log_dir", default="logs/rsl_rl", metavar="DIR", help="where runs are kept")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted or finished run")
     args = vars(parser.parse_args())

@@ -1,5 +1,6 @@
 """Training with rsl-rl: the wrapper keeps rsl-rl's contract, and a training can be run, resumed, played, exported."""
 
+import copy
 import json
 import os
 import subprocess
@@ -174,6 +175,20 @@ def test_a_training_goes_on_where_it_stopped(run):
     assert latest_checkpoint(run).name == "model_2.pt" and RunSettings.read(run).max_iterations == 3
     with pytest.raises(ValueError, match="ends after 3 iterations"):
         resume(run)
+
+
+def test_a_training_with_other_options_starts_from_another_s_policy(run, tmp_path):
+    started = copy.deepcopy(RunSettings.read(run))
+    started.start_from, started.log_dir, started.randomize = str(run / "model_0.pt"), str(tmp_path), True
+    started.max_iterations = 2
+    folder = train(started)
+    assert folder != run and {p.name for p in folder.glob("model_*.pt")} == {"model_1.pt"}
+    assert RunSettings.read(folder).randomize and (folder / "exported" / "policy.pt").is_file()
+    first, other = (torch.load(p / "model_1.pt", weights_only=False) for p in (run, folder))
+    assert other["iter"] == first["iter"] == 1
+    started.start_from = str(tmp_path / "nothing.pt")
+    with pytest.raises(ValueError, match="does not exist"):
+        train(started)
 
 
 def test_the_curriculum_goes_on_where_it_stopped_and_a_judge_has_none(run, tmp_path):

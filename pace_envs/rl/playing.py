@@ -12,7 +12,7 @@ import numpy as np
 from pace_envs.rendering import OffscreenRenderer
 from pace_envs.rl.evaluation import Evaluation, evaluate
 from pace_envs.rl.export import export_policy
-from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, latest_checkpoint
+from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, find_checkpoint
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rl.training import EditCfg, load_cfg, make_env
 from pace_envs.rl.video import check_video_path, write_video
@@ -66,11 +66,7 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
     """
     if settings.video is not None:
         check_video_path(settings.video)
-    path = Path(settings.checkpoint)
-    if path.is_dir():
-        path = latest_checkpoint(path)
-    elif not path.is_file():
-        raise ValueError(f"The checkpoint {path} does not exist.")
+    path = find_checkpoint(settings.checkpoint)
     run = _run_settings(path, settings)
     cfg = load_cfg(run, edit)
     play_cfg(cfg)

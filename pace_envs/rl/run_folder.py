@@ -45,6 +45,10 @@ class RunSettings:
     physics_dt: float | None = None
     """Time step of physics and drives [s]; ``None`` means the identification's, or the task's."""
 
+    start_from: str | None = None
+    """Checkpoint, or a run's folder for its last one, that the training goes on from in a folder of its own; its
+    iterations count. ``None`` starts with new networks."""
+
     log_dir: str = "logs/rsl_rl"
     """Where runs are kept."""
 
@@ -66,7 +70,8 @@ class RunSettings:
             raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-            added = {"identified": None, "randomize_identified": None, "physics_dt": None}  # not in older runs
+            # not in older runs
+            added = dict.fromkeys(("identified", "randomize_identified", "physics_dt", "start_from"))
             settings = cls(**{field.name: (added | data)[field.name] for field in fields(cls)})
         except (json.JSONDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}).") from None
@@ -86,6 +91,20 @@ def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:
             continue
         return folder
     raise OSError(f"{base} exists, and so do 999 more like it.")
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """A checkpoint, or the last one of a run's folder.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return latest_checkpoint(path)
+    if not path.is_file():
+        raise ValueError(f"The checkpoint {path} does not exist.")
+    return path
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -14,7 +14,7 @@ from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
 from pace_envs.rl.export import export_policy
-from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, latest_checkpoint, new_run_folder
+from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, find_checkpoint, latest_checkpoint, new_run_folder
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
@@ -88,11 +88,12 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
         edit: Changes the environment's configuration.
     """
     cfg = load_cfg(settings, edit)
+    start = None if settings.start_from is None else find_checkpoint(settings.start_from)
     folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
     settings.write(folder)
     if settings.identified is not None:
         shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
-    return _learn(cfg, folder, checkpoint=None)
+    return _learn(cfg, folder, start)
 
 
 def resume(run: str | Path, max_iterations: int | None = None, edit: EditCfg | None = None) -> Path:
