@@ -367,8 +367,10 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
         models={GAIN: alone},
     )
     second = Round(trials=[[make_trial(QUADRATIC, 0, 3e-4)]], chosen=[QUADRATIC], rivals=[[]])
-    no_fits({GAIN: errors_of(1e-4)})
     floor = torch.tensor([1e-4])
+    no_fits({GAIN: errors_of(2.8e-4)})  # as good is not better: the older effect stays
+    assert swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor) is None
+    no_fits({GAIN: errors_of(1e-4)})
     # at the floor nothing is left to gain
     assert swapping.swapped(bench.twins, now, errors_of(1.2e-4), [first, second], floor) is None
     result = swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor)

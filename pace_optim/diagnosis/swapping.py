@@ -104,7 +104,7 @@ def _choose(
     exchanges: dict[type[Effect], _Exchange],
     after: dict[type[Effect], torch.Tensor],
 ) -> dict[int, type[Effect]]:
-    """Joints that change, with their new effect: the best of each; among rivals, the one that most joints want."""
+    """Joints that change, with their new effect: the best of each; among rivals, the one most wanted."""
     model = now.model
     near: dict[int, dict[type[Effect], float]] = {}
     for j in sorted({j for joints in exchanges.values() for j in joints}):
@@ -118,7 +118,8 @@ def _choose(
         for effect in own:
             wanted[effect] = wanted.get(effect, 0) + 1
     total = {effect: sum(options.get(effect, 0.0) for options in near.values()) for effect in wanted}
-    best = {j: min(options, key=lambda e: (-wanted[e], total[e])) for j, options in near.items()}
+    used = {effect: int(has.sum()) for effect, has in zip(model.effects, model.has, strict=True)}
+    best = {j: min(options, key=lambda e: (-wanted[e], -used.get(e, 0), total[e])) for j, options in near.items()}
     return {j: effect for j, effect in best.items() if j in exchanges.get(effect, {})}
 
 
