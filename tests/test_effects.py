@@ -121,6 +121,20 @@ def test_the_targets_rate_is_limited_before_it_is_delayed():
     assert [drive.one(target) / 100.0 for target in targets] == pytest.approx(late)
 
 
+@pytest.mark.parametrize("name", ["joint_elasticity", "backlash"])
+def test_a_fit_feels_the_damping_of_a_soft_transmission_from_zero_on(name):
+    def torque(damping):
+        gap = {"backlash.gap": 0.001} if name == "backlash" else {}
+        drive = Drive([name], gap | {f"{name}.stiffness": 2000.0, f"{name}.damping": damping})
+        for k in range(4):
+            force = drive.one(target=0.3, v=0.1 * k)
+        return force
+
+    values = [torque(c) for c in (0.0, 1e-3, 2e-3)]
+    assert abs(values[1] - values[0]) > 1e-7
+    assert values[2] - values[1] == pytest.approx(values[1] - values[0], rel=0.05)
+
+
 def test_friction_laws():
     drive = Drive(["stribeck_friction"], {"stribeck_friction.effort": 1.5, "stribeck_friction.velocity": 0.2})
     for v in (0.0, 0.1, -0.2, 3.0):

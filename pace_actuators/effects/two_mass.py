@@ -50,7 +50,8 @@ class _TwoMass(Effect):
     parts_motor_and_link = True
     reads_load = True
     numerical_damping: ClassVar[float] = 0.05
-    """c is at least this part of k h: what is too fast for the step dies out, a resonance inside the band does not."""
+    """Part of k h below which c does not fall (half of what it says is added there, so that a fit feels it): what is
+    too fast for the step dies out, a resonance inside the band does not."""
     encoder_side: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
@@ -125,7 +126,8 @@ class _TwoMass(Effect):
         h, relative = self.dt, self._speed - s.joint_vel
         torque, k = self.spring(self._angle - s.joint_pos + 0.5 * h * relative)
         torque = torque - k * (0.5 * h * relative)  # looked ahead for contact only
-        c = torch.maximum(self.damping_of(k, s), (self.numerical_damping * h) * k)
+        c = self.damping_of(k, s)
+        c = torch.maximum(c, (self.numerical_damping * h) * k + 0.5 * c)
         coupling = 0.25 * h * k + 0.5 * c
         ahead = (0.25 if self.is_trapezoidal else -0.25) * h * k
         explicit = torque + (0.5 * c + ahead) * relative

@@ -17,7 +17,8 @@ from pace_optim.problem import Problem
 
 _FAR = 0.02
 """A joint without neighbours feels a reference that is this near [rad] as its own motion: gravity is linear there."""
-_ITERATIONS = 10
+_ITERATIONS = 20
+"""At most; an elasticity that was found behind an overdamped base model takes most of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
