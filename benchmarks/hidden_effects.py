@@ -8,25 +8,15 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import itertools
 import json
-import multiprocessing
-import os
 import sys
 import time
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
-import torch
 from hidden_effects_cases import GROUPS, ROBOTS, Job, make_jobs, run_job
 from hidden_effects_table import make_table
-
-
-def start_worker(processors: SimpleQueue[int]) -> None:
-    """One thread for each worker process, tensors and physics alike, and a processor of its own."""
-    torch.set_num_threads(1)
-    os.sched_setaffinity(0, {processors.get()})
+from workers import pinned_pool
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
@@ -45,11 +35,7 @@ def run_all(jobs: list[Job], results: Path, workers: int) -> None:
     print(f"{len(jobs)} cases, {len(jobs) - len(left)} done before")
     results.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    context = multiprocessing.get_context("spawn")
-    processors = context.SimpleQueue()
-    for _, processor in zip(range(workers), itertools.cycle(sorted(os.sched_getaffinity(0))), strict=False):
-        processors.put(processor)
-    with context.Pool(workers, start_worker, (processors,)) as pool, results.open("a") as file:
+    with pinned_pool(workers) as pool, results.open("a") as file:
         for i, line in enumerate(pool.imap_unordered(run_job, left), start=1):
             file.write(json.dumps(line) + "\n")
             file.flush()
@@ -64,7 +50,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="cases of each kind")
     parser.add_argument("--recordings", choices=("battery", "chirp"), default="battery")
     parser.add_argument("--robot", choices=tuple(ROBOTS), default="bench")
-    parser.add_argument("--workers", type=int, default=2, help="processes, one thread each")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
     parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
     parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")

@@ -18,8 +18,8 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,10 @@ import numpy as np
 import torch
 from transfer_robot import make_real
 from transfer_table import make_table, plot_transfer
+from workers import pinned_pool
 
 from pace_envs.rl import Evaluation, PlaySettings, play
+from pace_envs.rl.training import EditCfg
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.fit import fit
 from pace_optim.fit_settings import FitSettings
@@ -83,42 +85,81 @@ def identify(folder: Path, seed: int) -> dict[str, str]:
     return runs
 
 
-def train(folder: Path, policy: str, seed: int, iterations: int, options: list[str], processors: set[int]) -> None:
-    """Train one policy on some of the processors."""
-    if run_of(folder, policy, seed) is not None:
-        return
-    log = policies(folder, policy, seed)
-    command = [sys.executable, str(SCRIPTS / "train.py"), "--task", TASK, "--seed", str(seed), "--log_dir", str(log)]
-    command += ["--max_iterations", str(iterations), *options]
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A policy to train and to judge."""
+
+    policy: str
+    seed: int
+    settings: argparse.Namespace
+    """The command line."""
+    options: tuple[str, ...] = ()
+    """More options of scripts/train.py."""
+    iterations: int = 0
+    """Of its training, in all."""
+
+
+def train(job: Job) -> str:
+    """Train a policy on the processors of this process."""
+    log = policies(job.settings.folder, job.policy, job.seed)
     log.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, str(SCRIPTS / "train.py"), "--task", TASK, "--seed", str(job.seed)]
+    command += ["--log_dir", str(log), "--max_iterations", str(job.iterations), *job.options]
     start = time.perf_counter()
     with (log / "train.log").open("w") as out:
-        subprocess.run(
-            command, stdout=out, stderr=out, check=True, preexec_fn=lambda: os.sched_setaffinity(0, processors)
-        )
-    print(f"{policy}, seed {seed}: trained in {(time.perf_counter() - start) / 60:.1f} min", flush=True)
+        subprocess.run(command, stdout=out, stderr=out, check=True)
+    return f"{job.policy}, seed {job.seed}: trained in {(time.perf_counter() - start) / 60:.1f} min"
 
 
-def train_all(args: argparse.Namespace, fits: dict[str, str]) -> None:
-    """Train what is not trained yet, as many at once as there are workers."""
-    free = [set(share.tolist()) for share in np.array_split(sorted(os.sched_getaffinity(0)), args.workers)]
+def judge(job: Job) -> dict[str, Any]:
+    """Let a policy walk in its own world and on the "real" robot."""
+    run = run_of(job.settings.folder, job.policy, job.seed)
+    robot, truth = plant_robot(ROBOT), truth_of(job.settings.robot_seed)
+    play_settings = PlaySettings(checkpoint=str(run), num_envs=job.settings.robots, seed=100 + job.seed)
 
-    def run(job: tuple[str, int]) -> None:
-        policy, seed = job
-        options, iterations = [], args.start_iterations
-        if policy != START:
-            options = [fits.get(word, word) for word in VARIANTS[policy]]
-            options += ["--start_from", str(run_of(args.folder, START, seed))]
-            iterations += args.iterations
-        processors = free.pop()
-        try:
-            train(args.folder, policy, seed, iterations, options, processors)
-        finally:
-            free.append(processors)
+    def walk(edit: EditCfg | None) -> dict[str, float]:
+        result = play(play_settings, edit)
+        if not isinstance(result, Evaluation):
+            raise RuntimeError(f"{run} was not judged.")
+        return asdict(result)
 
-    with ThreadPoolExecutor(args.workers) as pool:
-        list(pool.map(run, [(START, seed) for seed in range(args.seeds)]))
-        list(pool.map(run, [(policy, seed) for seed in range(args.seeds) for policy in VARIANTS]))
+    worlds = {"own": walk(None), "real": walk(lambda cfg: make_real(cfg, robot, truth))}
+    return {"policy": job.policy, "seed": job.seed, **worlds}
+
+
+def run_all(settings: argparse.Namespace, fits: dict[str, str], results: Path) -> None:
+    """Train and judge what is not done yet, as many at once as there are workers."""
+    folder, seeds, common = settings.folder, range(settings.seeds), settings.start_iterations
+
+    def jobs_of(policy: str, options: Sequence[str], iterations: int) -> list[Job]:
+        return [
+            Job(
+                policy=policy,
+                seed=seed,
+                settings=settings,
+                options=(*options, *([] if policy == START else ["--start_from", str(run_of(folder, START, seed))])),
+                iterations=iterations,
+            )
+            for seed in seeds
+        ]
+
+    def train_missing(jobs: list[Job]) -> None:
+        for told in pool.imap_unordered(train, [j for j in jobs if run_of(folder, j.policy, j.seed) is None], 1):
+            print(told, flush=True)
+
+    with pinned_pool(settings.workers) as pool:
+        train_missing(jobs_of(START, [], common))
+        jobs = [
+            job
+            for policy, options in VARIANTS.items()
+            for job in jobs_of(policy, [fits.get(word, word) for word in options], common + settings.iterations)
+        ]
+        train_missing(jobs)
+        known = {(line["policy"], line["seed"]) for line in read(results)}
+        for line in pool.imap_unordered(judge, [job for job in jobs if (job.policy, job.seed) not in known], 1):
+            with results.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+            print(f"{line['policy']}, seed {line['seed']}: judged", flush=True)
 
 
 def policies(folder: Path, policy: str, seed: int) -> Path:
@@ -130,26 +171,6 @@ def run_of(folder: Path, policy: str, seed: int) -> Path | None:
     """The folder of a finished training."""
     done = sorted(policies(folder, policy, seed).glob("*/*/exported/policy.json"))
     return done[-1].parents[1] if done else None
-
-
-def judge(folder: Path, seed: int, robots: int, variant: str, policy_seed: int) -> dict[str, Any]:
-    """Let a policy walk in its own world and on the "real" robot."""
-    run = run_of(folder, variant, policy_seed)
-    robot, truth = plant_robot(ROBOT), truth_of(seed)
-
-    def walk(**options: Any) -> dict[str, float]:
-        result = play(PlaySettings(checkpoint=str(run), num_envs=robots, seed=100 + policy_seed), **options)
-        if not isinstance(result, Evaluation):
-            raise RuntimeError(f"{run} was not judged.")
-        return asdict(result)
-
-    own = walk()
-    return {
-        "policy": variant,
-        "seed": policy_seed,
-        "own": own,
-        "real": walk(edit=lambda cfg: make_real(cfg, robot, truth)),
-    }
 
 
 def main() -> None:
@@ -171,14 +192,7 @@ def main() -> None:
     results = args.folder / "results.jsonl"
     if not args.table:
         fits = identify(args.folder, args.robot_seed)
-        train_all(args, fits)
-        known = {(line["policy"], line["seed"]) for line in read(results)}
-        for job in ((policy, seed) for seed in range(args.seeds) for policy in VARIANTS):
-            if job not in known:
-                line = judge(args.folder, args.robot_seed, args.robots, *job)
-                with results.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-                print(f"{job[0]}, seed {job[1]}: judged", flush=True)
+        run_all(args, fits, results)
     lines = read(results)
     print(make_table(lines))
     plot_transfer(lines, args.plot or args.folder / "transfer.png")
