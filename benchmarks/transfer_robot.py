@@ -116,7 +116,7 @@ def make_real(cfg: VelocityEnvCfg, robot: PlantRobot, truth: Truth) -> None:
     drive_class = type("RealDriveOfTruth", (RealDrive,), {"truth": truth})
     values = {field: of_joints(field) for field in ("armature", "viscous_friction", "friction", "encoder_bias")}
     cfg.scene.robot.actuators = {
-        group: replace(drive, class_type=drive_class, delay=0.0, effects=(), **values)
+        group: replace(drive, class_type=drive_class, delay=0.0, delay_s=None, identified=None, effects=(), **values)
         for group, drive in cfg.scene.robot.actuators.items()
     }
     set_step(cfg, robot.control_dt)

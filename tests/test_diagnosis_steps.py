@@ -191,6 +191,23 @@ def test_every_structure_that_an_effect_can_have_starts_a_fit():
     assert [float(p.score) for p in _ranked(own, 0)] == [len(own) - 1, len(own) - 2]
 
 
+def test_where_an_encoder_sits_is_chosen_and_not_walked_to(bench):
+    elasticity, yes = get_effect("joint_elasticity"), torch.tensor([True])
+    fits = []
+    for side in (0.0, 1.0):
+        own = start_values(elasticity, {"encoder_side": side})[None]
+        model, physical = JointModel.base(bench.problem).extended(bench.truth_values, elasticity, yes, own)
+        fits.append(Fitted.start(model.structure_held(elasticity, physical), physical))
+    assert fits[0].model.free[0].tolist() == [True] * (len(BASE) + 2) + [False]
+    link, motor = fits
+    assert [float(f.model.to_physical(f.x)[0, -1]) for f in fits] == [0.0, 1.0]
+    link.take(motor, torch.tensor([False]))
+    assert float(link.model.to_physical(link.x)[0, -1]) == 0.0
+    link.take(motor, yes)
+    assert float(link.model.to_physical(link.x)[0, -1]) == 1.0
+    assert model.structure_held(STRIBECK, physical) is model  # it has nothing of the kind
+
+
 def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):
     backlash, elasticity = get_effect("backlash"), get_effect("joint_elasticity")
     model = JointModel.base(bench.problem).with_effect(backlash, torch.tensor([True]))

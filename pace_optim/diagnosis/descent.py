@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -45,6 +45,16 @@ class Fitted:
         """A model at physical values (n, P), not fitted yet."""
         unknown = torch.full((model.num_joints,), torch.inf, dtype=torch.float64)
         return cls(model=model, x=model.to_normalised(physical), score=unknown, tried=tried)
+
+    def take(self, other: Fitted, joints: torch.Tensor) -> None:
+        """Take over another fit of the same effects on some joints, (n,) bool: values, bounds and score."""
+        lower, upper = (
+            torch.where(joints[:, None], getattr(other.model, side), getattr(self.model, side))
+            for side in ("lower", "upper")
+        )
+        self.model = replace(self.model, lower=lower, upper=upper)
+        self.x = torch.where(joints[:, None], other.x, self.x)
+        self.score = torch.where(joints, other.score, self.score)
 
 
 def fit_coarse_to_fine(

@@ -47,7 +47,8 @@ def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]
     result = []
     for effect, slot, points_of, score in zip(effects, slots, values, batch.split(scores), strict=True):
         physical = points_of[score.argmin(dim=0), torch.arange(now.model.num_joints)]
-        result.append(Fitted.start(slot.model, physical, tried=effect))
+        model = slot.model.structure_held(effect, physical)
+        result.append(Fitted.start(model, physical, tried=effect))
     return result
 
 

@@ -118,6 +118,21 @@ class JointModel:
         physical[joints, self.columns(effect)] = values[joints]
         return model, physical
 
+    def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
+        """The same with an effect's structural parameter held where it is: a choice between things is no way to walk.
+
+        Args:
+            effect: The effect.
+            physical: Of this model, (n, P).
+        """
+        if not effect.structural:
+            return self
+        place = [parameter.name for parameter in effect.parameters].index(effect.structural)
+        column, has = self.columns(effect).start + place, self.has[self.effects.index(effect)]
+        lower, upper = self.lower.clone(), self.upper.clone()
+        lower[has, column] = upper[has, column] = physical[has, column]
+        return replace(self, lower=lower, upper=upper)
+
     def may_get(self, effect: type[Effect]) -> torch.Tensor:
         """Joints that can have an effect beside those that they have, (n,) bool; only one can part motor and link."""
         excluded = self.barred.get(effect, torch.zeros(self.num_joints, dtype=torch.bool)).clone()

@@ -191,8 +191,7 @@ def _begun(
     result: dict[type[Effect] | None, Fitted] = {}
     for each in fit_side_by_side(coarse, starts, max_iteration=4, part=0.4):
         best = result.setdefault(each.tried, each)
-        better = each.score < best.score
-        best.x[better], best.score[better] = each.x[better], each.score[better]
+        best.take(each, each.score < best.score)
     return result
 
 
@@ -229,7 +228,8 @@ def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted
     """The present model with an effect at each joint's probe."""
     own = torch.stack([starts_of(probe)[j] for j, probe in enumerate(probes)])
     physical = now.model.to_physical(now.x)
-    return Fitted.start(*now.model.extended(physical, effect, now.model.may_get(effect), own), tried=effect)
+    model, physical = now.model.extended(physical, effect, now.model.may_get(effect), own)
+    return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
 
 
 def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
