@@ -87,7 +87,7 @@ def test_a_run_goes_on_where_it_was(tmp_path, monkeypatch):
             return map(function, jobs)
 
     ran = []
-    monkeypatch.setattr(hidden_effects.multiprocessing, "get_context", lambda kind: type("C", (), {"Pool": Serial}))
+    monkeypatch.setattr(hidden_effects, "pinned_pool", Serial)
     monkeypatch.setattr(hidden_effects, "run_job", lambda job: ran.append(job) or {"case": job.case.name})
     jobs = [Job(group="clean", case=Case(seed=seed), folder=tmp_path) for seed in range(3)]
     results = tmp_path / "r.jsonl"

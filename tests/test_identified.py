@@ -201,13 +201,14 @@ def test_another_robot_is_refused(result):
 
 
 def test_the_policys_gains_stay(result):
+    changed(result, drive={"damping": dict.fromkeys(JOINTS, 0.9)})
     env = walking(result)
     (drive,) = env.scene["robot"].actuators.values()
-    assert drive.damping[0, 0] == 4.0 and drive.armature[0, 1] == pytest.approx(0.055)
+    assert drive.damping[0, 0] == 0.6 and drive.armature[0, 1] == pytest.approx(0.055)
     assert env.physics_dt == DT and env.step_dt == pytest.approx(0.02)
     env.close()
     env = walking(result, gains=True)
-    assert next(iter(env.scene["robot"].actuators.values())).damping[0, 0] == 0.6
+    assert next(iter(env.scene["robot"].actuators.values())).damping[0, 0] == 0.9
     env.close()
 
 
