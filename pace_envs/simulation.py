@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import mujoco
@@ -162,7 +163,7 @@ class Simulation:
         axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
         weight = self.expand("body_subtreemass")[:, bodies, None] * torch.tensor(model.opt.gravity)
         turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
-        return inertia, -(axis * turned).sum(dim=-1), inertia * self._stands_alone(columns)
+        return inertia, -(axis * turned).sum(dim=-1), inertia * self._stands_alone[columns]
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Note that an effect has written to the bodies of joints with these degrees of freedom."""
@@ -208,10 +209,11 @@ class Simulation:
             raise ValueError(f"env_ids holds {ids[0]} to {ids[-1]}, expected 0 to {self.num_envs - 1}.")
         return ids.astype(np.int32)
 
-    def _stands_alone(self, columns: torch.Tensor) -> torch.Tensor:
-        """Which degrees of freedom follow no other, and are followed by none, (len(columns),) bool."""
-        ids, parents = columns.numpy(), self.model.dof_parentid
-        return torch.as_tensor((parents[ids] < 0) & ~np.isin(ids, parents))
+    @cached_property
+    def _stands_alone(self) -> torch.Tensor:
+        """Which degrees of freedom follow no other, and are followed by none, (nv,) bool."""
+        parents = self.model.dof_parentid
+        return torch.as_tensor((parents < 0) & ~np.isin(np.arange(len(parents)), parents))
 
     def close(self) -> None:
         """Release the simulations."""

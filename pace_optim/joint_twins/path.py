@@ -147,6 +147,7 @@ def _feel(
 ) -> Feel:
     """Inertia of each joint, and the torque that the rest of the robot leaves on it, -(bias_j + Σ_{k≠j} M_jk a_k)."""
     steps, count, n = q.shape
+    own_block = np.ix_(columns, columns)
     inertia, torque = np.empty((steps, count, n)), np.empty((steps, count, n))
     for r, model in enumerate(models):
         data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
@@ -158,7 +159,7 @@ def _feel(
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
             mujoco.mj_fullM(model, data, mass)
-            own = mass[np.ix_(columns, columns)]
+            own = mass[own_block]
             diagonal = own.diagonal()
             inertia[k, r] = diagonal
             torque[k, r] = -(data.qfrc_bias[columns] + own @ accelerations[k] - diagonal * accelerations[k])

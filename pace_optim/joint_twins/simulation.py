@@ -62,11 +62,10 @@ class TwinSimulation(Simulation):
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Take over the parameters of an effect on the model, of joints with these degrees of freedom."""
-        order = self._columns.tolist()
-        place = torch.tensor([order.index(column) for column in columns.tolist()])
+        place = self._place(columns)
         for parameter in effect.parameters:
             key = effect.name, parameter.name
-            values = self._model_values.setdefault(key, torch.zeros(self.num_envs, len(order), dtype=torch.float64))
+            values = self._model_values.setdefault(key, torch.zeros(self.num_envs, len(self._columns), dtype=torch.float64))
             values[effect.rows] = values[effect.rows].index_copy(1, place, getattr(effect, parameter.name))
 
     @property
@@ -128,12 +127,13 @@ class TwinSimulation(Simulation):
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as :meth:`Simulation.felt_link`."""
         k = min(self._steps // self._steps_per_interval, self._intervals - 1)
-        order = self._columns.tolist()
-        place = [order.index(column) for column in columns.tolist()]
         rows = (self.num_envs // self._shape[1], -1, -1)
-        inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)[:, place]
-        stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)[:, place]
-        return inertia, -stiffness, inertia * self._stands_alone(columns)
+        inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)
+        stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)
+        if not torch.equal(columns, self._columns):
+            place = self._place(columns)
+            inertia, stiffness = inertia.index_select(1, place), stiffness.index_select(1, place)
+        return inertia, -stiffness, inertia * self._stands_alone[columns]
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """What the joints feel at the start."""
@@ -155,6 +155,11 @@ class TwinSimulation(Simulation):
             inertia = inertia + values.view(self._shape) * change.inertia[k]
             torque = torque + values.view(self._shape) * change.torque[k]
         return inertia, torque
+
+    def _place(self, columns: torch.Tensor) -> torch.Tensor:
+        """Where degrees of freedom are among the joints', (len(columns),)."""
+        order = self._columns.tolist()
+        return torch.tensor([order.index(column) for column in columns.tolist()])
 
     def _joints(self, field: torch.Tensor) -> torch.Tensor:
         """The joints' columns of a field, (candidates, recordings, n)."""
