@@ -11,7 +11,7 @@ from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis import pruning, search, sharing, swapping
+from pace_optim.diagnosis import one_round, pruning, search, sharing, swapping
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
@@ -19,9 +19,10 @@ from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
+from pace_optim.diagnosis.one_round import _ranked
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.screening import Probe, absorbed_effects
-from pace_optim.diagnosis.search import Outcome, _ranked
+from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
@@ -172,8 +173,8 @@ def test_a_search_ends_where_no_effect_gains_anything(bench, monkeypatch):
     base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
     same = torch.ones(1, dtype=torch.float64)
     begun = {None: SimpleNamespace(score=same), STRIBECK: SimpleNamespace(score=2 * same)}
-    monkeypatch.setattr(search, "_begun", lambda *_: begun)
-    monkeypatch.setattr(search, "_promising", lambda *_: {STRIBECK: 0 * same})
+    monkeypatch.setattr(one_round, "_begun", lambda *_: begun)
+    monkeypatch.setattr(one_round, "_promising", lambda *_: {STRIBECK: 0 * same})
     outcome = search.add_effects(bench.twins, base, [STRIBECK], 5 * same, 1e-9 * same, 2)
     assert outcome.rounds == [] and outcome.final is base
 

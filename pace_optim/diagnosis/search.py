@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors, judge
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned
-from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.swapping import swapped
-from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
-SCREEN_THRESHOLD = 0.03
-"""An effect that would explain less than this of what is left is not refitted."""
-SHORT_LIST = 6
-"""Effects refitted because they would explain most of the whole robot's error."""
-WORST_JOINTS = 4
-"""Joints whose own best candidates are refitted too."""
-PER_JOINT = 4
-"""How many of them."""
-FROM_SCREENING = 2
-"""How many of the best screened go on in any case, where refits began with all effects."""
-FAR_FROM_FLOOR = 50.0
-"""An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
-do for the first one."""
+LOOK_AHEAD = 3.0
+"""Where an effect leaves more than this many times the floor, others that came near lead on for a round too."""
+WAYS = 3
+"""How many effects of a joint lead on, at most."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -44,6 +34,16 @@ class Outcome:
     final: Fitted
     final_errors: BlockErrors
     rounds: list[Round] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Branch:
+    """A model on the way, and the rounds that led to it."""
+
+    problem: TwinProblem
+    now: Fitted
+    errors: BlockErrors
+    rounds: list[Round]
 
 
 def add_effects(
@@ -68,192 +68,87 @@ def add_effects(
         say: Shows how far it is.
         follow: Gives the joints along the motion of the robot with the present model, and the model fitted there.
     """
-    now, errors = base, validation_errors(problem, [base])[0]
-    outcome = Outcome(problem=problem, base=base, base_errors=errors, final=base, final_errors=errors)
-    open_joints = torch.ones(base.model.num_joints, dtype=torch.bool)
-    for depth in range(max_effects):
-        open_joints &= errors.mse.sqrt() > (1.0 if depth == 0 else NEXT_FLOOR) * floor
-        untried = [e for e in effects if bool((now.model.may_get(e) & open_joints).any())]
-        if not bool(open_joints.any()) or not untried:
-            break
-        say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
-        found = _try(problem, now, errors, untried, effort, floor, open_joints, say)
-        if found is None:
-            break
-        outcome.rounds.append(found)
-        open_joints &= torch.tensor([effect is not None for effect in found.chosen])
-        if not bool(open_joints.any()):
-            break
-        now = _combined(problem, now, found)
-        problem, now = follow(problem, now)
+    search = _Search(effects=effects, effort=effort, floor=floor, max_effects=max_effects, say=say, follow=follow)
+    errors = validation_errors(problem, [base])[0]
+    branch = _Branch(problem=problem, now=base, errors=errors, rounds=[])
+    found = search.tried(branch)
+    while found is not None and any(effect is not None for effect in found.chosen):
+        branch, found = search.led_on(branch, found)
+    rounds = [*branch.rounds, *([] if found is None else [found])]
+    return Outcome(
+        problem=branch.problem,
+        base=base,
+        base_errors=errors,
+        final=branch.now,
+        final_errors=branch.errors,
+        rounds=rounds,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """What stays the same from round to round; fields as in :func:`add_effects`."""
+
+    effects: Sequence[type[Effect]]
+    effort: torch.Tensor
+    floor: torch.Tensor
+    max_effects: int
+    say: Callable[[str], None]
+    follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]]
+
+    def tried(self, branch: _Branch) -> Round | None:
+        """What could come next; ``None`` if there is nothing to try."""
+        depth = len(branch.rounds)
+        found_so_far = [[r.chosen[j] is not None for r in branch.rounds] for j in range(len(self.floor))]
+        open_joints = torch.tensor([all(each) for each in found_so_far])
+        open_joints &= branch.errors.mse.sqrt() > (1.0 if depth == 0 else NEXT_FLOOR) * self.floor
+        untried = [e for e in self.effects if bool((branch.now.model.may_get(e) & open_joints).any())]
+        if depth == self.max_effects or not bool(open_joints.any()) or not untried:
+            return None
+        self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
+        return try_effects(
+            branch.problem, branch.now, branch.errors, untried, self.effort, self.floor, open_joints, self.say
+        )
+
+    def grown(self, branch: _Branch, found: Round, swapping: bool = True) -> _Branch:
+        """The branch with each joint's chosen effect, and what that changes of the older ones."""
+        rounds = [each.copy() for each in [*branch.rounds, found]]
+        problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         errors = validation_errors(problem, [now])[0]
-        if (exchanged := swapped(problem, now, errors, outcome.rounds, floor)) is not None:
-            problem, now = follow(problem, exchanged)
+        if swapping and (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
+            problem, now = self.follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
         now, errors = pruned(problem, now, errors, found.chosen)
-        outcome.problem, outcome.final, outcome.final_errors = problem, now, errors
-    return outcome
+        return _Branch(problem=problem, now=now, errors=errors, rounds=rounds)
 
+    def led_on(self, branch: _Branch, found: Round) -> tuple[_Branch, Round | None]:
+        """The branch with the effects that lead furthest, and what could come next.
 
-def _try(
-    problem: TwinProblem,
-    now: Fitted,
-    errors: BlockErrors,
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
-    floor: torch.Tensor,
-    open_joints: torch.Tensor,
-    say: Callable[[str], None],
-) -> Round | None:
-    probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
-    excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
-    listed = _short_list(_promising(probes, excess), excess)
-    first = not now.model.effects
-    far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
-    wide = first or far
-    begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
-    if not begin:
-        return None
-    say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
-    begun = _begun(problem, now, probes, begin, far)
-    if wide:
-        listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]]))
-    if not listed:  # no effect does better than the base parameters alone
-        return None
-    say(f"refitting with {_names(listed)}")
-    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed])
-    blocks = validation_errors(problem, fitted)
-    n = now.model.num_joints
-    tried = len(effects) * int(open_joints.sum())
-    trials: list[list[Trial]] = [[] for _ in range(n)]
-    keep: dict[type[Effect], Fitted] = {}
-    for effect, chosen, after in zip(listed, fitted, blocks, strict=True):
-        for j in (open_joints & now.model.may_get(effect)).nonzero()[:, 0].tolist():
-            verdict = judge(errors, after, j, tried, first)
-            values = chosen.model.to_physical(chosen.x)[j, chosen.model.columns(effect)].tolist()
-            trials[j].append(
-                Trial(
-                    effect=effect,
-                    joint=j,
-                    screen_score=max(float(p.score[j]) for p in probes if p.effect is effect),
-                    mse_before=float(errors.mse[j]),
-                    mse_after=float(after.mse[j]),
-                    ratio=verdict.ratio,
-                    t=verdict.t,
-                    significant=verdict.significant,
-                    values=dict(zip([p.name for p in effect.parameters], values, strict=True)),
-                )
-            )
-        keep[effect] = chosen
-    chosen_effects, rivals = _choose(trials)
-    return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)
-
-
-def _promising(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], torch.Tensor]:
-    """What each effect would explain of each joint's error, (n,) [rad²], by its best probe."""
-    best: dict[type[Effect], torch.Tensor] = {}
-    for probe in probes:
-        best[probe.effect] = torch.maximum(best.get(probe.effect, probe.score), probe.score)
-    return {effect: torch.where(score > SCREEN_THRESHOLD, score, 0.0) * excess for effect, score in best.items()}
-
-
-def _short_list(explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor) -> list[type[Effect]]:
-    """Effects that explain most of the whole robot's error, then those that explain most of the worst joints'.
-
-    Args:
-        explained: Squared error that each effect explains of each joint, (n,).
-        excess: Squared error of each joint that could be explained, (n,); zero where there is nothing to find.
-    """
-    total = {effect: float(values[excess > 0].sum()) for effect, values in explained.items()}
-    wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[:SHORT_LIST]
-    for j in excess.argsort(descending=True)[:WORST_JOINTS].tolist():
-        own = sorted((e for e in explained if explained[e][j] > 0), key=lambda e: -float(explained[e][j]))
-        wanted += own[:PER_JOINT]
-    return list(dict.fromkeys(wanted))
-
-
-def _begun(
-    problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
-) -> dict[type[Effect] | None, Fitted]:
-    """The present model with each effect after a few coarse steps, and without any (None).
-
-    Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
-    goes on, joint by joint. Far from the floor the best of many points is another start.
-    """
-    coarse = problem.with_physics_dt(problem.control_dt)
-    starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
-    for effect in effects:
-        own = [probe for probe in probes if probe.effect is effect]
-        ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
-        starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(len(ranked[0]))]
-    if far:
-        starts = _neighbours_together([*starts, *far_starts(coarse, now, effects)])
-    result: dict[type[Effect] | None, Fitted] = {}
-    for each in fit_side_by_side(coarse, starts, max_iteration=4, part=0.4):
-        best = result.setdefault(each.tried, each)
-        best.take(each, each.score < best.score)
-    return result
-
-
-def _neighbours_together(starts: Sequence[Fitted]) -> list[Fitted]:
-    """Starts of the same effect one after another: one effect then acts for all of them."""
-    order = list(dict.fromkeys(start.tried for start in starts))
-    return sorted(starts, key=lambda start: order.index(start.tried))
-
-
-def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
-    """A joint's best two probes of an effect, or the best of each structure."""
-    ranked = sorted(probes, key=lambda probe: -float(probe.score[joint]))
-    structural = probes[0].effect.structural
-    if not structural:
-        return ranked[:2]
-    place = [parameter.name for parameter in probes[0].effect.parameters].index(structural)
-    best: dict[float, Probe] = {}
-    for probe in ranked:
-        best.setdefault(float(probe.values[joint, place]), probe)
-    return list(best.values())
-
-
-def _names(effects: Sequence[type[Effect]]) -> str:
-    return ", ".join(effect.name for effect in effects)
-
-
-def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], torch.Tensor]:
-    """By how much each effect has lowered each joint's squared error, (n,) [rad²]."""
-    without = begun[None].score
-    return {effect: (without - each.score).clamp(min=0.0) for effect, each in begun.items() if effect is not None}
-
-
-def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted:
-    """The present model with an effect at each joint's probe."""
-    own = torch.stack([starts_of(probe)[j] for j, probe in enumerate(probes)])
-    physical = now.model.to_physical(now.x)
-    model, physical = now.model.extended(physical, effect, now.model.may_get(effect), own)
-    return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
-
-
-def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
-    """Each joint's best significant effect; among rivals, the one that most joints want."""
-    wanted: dict[type[Effect], int] = {}
-    near: list[list[Trial]] = []
-    for own in trials:
-        own.sort(key=lambda t: t.mse_after)
-        good = [t for t in own if t.significant]
-        close = [t for t in good if t.mse_after <= good[0].mse_after * RIVAL**2] if good else []
-        near.append(close)
-        for trial in close:
-            wanted[trial.effect] = wanted.get(trial.effect, 0) + 1
-    chosen: list[type[Effect] | None] = []
-    rivals: list[list[type[Effect]]] = []
-    for close in near:
-        if not close:
-            chosen.append(None)
-            rivals.append([])
-            continue
-        best = min(close, key=lambda t: (-wanted[t.effect], t.mse_after))
-        chosen.append(best.effect)
-        rivals.append([t.effect for t in close if t.effect is not best.effect])
-    return chosen, rivals
+        The best effect of the first round may stand in for two others, each of which is worse alone. Where it leaves
+        much unexplained, the next ones of each joint lead on for a round too; the one whose next round ends lowest is
+        taken.
+        """
+        first = self.grown(branch, found)
+        ways = [(first, self.tried(first))]
+        reach = [_reach(*ways[0])]
+        unexplained = first.errors.mse.sqrt() > LOOK_AHEAD * self.floor
+        ahead = not branch.rounds and ways[0][1] is not None
+        for k in range(1, WAYS if ahead else 1):
+            open_joints = unexplained & (torch.stack(reach).amin(dim=0).sqrt() > LOOK_AHEAD * self.floor)
+            if (other := _next_choice(found, k, open_joints)) is None:
+                break
+            self.say(f"looking ahead with {', '.join(dict.fromkeys(e.name for e in other.chosen if e is not None))}")
+            way = self.grown(branch, other, swapping=False)
+            ways.append((way, self.tried(way)))
+            # what is no better than the best of this round is not preferred to it
+            reach.append(RIVAL**2 * _reach(*ways[-1]))
+        best = torch.stack(reach).argmin(dim=0)
+        taken = best[unexplained].unique().tolist() or [0]
+        if len(taken) == 1:
+            return ways[taken[0]]
+        chosen = [ways[int(k)][0].rounds[-1].chosen[j] for j, k in enumerate(best)]
+        mixed = self.grown(branch, replace(found, chosen=chosen))
+        return mixed, self.tried(mixed)
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
@@ -269,3 +164,20 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
         model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
         physical[has, :size] = values[has, :size]
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+
+
+def _next_choice(found: Round, k: int, unexplained: torch.Tensor) -> Round | None:
+    """The round with the k-th of the effects that came near the best, on unexplained joints that have one."""
+    chosen = list(found.chosen)
+    for j in unexplained.nonzero()[:, 0].tolist():
+        if (best := found.chosen[j]) is not None and len(near := near_trials(found.trials[j], best)) >= k:
+            chosen[j] = near[k - 1].effect
+    return None if chosen == found.chosen else replace(found, chosen=chosen)
+
+
+def _reach(branch: _Branch, found: Round | None) -> torch.Tensor:
+    """Squared validation error of each joint with the best of what could come next, (n,) [rad²]."""
+    reach = branch.errors.mse.clone()
+    for j, trials in enumerate([] if found is None else found.trials):
+        reach[j] = min([float(reach[j]), *(t.mse_after for t in trials if t.significant)])
+    return reach

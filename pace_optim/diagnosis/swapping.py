@@ -10,12 +10,10 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.model import BASE
-from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
-_BEHIND = 3.0
-"""An effect whose RMSE was this many times the chosen one's is not tried again in its place."""
 _PER_JOINT = 3
 """How many effects are tried in place of one that a newer effect has joined."""
 
@@ -71,17 +69,11 @@ def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) 
                 continue
             several = int(model.has[:, j].sum()) > 1 and bool(unexplained[j])
             without = model.without_effect(old, torch.arange(model.num_joints) == j)
-            near = [t for t in _near(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
+            near = [t for t in near_trials(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
             wanted = [t.effect for k, t in enumerate(near) if t.effect in in_use or (several and k < _PER_JOINT)]
             for effect in wanted:
                 result.setdefault(effect, {}).setdefault(j, old)
     return result
-
-
-def _near(trials: Sequence[Trial], chosen: type[Effect]) -> list[Trial]:
-    """Significant trials of a joint that came near to the chosen effect, best first."""
-    most = next(t.mse_after for t in trials if t.effect is chosen) * _BEHIND**2
-    return [t for t in trials if t.effect is not chosen and t.significant and t.mse_after <= most]
 
 
 def _start(now: Fitted, effect: type[Effect], joints: _Exchange, rounds: Sequence[Round]) -> Fitted:

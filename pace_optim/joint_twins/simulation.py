@@ -65,7 +65,9 @@ class TwinSimulation(Simulation):
         place = self._place(columns)
         for parameter in effect.parameters:
             key = effect.name, parameter.name
-            values = self._model_values.setdefault(key, torch.zeros(self.num_envs, len(self._columns), dtype=torch.float64))
+            values = self._model_values.setdefault(
+                key, torch.zeros(self.num_envs, len(self._columns), dtype=torch.float64)
+            )
             values[effect.rows] = values[effect.rows].index_copy(1, place, getattr(effect, parameter.name))
 
     @property

@@ -1,0 +1,125 @@
+"""The best effect of a round may stand in for two others: the search looks one round ahead."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diagnoses import make_trial
+
+from pace_actuators.effects import get_effect
+from pace_optim.diagnosis import search
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.trials import Round
+
+ELASTICITY, MOUNT, GAIN, SPRING = (
+    get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring")
+)
+FLOOR = 1e-4
+
+
+class World:
+    """Joints whose RMSE [mrad] follows from the effects that the model gives them."""
+
+    def __init__(self, *joints):
+        self.joints, self.rounds = joints, 0
+
+    def rmse(self, joint, effects):
+        return 1e-3 * self.joints[joint].get(frozenset(effects), 40.0 / (1 + len(effects)))
+
+    def effects_of(self, now):
+        model = now.model
+        return [[e for e, has in zip(model.effects, model.has, strict=True) if has[j]] for j in range(model.num_joints)]
+
+    def errors(self, _, models):
+        result = []
+        for now in models:
+            squares = [self.rmse(j, effects) ** 2 for j, effects in enumerate(self.effects_of(now))]
+            result.append(BlockErrors(square=torch.tensor([squares]).double(), weight=torch.ones(1).double()))
+        return result
+
+    def try_effects(self, _, now, errors, effects, effort, floor, open_joints, say):
+        self.rounds += 1
+        trials, models = [], {}
+        for effect in effects:
+            values = torch.zeros(now.model.num_joints, len(effect.parameters)).double()
+            model, physical = now.model.extended(
+                now.model.to_physical(now.x), effect, now.model.may_get(effect) & open_joints, values
+            )
+            models[effect] = Fitted.start(model, physical, tried=effect)
+        for j, has in enumerate(self.effects_of(now)):
+            before = float(errors.mse[j].sqrt())
+            own = [e for e in effects if open_joints[j] and now.model.may_get(e)[j]]
+            after = {e: self.rmse(j, [*has, e]) for e in own}
+            trials.append([make_trial(e, j, after[e], after[e] * 1.2 < before) for e in sorted(own, key=after.get)])
+        chosen = [next((t.effect for t in each if t.significant), None) for each in trials]
+        return Round(trials=trials, chosen=chosen, rivals=[[] for _ in trials], models=models)
+
+
+def found(monkeypatch, *joints):
+    """The effects of each joint where a search ends, and how many rounds it tried."""
+    world, n = World(*joints), len(joints)
+    monkeypatch.setattr(search, "validation_errors", world.errors)
+    monkeypatch.setattr(search, "try_effects", world.try_effects)
+    monkeypatch.setattr(search, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+    monkeypatch.setattr(search, "swapped", lambda *_: None)
+    monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
+    bounds = torch.ones(n, len(BASE)).double()
+    model = JointModel(
+        effects=(),
+        has=torch.zeros(0, n, dtype=torch.bool),
+        lower=-bounds,
+        upper=bounds,
+        log=torch.zeros(len(BASE), dtype=torch.bool),
+    )
+    floor = torch.full((n,), FLOOR, dtype=torch.float64)
+    outcome = search.add_effects(
+        SimpleNamespace(), Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING], 5 * floor, floor, 3
+    )
+    assert outcome.final_errors.mse.sqrt().tolist() == pytest.approx(
+        [world.rmse(j, effects) for j, effects in enumerate(world.effects_of(outcome.final))]
+    )
+    return [{e.name for e in effects} for effects in world.effects_of(outcome.final)], world.rounds
+
+
+def mrad(table):
+    return {frozenset(effects): rmse for effects, rmse in table.items()}
+
+
+STANDS_IN = mrad(
+    {
+        (MOUNT,): 7.5,
+        (ELASTICITY,): 18.0,
+        (GAIN,): 39.0,
+        (SPRING,): 20.0,
+        (MOUNT, GAIN): 6.0,
+        (ELASTICITY, GAIN): 0.1,
+        (ELASTICITY, SPRING): 15.0,
+    }
+)
+IS_IT = mrad({(MOUNT,): 7.5, (ELASTICITY,): 18.0, (GAIN,): 39.0, (MOUNT, GAIN): 0.1, (ELASTICITY, GAIN): 12.0})
+
+
+def test_two_effects_are_found_behind_one_that_stands_in_for_both(monkeypatch):
+    effects, rounds = found(monkeypatch, STANDS_IN)
+    assert effects == [{"joint_elasticity", "torque_gain"}]
+    assert rounds == 3  # the first, and the second along two ways: nothing was left for a third way to explain
+
+
+def test_the_best_effect_stays_where_no_other_leads_further(monkeypatch):
+    effects, rounds = found(monkeypatch, IS_IT)
+    assert effects == [{"mount_compliance", "torque_gain"}] and rounds == 2
+    hardly_better = {**STANDS_IN, frozenset((ELASTICITY, GAIN)): 5.7}
+    assert found(monkeypatch, hardly_better)[0] == [{"mount_compliance", "torque_gain"}]
+
+
+def test_each_joint_takes_its_own_way(monkeypatch):
+    effects, _ = found(monkeypatch, STANDS_IN, IS_IT)
+    assert effects == [{"joint_elasticity", "torque_gain"}, {"mount_compliance", "torque_gain"}]
+
+
+def test_nothing_is_looked_for_where_an_effect_explains_what_is_missing(monkeypatch):
+    table = mrad({(MOUNT,): 0.25, (ELASTICITY,): 0.3, (ELASTICITY, GAIN): 0.1})
+    effects, rounds = found(monkeypatch, table)
+    assert effects == [{"mount_compliance"}] and rounds == 2
