@@ -81,7 +81,6 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         "ladder": [{"model": "base model", "validation_rmse": 4.3e-3}]
         + [{"model": "stribeck_friction", "validation_rmse": 4e-4}] * known,
         "error_map": {"sentence": "It follows q·sgn v.", "joints": dict.fromkeys(JOINTS, carried)},
-        "simulated_steps": 0,
         "wall_time_s": 12.0,
     }
 

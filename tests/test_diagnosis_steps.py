@@ -11,7 +11,7 @@ from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis import one_round, pruning, search, sharing, swapping
+from pace_optim.diagnosis import next_experiment, one_round, pruning, search, sharing, swapping
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
@@ -236,6 +236,29 @@ def test_rivals_are_sent_to_the_recording_where_they_part(bench):
     assert f"{1e3 * float(apart.max()):.2g} mrad" in sentence and "scripts/data_collection.py --task" in sentence
     (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1.0], dtype=torch.float64))
     assert "Nor would any of" in sentence
+
+
+def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monkeypatch):
+    base, values = JointModel.base(bench.problem), bench.truth_values
+    effects = {STRIBECK: [0.3, 0.1], QUADRATIC: [0.05], GAIN: [0.1]}
+    models = {effect: with_effects(base, values, (effect, [True], own)) for effect, own in effects.items()}
+    this = Round(trials=[[]], chosen=[STRIBECK], rivals=[[QUADRATIC, GAIN]], models=models)
+    outcome = outcome_of([1e-3], [2e-4], [STRIBECK], rounds=[this])
+    apart = {QUADRATIC: {1: 4e-3, 2: 9e-3}, GAIN: {1: 1e-3}}  # the first pair parts further on another recording
+
+    def distances_of(_, pair, recordings):
+        return torch.tensor([apart[pair.rival].get(k, 0.0) for k in range(len(recordings))])
+
+    monkeypatch.setattr(next_experiment, "distances", distances_of)
+    noise = torch.tensor([1e-4], dtype=torch.float64)
+    (sentence,) = next_experiments(bench.problem, outcome, noise)
+    choice = list(menu(bench.problem, 0))[1]
+    assert "stribeck_friction from quadratic_friction (servo), nor stribeck_friction from torque_gain" in sentence
+    assert f"{choice.words} would" in sentence and "1 to 4 mrad, 10 to 40 times the noise" in sentence
+    del apart[GAIN][1]
+    told, not_told = next_experiments(bench.problem, outcome, noise)
+    assert "9 mrad, 90 times" in told and "torque_gain" not in told
+    assert "from torque_gain (servo). Nor would any of 8 others tried." in not_told
 
 
 def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):

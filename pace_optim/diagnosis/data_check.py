@@ -58,7 +58,8 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
     loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
     gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
     sentences.append(
-        f"{len(data.recordings)} recordings with {len(loads)} different loads and {len(gains)} sets of gains."
+        f"{_count(len(data.recordings), 'recording')} with {_count(len(loads), 'load')} and "
+        f"{_count(len(gains), 'set')} of gains."
     )
     return DataCheck(
         floor=(noise**2 + numerical**2).sqrt(),
@@ -88,3 +89,7 @@ def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return dict(value) if isinstance(value, Mapping) else value
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -95,6 +95,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         run=str(folder),
         verdict=found.verdict,
         summary=summary_of(found, problem),
+        explained=found.explained,
         added=found.added,
         ranking=ranking(found.outcome, problem.joint_names),
         joints=_joints(found, problem),

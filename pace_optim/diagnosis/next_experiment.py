@@ -49,8 +49,20 @@ class Rivals:
     joints: list[int]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """How far two effects' predictions for an entry of the menu are apart."""
+
+    pair: Rivals
+    choice: Choice
+    apart: float
+    """[rad]."""
+    times: float
+    """The same as a multiple of the noise."""
+
+
 def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) -> list[str]:
-    """For each pair of effects that the recordings cannot tell apart, the recording that would, as a sentence.
+    """Which recordings would tell apart what the present ones cannot, as few of them as do, as sentences.
 
     Args:
         problem: The whole robot with the base model.
@@ -59,25 +71,56 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
     """
     pairs = rivals_of(outcome)
     if not pairs or problem.env_cfg.sim2real.excitation is None:
-        return [f"{_alike(pair, problem)} {_hint(pair)}".rstrip() for pair in pairs]
+        return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
+    predictions = [each for pair in pairs for each in _predictions(problem, pair, noise)]
     result = []
-    for pair in pairs:
-        choices = list(menu(problem, pair.joints[0]))
-        apart = distances(problem, pair, [choice.recording for choice in choices])
-        best = int(apart.argmax())
-        times = float(apart[best] / noise[pair.joints].mean())
-        if times < _CLEAR:
-            result.append(
-                f"{_alike(pair, problem)} Nor would any of {len(choices)} others tried. {_hint(pair)}".rstrip()
-            )
-            continue
-        choice = choices[best]
-        result.append(
-            f"{_alike(pair, problem)} {choice.words} would tell them apart: they predict motions that differ by "
-            f"{1e3 * float(apart[best]):.2g} mrad, {times:.0f} times the noise. scripts/data_collection.py --task "
-            f"{problem.task} {choice.arguments} --command_only --export_command next.csv"
-        )
+    clear = [each for each in predictions if each.times >= _CLEAR]
+    while clear:
+        best = _most_telling(clear)
+        result.append(_sentence(best, problem))
+        told = [each.pair for each in best]
+        clear = [each for each in clear if each.pair not in told]
+    seen = [each.pair for each in predictions if each.times >= _CLEAR]
+    for pair in [pair for pair in pairs if pair not in seen]:
+        count = sum(each.pair is pair for each in predictions)
+        text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
+        result.append(f"{text} {_hint(pair)}".rstrip())
     return result
+
+
+def _predictions(problem: Problem, pair: Rivals, noise: torch.Tensor) -> list[Prediction]:
+    choices = list(menu(problem, pair.joints[0]))
+    apart = distances(problem, pair, [choice.recording for choice in choices]).tolist()
+    level = float(noise[pair.joints].mean())
+    return [
+        Prediction(pair=pair, choice=choice, apart=each, times=each / level)
+        for choice, each in zip(choices, apart, strict=True)
+    ]
+
+
+def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
+    """Predictions for the recording that tells most pairs apart; among equals, the one that does so most clearly."""
+    by_recording: dict[str, list[Prediction]] = {}
+    for each in clear:
+        by_recording.setdefault(each.choice.arguments + each.choice.words, []).append(each)
+    return max(by_recording.values(), key=lambda own: (len(own), min(each.times for each in own)))
+
+
+def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
+    choice = told[0].choice
+    pairs = ", nor ".join(_named(each.pair, problem) for each in told)
+    apart = _range([1e3 * each.apart for each in told], "{:.2g}")
+    times = _range([each.times for each in told], "{:.0f}")
+    return (
+        f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
+        f"mrad, {times} times the noise. scripts/data_collection.py --task {problem.task} {choice.arguments} "
+        "--command_only --export_command next.csv"
+    )
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    low, high = form.format(min(values)), form.format(max(values))
+    return low if low == high else f"{low} to {high}"
 
 
 def rivals_of(outcome: Outcome) -> list[Rivals]:
@@ -165,9 +208,9 @@ def _loaded(like: Recording, **changes: object) -> Recording:
     return replace(like, load=replace(like.load, **changes))  # type: ignore[arg-type]
 
 
-def _alike(pair: Rivals, problem: Problem) -> str:
+def _named(pair: Rivals, problem: Problem) -> str:
     names = ", ".join(problem.joint_names[j] for j in pair.joints)
-    return f"These recordings cannot tell {pair.chosen.name} from {pair.rival.name} ({names})."
+    return f"{pair.chosen.name} from {pair.rival.name} ({names})"
 
 
 def _hint(pair: Rivals) -> str:

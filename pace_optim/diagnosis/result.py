@@ -22,6 +22,8 @@ class Diagnosis:
     """``effect``, ``nothing_missing`` or ``unknown``."""
     summary: str
     """The verdict in a sentence or two."""
+    explained: float = 1.0
+    """Part of the error above the floor that the effects found explain."""
     added: list[str]
     """Effects to add, as ``fit.py --effects`` takes them."""
     ranking: list[dict[str, Any]]
@@ -44,7 +46,6 @@ class Diagnosis:
     """Validation RMSE of all joints from the base model to the last effect [rad]."""
     error_map: dict[str, Any] = field(default_factory=dict)
     """Which variable carries what is left, joint by joint."""
-    simulated_steps: int = 0
     wall_time_s: float = 0.0
 
     def save(self, folder: str | Path) -> Path:

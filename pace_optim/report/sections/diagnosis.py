@@ -16,6 +16,8 @@ _HEADINGS = {
     "nothing_missing": ("good", "Nothing is missing"),
     "unknown": ("bad", "Something is missing, and it is none of the known effects"),
 }
+_PARTLY = 0.8
+"""Effects that explain less than this part of the error above the floor are not all that is missing."""
 _SHOWN = 10
 """Effects in the chart, at most."""
 _VARIABLES = 6
@@ -35,6 +37,8 @@ def diagnosis(run: RunData) -> Section | None:
 
 def _verdict(content: dict[str, Any]) -> str:
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
+    if content["verdict"] == "effect" and (part := content.get("explained", 1.0)) < _PARTLY:
+        css, heading = "bad", f"Something is missing, and known effects explain {100 * part:.0f} % of it"
     add = ""
     if content["added"]:
         add = f"<p>Add it: <code>scripts/fit.py … --effects {esc(' '.join(content['added']))}</code></p>"
@@ -57,11 +61,12 @@ def _ladder(content: dict[str, Any]) -> str:
     for step in steps:
         error = step["validation_rmse"]
         gain = "" if before is None or error <= 0 else f"{before / error:.3g}"
-        rows.append([f"<b>{esc(step['model'])}</b>", f"{factor * error:#.3g}", gain])
+        model = esc(step["model"]).replace("|", "|<wbr>")
+        rows.append([f"<b>{model}</b>", f"{factor * error:#.3g}", gain])
         before = error
     rows.append(["floor of noise and numerics", f"{factor * floor:#.3g}", ""])
     head = ["model, each joint simulated alone", f"validation [{unit}]", "× better than before"]
-    return f"<h3>The error with it</h3>{table(head, rows)}"
+    return f"<h3>The error with it</h3>{table(head, rows, 'ladder')}"
 
 
 def _ranking(content: dict[str, Any]) -> str:
@@ -84,9 +89,9 @@ def _name(entry: dict[str, Any]) -> str:
 def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str) -> str:
     names = [_name(entry) for entry in reversed(entries)]
     traces = []
-    for key, word, color in (
-        ("validation_rmse_before", "before", "var(--target)"),
+    for key, word, color in (  # from the bottom up
         ("validation_rmse_after", "after", "var(--heldedge)"),
+        ("validation_rmse_before", "before", "var(--target)"),
     ):
         traces.append(
             {
@@ -114,9 +119,9 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
         "xaxis": {"title": {"text": f"validation error [{unit}]"}, "rangemode": "tozero"},
         "yaxis": {"type": "category", "automargin": True, "showgrid": False},
         "hovermode": "closest",
-        "legend": {"traceorder": "normal"},
+        "legend": {"traceorder": "reversed"},
     }
-    return figure("effect-ranking", [*traces, floor_line], layout, height=130 + 42 * len(names))
+    return figure("effect-ranking", [floor_line, *traces], layout, height=130 + 42 * len(names))
 
 
 def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> str:
