@@ -283,6 +283,19 @@ class Articulation:
             result[:, ids] = actuator.observe(pick(self.data.joint_pos, ids), pick(self.data.joint_vel, ids))
         return result
 
+    def joint_pos_that_shows(self, encoder_pos: torch.Tensor) -> torch.Tensor:
+        """Joint positions at which the encoders, just reset, show values before their bias: inverse of sensing.
+
+        Args:
+            encoder_pos: [rad], (num_envs, num_joints).
+        """
+        result = encoder_pos.clone()
+        for actuator in self.actuators.values():
+            self._tell_link(actuator)
+            ids = actuator.joint_indices
+            result[:, ids] = actuator.position_that_shows(pick(encoder_pos, ids))
+        return result
+
     def write_effect_parameter_to_sim(
         self,
         effect: str,

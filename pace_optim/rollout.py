@@ -14,6 +14,8 @@ from pace_optim.parameter_space import ParameterSpace
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
+_LOAD_STEPS = 6
+"""Fixed-point steps of a start whose positions depend on the load there."""
 _DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 
 
@@ -186,16 +188,18 @@ class Rollout:
         Args:
             offset: Added to the first positions, (num_envs, n) [rad].
         """
-        position = self._rows(self.dataset.measured[0]).clone()
+        shown = self._rows(self.dataset.measured[0]).clone()
         for actuator in self.robot.actuators.values():
             ids = actuator.joint_indices
-            position[:, ids] = actuator.position_that_shows(position[:, ids] + actuator.encoder_bias)
+            shown[:, ids] += actuator.encoder_bias
             actuator.set_session_time(self._session_start[:, ids])
         measured = [recording.dof_vel is not None for recording in self.dataset.recordings]
-        speed = self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None]
-        self.robot.write_joint_state_to_sim(position + offset, self._rows(speed))
-        if any(actuator.needs_load for actuator in self.robot.actuators.values()):
-            self.env.sim.forward()
+        speed = self._rows(self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None])
+        needs_load = any(actuator.needs_load for actuator in self.robot.actuators.values())
+        for _ in range(_LOAD_STEPS if needs_load else 1):  # the load bends what an encoder on the motor shows
+            self.robot.write_joint_state_to_sim(self.robot.joint_pos_that_shows(shown) + offset, speed)
+            if needs_load:
+                self.env.sim.forward()
 
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]

@@ -74,6 +74,30 @@ def test_a_late_log_is_the_replay_read_earlier():
     assert torch.allclose(late[2:], replay(problem_with([]), CALM)[:-2], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("effect", "values", "twist"),
+    [
+        ("joint_elasticity", {"stiffness": 150.0, "damping": 1.0}, lambda load: -load / 150),
+        ("backlash", {"gap": 0.02, "stiffness": 3e3, "damping": 4.0}, lambda load: -load / 3e3 - 0.01 * np.sign(load)),
+    ],
+)
+@pytest.mark.parametrize("side", [0.0, 1.0])
+def test_a_replay_begins_where_the_encoder_was_on_whichever_side(effect, values, twist, side):
+    recording = record(chirp(0.5, amplitude=0.0) + 1.0, CALM)
+    recording.dof_pos[:] = recording.dof_pos[0]
+    problem = problem_with([effect], recording)
+    values = {**CALM, **{f"{effect}.{key}": value for key, value in {**values, "encoder_side": side}.items()}}
+    physical = problem.space.from_dict(values)
+    for each in (problem, twin_problem(problem, reference_path(problem, physical)).with_effects([effect])):
+        rollout = each.evaluator().rollout(1)
+        rollout.start(physical[None], problem.dataset.sampled)
+        seen, link = float(rollout.robot.sensed_joint_pos()), float(rollout.robot.data.joint_pos)
+        load = float(rollout.robot.load_effort)
+        assert abs(load) > 1.0
+        assert seen - CALM["encoder_bias"] == pytest.approx(recording.dof_pos[0, 0], abs=1e-6)
+        assert seen - link == pytest.approx(side * twist(load), abs=1e-6)
+
+
 TWIN_CASES = {
     "stribeck_friction": {"effort": 1.5, "velocity": 0.5},
     "load_dependent_friction": {"coefficient": 0.2},

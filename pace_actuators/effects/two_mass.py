@@ -76,11 +76,11 @@ class _TwoMass(Effect):
             self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
             self._drive, self._coupling, self._inertia, self._direction = zeros(), zeros(), zeros() + 1, zeros()
             self._fresh = torch.ones_like(zeros(), dtype=torch.bool)
-            self._started = False
+            self._any_fresh = True
 
     def reset_state(self, rows: torch.Tensor | slice) -> None:
         """Motor and link stand at rest against each other, the spring holding the load."""
-        self._fresh[rows] = True
+        self._fresh[rows] = self._any_fresh = True
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """Deflection that holds the load."""
@@ -101,18 +101,21 @@ class _TwoMass(Effect):
         moving = 0.5 * (self._speed + speed) if self.is_trapezoidal else speed
         self._angle = self._angle + self.dt * moving
         self._speed = speed
-        if bool(self._fresh.any()):
+        if self._any_fresh:
             self._angle = torch.where(self._fresh, s.joint_pos + self.rest_deflection(s), self._angle)
             self._speed = torch.where(self._fresh, s.joint_vel, self._speed)
-            self._fresh[:] = False
+            self._fresh[:] = self._any_fresh = False
         s.motor_pos = torch.where(self._on, self._angle, s.motor_pos)
         s.motor_vel = torch.where(self._on, self._speed, s.motor_vel)
 
     def measurement(self, s: DriveState) -> None:
-        """An encoder on the motor sees the motor; before the first step it is where the link is."""
-        if self._any:
-            seen = self._on & ~self._fresh
-            s.encoder_pos += torch.where(seen, self.encoder_side * (self._angle - s.joint_pos), 0.0)
+        """An encoder on the motor sees the motor; before the first step it is where it will stand at rest."""
+        if not self._any:
+            return
+        twist = self._angle - s.joint_pos
+        if self._any_fresh:
+            twist = torch.where(self._fresh, self.rest_deflection(s), twist)
+        s.encoder_pos += self._side * twist
 
     def sensed_velocity(self, s: DriveState) -> None:
         """And its speed."""
