@@ -14,12 +14,19 @@ from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.least_squares import bounded_step
 
-_STEP = 1e-4
+_SMOOTH = (1e-4,)
+"""Normalised step of the derivatives."""
+_ROUGH = (3e-2, 1e-2, 1e-4)
+"""The same where contacts and sticking make the error rough: a narrow one sees the roughness and not the slope. The
+next is taken when one leads no further."""
 _TRIALS = (1.0, 30.0, 1e3)
+_DAMPING = 1e-3
 _ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
 _BEHIND = 2.0
 """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
+_COARSE, _FINE = 8, 3
+"""Iterations at the control step and at the problem's physics step."""
 _STRIDE = 2
 """Only every so many control steps count in a fit."""
 
@@ -57,19 +64,25 @@ class Fitted:
         self.score = torch.where(joints, other.score, self.score)
 
 
-def fit_coarse_to_fine(
-    problem: TwinProblem, starts: Sequence[Fitted], coarse_iterations: int = 8, fine_iterations: int = 3
-) -> list[Fitted]:
+def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
     """Go most of the way at the control step, which costs half, and the rest at the problem's physics step.
 
     Models that the control step shows to be far behind the best one on every joint stay where it left them.
+
+    Args:
+        problem: The joints simulated alone.
+        starts: Models and where they start.
+        rough: Whether to go on over wide steps where narrow ones have led.
     """
-    coarse = fit_side_by_side(problem.with_physics_dt(problem.control_dt), starts, coarse_iterations)
+    at_control_step = problem.with_physics_dt(problem.control_dt)
+    coarse = fit_side_by_side(at_control_step, starts, _COARSE)
+    if rough:
+        coarse = fit_side_by_side(at_control_step, coarse, _COARSE, rough=True)
     scores = torch.stack([each.score for each in coarse])
     near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
     fine = iter(
         fit_side_by_side(
-            problem, [each for each, yes in zip(coarse, near, strict=True) if yes], fine_iterations, keep_jacobian=True
+            problem, [each for each, yes in zip(coarse, near, strict=True) if yes], _FINE, keep_jacobian=True
         )
     )
     return [next(fine) if yes else each for each, yes in zip(coarse, near, strict=True)]
@@ -81,6 +94,7 @@ def fit_side_by_side(
     max_iteration: int = 9,
     keep_jacobian: bool = False,
     part: float = 1.0,
+    rough: bool = False,
 ) -> list[Fitted]:
     """Fit several models from their present x, each joint by itself.
 
@@ -93,13 +107,14 @@ def fit_side_by_side(
         max_iteration: Largest number of iterations.
         keep_jacobian: Whether the last Jacobian is kept.
         part: Only so much of the beginning of the recordings is simulated.
+        rough: Whether derivatives are taken over wide steps first.
     """
     slots = [Slot(model=s.model, rows=s.model.size + len(_TRIALS)) for s in starts]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train.clone()
     where[math.ceil(part * len(where)) :] = False
     samples = float(where[where.any(dim=1)][::_STRIDE].sum())
-    ways = [_Way(start, samples, keep_jacobian) for start in starts]
+    ways = [_Way(start, samples, keep_jacobian, rough) for start in starts]
     for _ in range(max_iteration):
         rows = [way.ask() for way in ways]
         physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
@@ -114,16 +129,18 @@ def fit_side_by_side(
 class _Way:
     """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
 
-    def __init__(self, start: Fitted, samples: float, keep: bool):
+    def __init__(self, start: Fitted, samples: float, keep: bool, rough: bool):
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
-        self._damping = torch.full((n,), 1e-3, dtype=torch.float64)
+        self._damping = torch.full((n,), _DAMPING, dtype=torch.float64)
         self._hessian = torch.zeros(n, size, size, dtype=torch.float64)
         self._gradient = torch.zeros(n, size, dtype=torch.float64)
         self._known = torch.zeros(n, dtype=torch.bool)
         self._still = torch.zeros(n, dtype=torch.long)
+        self._widths = torch.tensor(_ROUGH if rough else _SMOOTH, dtype=torch.float64)
+        self._width = torch.zeros(n, dtype=torch.long)
         self._free = start.model.free
         self._jacobian: torch.Tensor | None = None
         self._error: torch.Tensor | None = None
@@ -146,7 +163,8 @@ class _Way:
             for t, factor in enumerate(_TRIALS):
                 trials[t, j, at] = bounded_step(self.x[j, at], hessian, gradient, float(self._damping[j]) * factor)
         favoured = trials[0]
-        self._step = torch.where(favoured > 0, -_STEP, _STEP).to(favoured.dtype)
+        width = self._widths[self._width][:, None]
+        self._step = torch.where(favoured > 0, -width, width)
         neighbours = favoured.repeat(size, 1, 1)
         for p in range(size):
             neighbours[p, :, p] += self._step[:, p]
@@ -164,6 +182,8 @@ class _Way:
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
         self._still = torch.where(fresh | (gain > _ENOUGH), 0, self._still + 1)
+        narrower = (self._still > 0) & (self._width + 1 < len(self._widths))
+        self._still[narrower] = 0
         chosen = x[choice].gather(0, best[None, :, None].expand(1, -1, size))[0]
         moved = better & ~fresh
         self.x = torch.where(moved[:, None], chosen, self.x)
@@ -172,7 +192,9 @@ class _Way:
         lowered = (self._damping * factor / 10).clamp(min=1e-9)
         self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * 1e3))
         at_favoured = fresh | (moved & (best == 0))
-        self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known))
+        self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known)) & ~narrower
+        self._width += narrower
+        self._damping = torch.where(narrower, _DAMPING, self._damping)
         if bool(at_favoured.any()):
             difference = error[1 : 1 + size] - error[:1]
             columns = difference / self._step.T[:, None, None, :].float()

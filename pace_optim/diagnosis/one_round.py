@@ -39,6 +39,7 @@ def try_effects(
     floor: torch.Tensor,
     open_joints: torch.Tensor,
     say: Callable[[str], None],
+    rough: bool = False,
 ) -> Round | None:
     """Screen effects, refit the promising ones on top of a model, and judge them; ``None`` if none is promising.
 
@@ -51,6 +52,7 @@ def try_effects(
         floor: Below this RMSE of each joint there is nothing to find, (n,) [rad].
         open_joints: Joints that something is sought for, (n,) bool.
         say: Shows how far it is.
+        rough: Whether refits go on over wide steps.
     """
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
     excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
@@ -68,7 +70,7 @@ def try_effects(
     if not listed:  # no effect does better than the base parameters alone
         return None
     say(f"refitting with {_names(listed)}")
-    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed])
+    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough=rough)
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
     tried = len(effects) * int(open_joints.sum())

@@ -19,6 +19,7 @@ from pace_optim.joint_twins.problem import TwinProblem
 
 LOOK_AHEAD = 3.0
 """Where an effect leaves more than this many times the floor, others that came near lead on for a round too."""
+_ROUGH_ITERATIONS = 12
 WAYS = 3
 """How many effects of a joint lead on, at most."""
 
@@ -107,14 +108,28 @@ class _Search:
             return None
         self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
         return try_effects(
-            branch.problem, branch.now, branch.errors, untried, self.effort, self.floor, open_joints, self.say
+            branch.problem,
+            branch.now,
+            branch.errors,
+            untried,
+            self.effort,
+            self.floor,
+            open_joints,
+            self.say,
+            rough=depth > 0 and self._far(branch.errors),
         )
+
+    def _far(self, errors: BlockErrors) -> bool:
+        return bool((errors.mse.sqrt() > LOOK_AHEAD * self.floor).any())
 
     def grown(self, branch: _Branch, found: Round, swapping: bool = True) -> _Branch:
         """The branch with each joint's chosen effect, and what that changes of the older ones."""
         rounds = [each.copy() for each in [*branch.rounds, found]]
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         errors = validation_errors(problem, [now])[0]
+        if self._far(errors):  # perhaps only because narrow derivatives led no further
+            now = fit_side_by_side(problem, [now], _ROUGH_ITERATIONS, keep_jacobian=True, rough=True)[0]
+            errors = validation_errors(problem, [now])[0]
         if swapping and (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
             problem, now = self.follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
