@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -75,17 +75,18 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
         rough: Whether to go on over wide steps where narrow ones have led.
     """
     at_control_step = problem.with_physics_dt(problem.control_dt)
-    coarse = fit_side_by_side(at_control_step, starts, _COARSE)
+    result = fit_side_by_side(at_control_step, starts, _COARSE)
     if rough:
-        coarse = fit_side_by_side(at_control_step, coarse, _COARSE, rough=True)
-    scores = torch.stack([each.score for each in coarse])
+        result = _near_ones(result, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
+    return _near_ones(result, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
+
+
+def _near_ones(models: Sequence[Fitted], fit: Callable[[list[Fitted]], list[Fitted]]) -> list[Fitted]:
+    """All models, fitted again those that are near the best one on some joint."""
+    scores = torch.stack([each.score for each in models])
     near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
-    fine = iter(
-        fit_side_by_side(
-            problem, [each for each, yes in zip(coarse, near, strict=True) if yes], _FINE, keep_jacobian=True
-        )
-    )
-    return [next(fine) if yes else each for each, yes in zip(coarse, near, strict=True)]
+    again = iter(fit([each for each, yes in zip(models, near, strict=True) if yes]))
+    return [next(again) if yes else each for each, yes in zip(models, near, strict=True)]
 
 
 def fit_side_by_side(

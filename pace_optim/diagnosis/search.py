@@ -18,10 +18,10 @@ from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
 LOOK_AHEAD = 3.0
-"""Where an effect leaves more than this many times the floor, others that came near lead on for a round too."""
-_ROUGH_ITERATIONS = 12
-WAYS = 3
-"""How many effects of a joint lead on, at most."""
+"""Where an effect leaves more than this many times the floor, the next one leads on for a round too."""
+_ROUGH_ITERATIONS, _FINE = 8, 3
+WAYS = 2
+"""How many effects of a joint lead on."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -122,15 +122,15 @@ class _Search:
     def _far(self, errors: BlockErrors) -> bool:
         return bool((errors.mse.sqrt() > LOOK_AHEAD * self.floor).any())
 
-    def grown(self, branch: _Branch, found: Round, swapping: bool = True) -> _Branch:
+    def grown(self, branch: _Branch, found: Round) -> _Branch:
         """The branch with each joint's chosen effect, and what that changes of the older ones."""
         rounds = [each.copy() for each in [*branch.rounds, found]]
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         errors = validation_errors(problem, [now])[0]
         if self._far(errors):  # perhaps only because narrow derivatives led no further
-            now = fit_side_by_side(problem, [now], _ROUGH_ITERATIONS, keep_jacobian=True, rough=True)[0]
+            now = _over_wide_steps(problem, now)
             errors = validation_errors(problem, [now])[0]
-        if swapping and (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
+        if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
             problem, now = self.follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
         now, errors = pruned(problem, now, errors, found.chosen)
@@ -140,30 +140,40 @@ class _Search:
         """The branch with the effects that lead furthest, and what could come next.
 
         The best effect of the first round may stand in for two others, each of which is worse alone. Where it leaves
-        much unexplained, the next ones of each joint lead on for a round too; the one whose next round ends lowest is
-        taken.
+        much unexplained, the next one of each joint leads on for a round too, and is taken if it ends lower.
         """
         first = self.grown(branch, found)
-        ways = [(first, self.tried(first))]
-        reach = [_reach(*ways[0])]
-        unexplained = first.errors.mse.sqrt() > LOOK_AHEAD * self.floor
-        ahead = not branch.rounds and ways[0][1] is not None
-        for k in range(1, WAYS if ahead else 1):
-            open_joints = unexplained & (torch.stack(reach).amin(dim=0).sqrt() > LOOK_AHEAD * self.floor)
-            if (other := _next_choice(found, k, open_joints)) is None:
+        ahead = self.tried(first)
+        if branch.rounds or ahead is None:
+            return first, ahead
+        reach, chosen = _reach(first, ahead), list(found.chosen)
+        for k in range(1, WAYS):
+            unexplained = (first.errors.mse.sqrt() > LOOK_AHEAD * self.floor) & (reach > (LOOK_AHEAD * self.floor) ** 2)
+            if (other := _next_choice(found, k, unexplained)) is None:
                 break
             self.say(f"looking ahead with {', '.join(dict.fromkeys(e.name for e in other.chosen if e is not None))}")
-            way = self.grown(branch, other, swapping=False)
-            ways.append((way, self.tried(way)))
-            # what is no better than the best of this round is not preferred to it
-            reach.append(RIVAL**2 * _reach(*ways[-1]))
-        best = torch.stack(reach).argmin(dim=0)
-        taken = best[unexplained].unique().tolist() or [0]
-        if len(taken) == 1:
-            return ways[taken[0]]
-        chosen = [ways[int(k)][0].rounds[-1].chosen[j] for j, k in enumerate(best)]
-        mixed = self.grown(branch, replace(found, chosen=chosen))
-        return mixed, self.tried(mixed)
+            way = self._quickly_grown(branch, other)
+            further = _reach(way, self.tried(way))
+            better = unexplained & (RIVAL**2 * further < reach)
+            chosen = [other.chosen[j] if better[j] else effect for j, effect in enumerate(chosen)]
+            reach = torch.where(better, further, reach)
+        if chosen == found.chosen:
+            return first, ahead
+        taken = self.grown(branch, replace(found, chosen=chosen))
+        return taken, self.tried(taken)
+
+    def _quickly_grown(self, branch: _Branch, found: Round) -> _Branch:
+        """The same along the present reference, older effects as they are."""
+        now = _over_wide_steps(branch.problem, _combined(branch.problem, branch.now, found))
+        errors = validation_errors(branch.problem, [now])[0]
+        return _Branch(problem=branch.problem, now=now, errors=errors, rounds=[*branch.rounds, found])
+
+
+def _over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
+    """Fitted again where narrow derivatives may have led no further."""
+    coarse = problem.with_physics_dt(problem.control_dt)
+    now = fit_side_by_side(coarse, [now], _ROUGH_ITERATIONS, rough=True)[0]
+    return fit_side_by_side(problem, [now], _FINE, keep_jacobian=True)[0]
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
