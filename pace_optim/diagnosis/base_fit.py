@@ -45,7 +45,6 @@ def fit_base(
         say(f"base model, round {i + 1}")
         path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)))
         coarse = twin_problem(problem, path).with_physics_dt(problem.control_dt)
-        fitted.score[:] = torch.inf
         before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6, part=_PART)[0]
         if float((fitted.x - before.x).abs().max()) < _FAR:
             break

@@ -48,5 +48,4 @@ class OwnMotion:
         if alone and float((path.position - twins.path.position).abs().max()) < _FAR:
             return twins, now
         along = twin_problem(self.problem, path)
-        now.score = torch.full_like(now.score, torch.inf)
         return along, fit_side_by_side(along, [now], max_iteration=_ITERATIONS, keep_jacobian=True)[0]
