@@ -107,7 +107,9 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
         return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
 
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
-    final = SimpleNamespace(model=SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")}))
+    model = SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")})
+    model.at_bounds = lambda _: torch.zeros_like(has)
+    final = SimpleNamespace(model=model, x=None)
     return Outcome(
         problem=None,
         base=final,

@@ -25,7 +25,7 @@ from pace_optim.diagnosis.screening import Probe, absorbed_effects
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.trials import Round
-from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
+from pace_optim.diagnosis.verdict import explained_joints, labels, stand_ins, verdict
 from pace_optim.joint_twins import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -123,6 +123,29 @@ def test_the_effects_of_joints_that_they_do_not_explain_are_not_kept():
     assert verdict(outcome, floor)[0] == "effect"
     assert explained_joints(outcome, floor).tolist() == [True, False, False]
     assert verdict(outcome_of([0.1, 1.0], [0.06, 1.0], [STRIBECK], [[True, False]]), floor[:2])[0] == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("effect", "own", "stuck"),
+    [
+        ("payload", [-0.6], True),
+        ("payload", [0.5], False),
+        ("stribeck_friction", [1.0, 0.01], False),  # the speed is no size
+        ("stribeck_friction", [4.0, 0.1], True),
+        ("stribeck_friction", [0.0, 0.1], False),  # nothing, and not at an end
+        ("torque_limit", [get_effect("torque_limit").parameters[0].upper], False),  # next to no limit
+        ("torque_limit", [get_effect("torque_limit").parameters[0].lower], True),
+    ],
+)
+def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effect, own, stuck):
+    effect = get_effect(effect)
+    now = with_effects(JointModel.base(bench.problem), bench.truth_values, (effect, [True], own))
+    assert now.model.at_bounds(now.x).tolist() == [[stuck]]
+    floor = torch.tensor([1e-4])
+    far = Outcome(problem=None, base=now, base_errors=errors_of(1e-2), final=now, final_errors=errors_of(2e-3))
+    assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
+    assert stand_ins(far, ["servo"]) == ([f"{effect.name} (servo)"] if stuck else [])
+    assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
 
 
 def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):

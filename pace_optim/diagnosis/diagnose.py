@@ -21,7 +21,7 @@ from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, keep_on, labels, ranking, verdict
+from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, keep_on, labels, ranking, stand_ins, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
@@ -168,11 +168,14 @@ def summary_of(found: Findings, problem: Problem) -> str:
     if found.verdict == "unknown":
         paying = labels(found.outcome.final.model, problem.joint_names)
         shares = f"what pays, {', '.join(paying)}, explains" if paying else "the effects tried explain"
-        return (
+        text = (
             f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
             f"mrad, the floor {floor:.3g} mrad, and {shares} {100 * max(0.0, found.explained):.0f} % of what lies "
             "between."
         )
+        if bent := stand_ins(found.outcome, problem.joint_names):
+            text += f" At a bound, so that it stands in for something else: {', '.join(bent)}."
+        return text
     summary = (
         f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."

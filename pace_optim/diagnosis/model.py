@@ -12,6 +12,8 @@ from pace_optim.problem import Problem
 
 BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
 """The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
+_AT_BOUND = 0.998
+"""Normalised values beyond this are at a bound."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,6 +142,23 @@ class JointModel:
             if other is effect or (other.parts_motor_and_link and effect.parts_motor_and_link):
                 excluded |= has
         return ~excluded
+
+    def at_bounds(self, x: torch.Tensor) -> torch.Tensor:
+        """Joints with an effect whose size has run into a bound, (effects, n) bool.
+
+        A size is what vanishes at a null; the bound that is the null, or next to an infinite one, does not count.
+
+        Args:
+            x: Normalised, (n, P).
+        """
+        result = torch.zeros_like(self.has)
+        for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
+            for parameter, value in zip(effect.parameters, x[:, self.columns(effect)].unbind(dim=1), strict=True):
+                if parameter.null is not None and parameter.null > parameter.lower:
+                    result[row] |= has & (value <= -_AT_BOUND)
+                if parameter.null is not None and parameter.null < parameter.upper:
+                    result[row] |= has & (value >= _AT_BOUND)
+        return result
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:
         """Physical values of normalised ones (…, n, P)."""

@@ -116,18 +116,22 @@ class _Search:
             self.floor,
             open_joints,
             self.say,
-            rough=depth > 0 and self._far(branch.errors),
+            rough=self._is_rough(branch.now, branch.errors),
         )
 
-    def _far(self, errors: BlockErrors) -> bool:
-        return bool((errors.mse.sqrt() > LOOK_AHEAD * self.floor).any())
+    def _is_rough(self, now: Fitted, errors: BlockErrors) -> bool:
+        """Whether contacts or springs of joints far from the floor may keep narrow derivatives from leading on."""
+        far = errors.mse.sqrt() > LOOK_AHEAD * self.floor
+        return any(
+            e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
+        )
 
     def grown(self, branch: _Branch, found: Round) -> _Branch:
         """The branch with each joint's chosen effect, and what that changes of the older ones."""
         rounds = [each.copy() for each in [*branch.rounds, found]]
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         errors = validation_errors(problem, [now])[0]
-        if self._far(errors):  # perhaps only because narrow derivatives led no further
+        if self._is_rough(now, errors):
             now = _over_wide_steps(problem, now)
             errors = validation_errors(problem, [now])[0]
         if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
@@ -164,8 +168,11 @@ class _Search:
 
     def _quickly_grown(self, branch: _Branch, found: Round) -> _Branch:
         """The same along the present reference, older effects as they are."""
-        now = _over_wide_steps(branch.problem, _combined(branch.problem, branch.now, found))
+        now = _combined(branch.problem, branch.now, found)
         errors = validation_errors(branch.problem, [now])[0]
+        if self._is_rough(now, errors):
+            now = _over_wide_steps(branch.problem, now)
+            errors = validation_errors(branch.problem, [now])[0]
         return _Branch(problem=branch.problem, now=now, errors=errors, rounds=[*branch.rounds, found])
 
 

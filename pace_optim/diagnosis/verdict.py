@@ -43,6 +43,9 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
 def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 
+    They explain at least half of the error above the floor, and none of them has run into a bound: it would stand in
+    for something else. Near the floor it does not matter how.
+
     Args:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
@@ -50,7 +53,18 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     after = outcome.final_errors.mse
     excess, left = _above(outcome.base_errors.mse, floor), _above(after, floor)
     near = after.sqrt() <= UNKNOWN_RATIO * floor
-    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) | near)
+    inside = ~outcome.final.model.at_bounds(outcome.final.x).any(dim=0)
+    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & inside | near)
+
+
+def stand_ins(outcome: Outcome, names: Sequence[str]) -> list[str]:
+    """Effects that have run into a bound, with their joints."""
+    model = outcome.final.model
+    return [
+        f"{effect.name} ({', '.join(name for name, yes in zip(names, joints.tolist(), strict=True) if yes)})"
+        for effect, joints in zip(model.effects, model.at_bounds(outcome.final.x), strict=True)
+        if bool(joints.any())
+    ]
 
 
 def _above(mse: torch.Tensor, floor: torch.Tensor) -> torch.Tensor:
