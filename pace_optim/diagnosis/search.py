@@ -20,8 +20,6 @@ from pace_optim.joint_twins.problem import TwinProblem
 LOOK_AHEAD = 3.0
 """Where an effect leaves more than this many times the floor, the next one leads on for a round too."""
 _ROUGH_ITERATIONS, _FINE = 8, 3
-WAYS = 2
-"""How many effects of a joint lead on."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -126,14 +124,21 @@ class _Search:
             e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
         )
 
+    def _settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
+        """A model and its errors, fitted over wide steps where narrow ones may have led no further."""
+        errors = validation_errors(problem, [now])[0]
+        if not self._is_rough(now, errors):
+            return now, errors
+        coarse = problem.with_physics_dt(problem.control_dt)
+        now = fit_side_by_side(coarse, [now], _ROUGH_ITERATIONS, rough=True)[0]
+        now = fit_side_by_side(problem, [now], _FINE, keep_jacobian=True)[0]
+        return now, validation_errors(problem, [now])[0]
+
     def grown(self, branch: _Branch, found: Round) -> _Branch:
         """The branch with each joint's chosen effect, and what that changes of the older ones."""
         rounds = [each.copy() for each in [*branch.rounds, found]]
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
-        errors = validation_errors(problem, [now])[0]
-        if self._is_rough(now, errors):
-            now = _over_wide_steps(problem, now)
-            errors = validation_errors(problem, [now])[0]
+        now, errors = self._settled(problem, now)
         if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
             problem, now = self.follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
@@ -148,39 +153,21 @@ class _Search:
         """
         first = self.grown(branch, found)
         ahead = self.tried(first)
-        if branch.rounds or ahead is None:
+        reach, enough = _reach(first, ahead), (LOOK_AHEAD * self.floor) ** 2
+        unexplained = (first.errors.mse > enough) & (reach > enough)
+        other = _next_choice(found, unexplained)
+        if branch.rounds or ahead is None or other is None:
             return first, ahead
-        reach, chosen = _reach(first, ahead), list(found.chosen)
-        for k in range(1, WAYS):
-            unexplained = (first.errors.mse.sqrt() > LOOK_AHEAD * self.floor) & (reach > (LOOK_AHEAD * self.floor) ** 2)
-            if (other := _next_choice(found, k, unexplained)) is None:
-                break
-            self.say(f"looking ahead with {', '.join(dict.fromkeys(e.name for e in other.chosen if e is not None))}")
-            way = self._quickly_grown(branch, other)
-            further = _reach(way, self.tried(way))
-            better = unexplained & (RIVAL**2 * further < reach)
-            chosen = [other.chosen[j] if better[j] else effect for j, effect in enumerate(chosen)]
-            reach = torch.where(better, further, reach)
-        if chosen == found.chosen:
+        self.say(f"looking ahead with {', '.join(dict.fromkeys(e.name for e in other.chosen if e is not None))}")
+        # along the present reference, which is near enough for a look
+        now, errors = self._settled(branch.problem, _combined(branch.problem, branch.now, other))
+        way = _Branch(problem=branch.problem, now=now, errors=errors, rounds=[other])
+        better = unexplained & (RIVAL**2 * _reach(way, self.tried(way)) < reach)
+        if not bool(better.any()):
             return first, ahead
+        chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
         taken = self.grown(branch, replace(found, chosen=chosen))
         return taken, self.tried(taken)
-
-    def _quickly_grown(self, branch: _Branch, found: Round) -> _Branch:
-        """The same along the present reference, older effects as they are."""
-        now = _combined(branch.problem, branch.now, found)
-        errors = validation_errors(branch.problem, [now])[0]
-        if self._is_rough(now, errors):
-            now = _over_wide_steps(branch.problem, now)
-            errors = validation_errors(branch.problem, [now])[0]
-        return _Branch(problem=branch.problem, now=now, errors=errors, rounds=[*branch.rounds, found])
-
-
-def _over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
-    """Fitted again where narrow derivatives may have led no further."""
-    coarse = problem.with_physics_dt(problem.control_dt)
-    now = fit_side_by_side(coarse, [now], _ROUGH_ITERATIONS, rough=True)[0]
-    return fit_side_by_side(problem, [now], _FINE, keep_jacobian=True)[0]
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
@@ -198,12 +185,12 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
 
 
-def _next_choice(found: Round, k: int, unexplained: torch.Tensor) -> Round | None:
-    """The round with the k-th of the effects that came near the best, on unexplained joints that have one."""
+def _next_choice(found: Round, unexplained: torch.Tensor) -> Round | None:
+    """The round with the effect that came nearest to the best, on unexplained joints that have one."""
     chosen = list(found.chosen)
     for j in unexplained.nonzero()[:, 0].tolist():
-        if (best := found.chosen[j]) is not None and len(near := near_trials(found.trials[j], best)) >= k:
-            chosen[j] = near[k - 1].effect
+        if (best := found.chosen[j]) is not None and (near := near_trials(found.trials[j], best)):
+            chosen[j] = near[0].effect
     return None if chosen == found.chosen else replace(found, chosen=chosen)
 
 
