@@ -111,7 +111,15 @@ def diagnose_command(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise ValueError(f"This version has no diagnosis ({error}). Update the checkout.") from None
     run = newest_run(ROBOTS[args.robot], args.log_dir)
-    print(diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects)))
+    found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects))
+    print(f"{found.verdict}: {found.summary}")
+    print(*(f"{name}: {_mrad(joint)}" for name, joint in found.joints.items()), sep="\n")
+    print(f"run: {found.runs[-1]}")
+
+
+def _mrad(joint: dict) -> str:
+    before, after = (1e3 * joint[f"validation_rmse_{when}"] for when in ("before", "after"))
+    return f"{before:.3g} -> {after:.3g} mrad held out, floor {1e3 * joint['floor']:.2g}; {', '.join(joint['effects'])}"
 
 
 def sag_command(args: argparse.Namespace) -> None:
