@@ -20,6 +20,7 @@ from static_sag import sag_table, static_sag
 
 from pace_envs import load_env_cfg
 from pace_optim.cli import run_cli
+from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.find_run import find_run
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
@@ -106,10 +107,6 @@ def fit_command(args: argparse.Namespace) -> None:
 
 def diagnose_command(args: argparse.Namespace) -> None:
     """Diagnose the newest run of a robot."""
-    try:
-        from pace_optim.diagnosis import DiagnosisSettings, diagnose
-    except ImportError as error:
-        raise ValueError(f"This version has no diagnosis ({error}). Update the checkout.") from None
     run = newest_run(ROBOTS[args.robot], args.log_dir)
     found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects))
     print(f"{found.verdict}: {found.summary}")
