@@ -26,6 +26,7 @@ from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import OPTIMIZERS, FitSettings
 from pace_optim.plots import plot_trajectories
+from pace_optim.report import write_report
 from pace_optim.summary import summary
 
 SOURCE = Path(__file__).resolve().parents[2] / "shared" / "measurements"
@@ -110,13 +111,12 @@ def diagnose_command(args: argparse.Namespace) -> None:
     run = newest_run(ROBOTS[args.robot], args.log_dir)
     found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects))
     print(f"{found.verdict}: {found.summary}")
-    print(*(f"{name}: {_mrad(joint)}" for name, joint in found.joints.items()), sep="\n")
+    for name, joint in found.joints.items():
+        before, after = (1e3 * joint[f"validation_rmse_{when}"] for when in ("before", "after"))
+        print(f"  {name:20s} {before:7.2f} -> {after:7.2f} mrad  {', '.join(joint['effects'])}")
+    for each in found.runs:
+        print(f"report: {write_report(each)}")
     print(f"run: {found.runs[-1]}")
-
-
-def _mrad(joint: dict) -> str:
-    before, after = (1e3 * joint[f"validation_rmse_{when}"] for when in ("before", "after"))
-    return f"{before:.3g} -> {after:.3g} mrad held out, floor {1e3 * joint['floor']:.2g}; {', '.join(joint['effects'])}"
 
 
 def sag_command(args: argparse.Namespace) -> None:

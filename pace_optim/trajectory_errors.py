@@ -25,6 +25,11 @@ def rms(error: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(np.square(error)))) if error.size else None
 
 
+def three_figures(value: float) -> str:
+    """A number of a table, as 0.120, 12.0 or 120."""
+    return f"{value:#.3g}".rstrip(".")
+
+
 def angle_unit(values: Iterable[float | None]) -> tuple[float, str]:
     """A factor and a unit in which the largest of some angles [rad] reads well; mrad unless all are tiny."""
     largest = max((abs(value) for value in values if value is not None and np.isfinite(value)), default=1.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.trajectory_errors import angle_unit, rms
+from pace_optim.trajectory_errors import angle_unit, rms, three_figures
 
 from .joint import noise_floors, rmse_by_part
 from .tracks import RunTracks, Track
@@ -121,4 +121,4 @@ def _rmse_by_joint(run: RunTracks, part: str) -> dict[str, float]:
 
 
 def _cell(value: float | None, factor: float) -> str:
-    return "–" if value is None else f"{factor * value:#.3g}"
+    return "–" if value is None else three_figures(factor * value)

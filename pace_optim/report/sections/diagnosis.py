@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from pace_optim.trajectory_errors import angle_unit
+from pace_optim.trajectory_errors import angle_unit, three_figures
 
 from ..markup import Section, bullets, esc, figure, table
 from ..run_data import RunData
@@ -62,9 +62,9 @@ def _ladder(content: dict[str, Any]) -> str:
         error = step["validation_rmse"]
         gain = "" if before is None or error <= 0 else f"{before / error:.3g}"
         model = esc(step["model"]).replace("|", "|<wbr>")
-        rows.append([f"<b>{model}</b>", f"{factor * error:#.3g}", gain])
+        rows.append([f"<b>{model}</b>", three_figures(factor * error), gain])
         before = error
-    rows.append(["floor of noise and numerics", f"{factor * floor:#.3g}", ""])
+    rows.append(["floor of noise and numerics", three_figures(factor * floor), ""])
     head = ["model, each joint simulated alone", f"validation [{unit}]", "× better than before"]
     return f"<h3>The error with it</h3>{table(head, rows, 'ladder')}"
 
@@ -132,7 +132,7 @@ def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> str:
             [
                 f"<b>{esc(_name(entry))}</b>",
                 state,
-                f"{factor * entry['validation_rmse_before']:#.3g} → {factor * entry['validation_rmse_after']:#.3g}",
+                " → ".join(three_figures(factor * entry[f"validation_rmse_{when}"]) for when in ("before", "after")),
                 esc(_few(entry["joints"])),
                 esc(", ".join(entry["confounded_with"]) or "–"),
                 esc(entry["evidence"]),
@@ -152,7 +152,10 @@ def _joints(content: dict[str, Any]) -> str:
     rows = [
         [
             f"<b>{esc(name)}</b>",
-            *(f"{factor * joint[key]:#.3g}" for key in ("validation_rmse_before", "validation_rmse_after", "floor")),
+            *(
+                three_figures(factor * joint[key])
+                for key in ("validation_rmse_before", "validation_rmse_after", "floor")
+            ),
             esc(", ".join(joint["effects"]) or "–"),
         ]
         for name, joint in joints.items()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pace_optim.trajectory_errors import angle_unit
+from pace_optim.trajectory_errors import angle_unit, three_figures
 
 from ..markup import Section, bullets, choice, esc, json_script, table
 from ..run_data import RunData
@@ -72,8 +72,8 @@ def _by_joint(content: dict[str, Any]) -> str:
         rows.append(
             [
                 f'<a href="#failure" data-joint="{esc(name)}"><b>{esc(name)}</b></a>',
-                *(f"{factor * joint['rmse'][part]:#.3g}" for part in parts),
-                f"{factor * joint['noise_floor']:#.3g}",
+                *(three_figures(factor * joint["rmse"][part]) for part in parts),
+                three_figures(factor * joint["noise_floor"]),
                 f'<span class="share"><div><i style="width:{share:.0f}%"></i></div>{share:.0f} %</span>',
                 esc(joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} ")),
             ]

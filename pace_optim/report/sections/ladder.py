@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pace_optim.trajectory_errors import angle_unit
+from pace_optim.trajectory_errors import angle_unit, three_figures
 
 from ..markup import Section, esc, figure, table
 from ..run_data import RunData
@@ -109,9 +109,9 @@ def _table(steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float
         cells = [f"<b>{esc(step['name'])}</b>"]
         for part in parts:
             ratio = step["ratio_to_previous"].get(part)
-            cells += [f"{factor * step['rmse'][part]['all']:#.3g}", "" if ratio is None else f"{ratio:.3g}"]
+            cells += [three_figures(factor * step["rmse"][part]["all"]), "" if ratio is None else f"{ratio:.3g}"]
         rows.append(cells)
-    rows.append(["noise floor", *[f"{factor * floor['all']:#.3g}", ""] * len(parts)])
+    rows.append(["noise floor", *[three_figures(factor * floor["all"]), ""] * len(parts)])
     head = ["model"]
     for part in parts:
         head += [f"{_PARTS[part][0]} [{unit}]", "× better than before"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pace_optim.fit_result import FitResult
-from pace_optim.trajectory_errors import angle_text, angle_unit
+from pace_optim.trajectory_errors import angle_text, angle_unit, three_figures
 
 from ..markup import Section, bullets, esc
 from ..run_data import RunData
@@ -122,7 +122,7 @@ def _errors_by_joint(result: FitResult) -> str:
     for joint in result.joint_names:
         bars = "".join(
             f'<div class="bar {name}"><i style="width:{100 * errors[joint] / largest:.1f}%"></i>'
-            f"<span>{factor * errors[joint]:#.3g}</span></div>"
+            f"<span>{three_figures(factor * errors[joint])}</span></div>"
             for name, errors in parts
         )
         rows.append(
