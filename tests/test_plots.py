@@ -8,7 +8,7 @@ from run_folders import JOINTS, make_history, make_trajectory
 
 from pace_optim.history import History
 from pace_optim.plots import plot_scores, plot_trajectories
-from pace_optim.trajectory_errors import angle_text, angle_unit, held_out_spans
+from pace_optim.trajectory_errors import angle_text, angle_unit, held_out_spans, three_figures
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +126,8 @@ def test_a_unit_fits_the_largest_and_survives_what_is_no_number():
     assert angle_unit([1e-9, 2e-3]) == (1e3, "mrad")
     assert angle_unit([float("nan"), None, 1e-6]) == (1e6, "µrad")
     assert angle_unit([]) == (1e3, "mrad")
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.12, "0.120"), (11.96, "12.0"), (114.2, "114"), (0.0, "0.00")])
+def test_numbers_of_a_table_have_three_figures(value, text):
+    assert three_figures(value) == text
