@@ -146,6 +146,8 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
     assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
     assert stand_ins(far, ["servo"]) == ([f"{effect.name} (servo)"] if stuck else [])
     assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
+    two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [-0.2]))
+    assert verdict(replace(far, final=two), floor)[0] == "effect"  # beside another that is inside its bounds
 
 
 def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):

@@ -63,6 +63,7 @@ def found(monkeypatch, *joints):
     monkeypatch.setattr(search, "validation_errors", world.errors)
     monkeypatch.setattr(search, "try_effects", world.try_effects)
     monkeypatch.setattr(search, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+    monkeypatch.setattr(search, "fit_over_wide_steps", lambda _, now: now)
     monkeypatch.setattr(search, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
     bounds = torch.ones(n, len(BASE)).double()
@@ -73,10 +74,9 @@ def found(monkeypatch, *joints):
         upper=bounds,
         log=torch.zeros(len(BASE), dtype=torch.bool),
     )
-    problem = SimpleNamespace(control_dt=1.0, with_physics_dt=lambda _: None)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     outcome = search.add_effects(
-        problem, Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING], 5 * floor, floor, 3
+        SimpleNamespace(), Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING], 5 * floor, floor, 3
     )
     assert outcome.final_errors.mse.sqrt().tolist() == pytest.approx(
         [world.rmse(j, effects) for j, effects in enumerate(world.effects_of(outcome.final))]

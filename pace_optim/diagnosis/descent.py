@@ -81,6 +81,13 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
     return _near_ones(result, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
 
 
+def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
+    """Go on from a model over wide steps at the control step, and the rest at the problem's physics step."""
+    at_control_step = problem.with_physics_dt(problem.control_dt)
+    coarse = fit_side_by_side(at_control_step, [now], _COARSE, rough=True)
+    return fit_side_by_side(problem, coarse, _FINE, keep_jacobian=True)[0]
+
+
 def _near_ones(models: Sequence[Fitted], fit: Callable[[list[Fitted]], list[Fitted]]) -> list[Fitted]:
     """All models, fitted again those that are near the best one on some joint."""
     scores = torch.stack([each.score for each in models])

@@ -9,7 +9,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.swapping import swapped
@@ -19,7 +19,6 @@ from pace_optim.joint_twins.problem import TwinProblem
 
 LOOK_AHEAD = 3.0
 """Where an effect leaves more than this many times the floor, the next one leads on for a round too."""
-_ROUGH_ITERATIONS, _FINE = 8, 3
 
 
 @dataclass(kw_only=True, eq=False)
@@ -129,9 +128,7 @@ class _Search:
         errors = validation_errors(problem, [now])[0]
         if not self._is_rough(now, errors):
             return now, errors
-        coarse = problem.with_physics_dt(problem.control_dt)
-        now = fit_side_by_side(coarse, [now], _ROUGH_ITERATIONS, rough=True)[0]
-        now = fit_side_by_side(problem, [now], _FINE, keep_jacobian=True)[0]
+        now = fit_over_wide_steps(problem, now)
         return now, validation_errors(problem, [now])[0]
 
     def grown(self, branch: _Branch, found: Round) -> _Branch:

@@ -43,8 +43,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
 def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 
-    They explain at least half of the error above the floor, and none of them has run into a bound: it would stand in
-    for something else. Near the floor it does not matter how.
+    They explain at least half of the error above the floor, and not all of them have run into a bound: those would
+    stand in for something else. Near the floor it does not matter how.
 
     Args:
         outcome: Where the search ended.
@@ -53,8 +53,9 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     after = outcome.final_errors.mse
     excess, left = _above(outcome.base_errors.mse, floor), _above(after, floor)
     near = after.sqrt() <= UNKNOWN_RATIO * floor
-    inside = ~outcome.final.model.at_bounds(outcome.final.x).any(dim=0)
-    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & inside | near)
+    has = outcome.final.model.has
+    inside = (has & ~outcome.final.model.at_bounds(outcome.final.x)).any(dim=0)
+    return has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & inside | near)
 
 
 def stand_ins(outcome: Outcome, names: Sequence[str]) -> list[str]:
