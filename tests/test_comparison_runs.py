@@ -296,6 +296,16 @@ def test_the_page_opens_without_a_complaint_and_draws_every_figure(browser):
     assert len(drawn) == 7 and all(drawn)
 
 
+def test_the_curves_open_where_the_error_is_largest(browser):
+    page, content = browser
+    joint = content["worst_places"][0]["joint"]
+    errors = [max(filter(None, each["rmse"].values())) for each in content["joints"][joint]["recordings"]]
+    assert joint != JOINTS[0] or errors[0] < max(errors)  # otherwise the first ones would do
+    for name, index in (("joint", JOINTS.index(joint)), ("recording", errors.index(max(errors)))):
+        chosen = f"document.querySelector('.chooser [data-choice={name}] input:checked').value"
+        assert page.evaluate(chosen) == str(index)
+
+
 def test_the_sections_are_in_the_order_of_reading(browser):
     page, _ = browser
     ids = page.evaluate("[...document.querySelectorAll('section')].map((s) => s.id)")

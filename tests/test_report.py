@@ -261,6 +261,16 @@ def test_it_opens_without_a_complaint_or_a_request(browser, run):
     assert [url for url in browser.requests if url != own and not url.startswith(("data:", "about:"))] == []
 
 
+def test_the_trajectories_open_on_the_largest_error(browser):
+    recordings = make_trajectory()["recordings"]
+    rms = np.array([(r["sim_dof_pos"] - r["dof_pos"]).square().mean(dim=0).sqrt().numpy() for r in recordings])
+    r, j = np.unravel_index(rms.argmax(), rms.shape)
+    assert (r, j) != (0, 0)
+    for name, index in (("recording", r), ("joint", j)):
+        chosen = f"document.querySelector('.explorer [data-choice={name}] input:checked').value"
+        assert browser.evaluate(chosen) == str(index)
+
+
 def test_every_figure_is_drawn(browser):
     drawn = "[...document.querySelectorAll('.canvas')].map((c) => c.querySelectorAll('svg.main-svg').length)"
     assert len(browser.evaluate(drawn)) == 3

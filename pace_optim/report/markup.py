@@ -66,16 +66,17 @@ def figure(
     )
 
 
-def choice(name: str, entries: Sequence[str], group: str = "") -> str:
+def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> str:
     """Radio buttons that look like pills: arrow keys go from one to the next.
 
     Args:
         name: What is chosen.
         entries: From what.
         group: Sets them apart from another choice of the same on the page.
+        at: Which one the page opens on.
     """
     pills = "".join(
-        f'<label><input type="radio" name="{esc(group + name)}" value="{i}"{" checked" if i == 0 else ""}>'
+        f'<label><input type="radio" name="{esc(group + name)}" value="{i}"{" checked" if i == at else ""}>'
         f"<span>{esc(entry)}</span></label>"
         for i, entry in enumerate(entries)
     )

@@ -37,16 +37,25 @@ def failure(run: RunData) -> Section | None:
         ],
     }
     notes = bullets(content["notes"], "notes") if content["notes"] else ""
+    r, j = _worst_cell(content)
     return Section(
         id="failure",
         title="Where the model fails",
         lead=content["summary"] + _basis(content),
         html=(
             f"{_places(content)}{_by_joint(content)}{notes}"
-            f'<div class="chooser">{choice("recording", recordings, "failure-")}'
-            f"{choice('joint', content['joint_names'], 'failure-')}{cards}{json_script(page)}</div>"
+            f'<div class="chooser">{choice("recording", recordings, "failure-", r)}'
+            f"{choice('joint', content['joint_names'], 'failure-', j)}{cards}{json_script(page)}</div>"
         ),
     )
+
+
+def _worst_cell(content: dict[str, Any]) -> tuple[int, int]:
+    """Recording and joint that the curves open on: of the worst place's joint, the recording with the largest error."""
+    names = content["joint_names"]
+    joint = content["worst_places"][0]["joint"] if content["worst_places"] else names[0]
+    largest = [max(filter(None, one["rmse"].values()), default=0.0) for one in content["joints"][joint]["recordings"]]
+    return largest.index(max(largest)), names.index(joint)
 
 
 def _basis(content: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,16 +28,27 @@ def trajectories(run: RunData) -> Section | None:
         "joints": list(run.joint_names),
         "recordings": [_encode(recording, per_curve) for recording in run.recordings],
     }
+    r, j = _worst_cell(run.recordings)
     return Section(
         id="trajectories",
         title="Trajectories",
         lead="Drag to zoom, double click to see all. The zoom stays when the joint changes.",
         html=(
-            f'<div class="explorer">{choice("recording", [r.name for r in run.recordings])}'
-            f"{choice('joint', run.joint_names)}"
+            f'<div class="explorer">{choice("recording", [each.name for each in run.recordings], at=r)}'
+            f"{choice('joint', run.joint_names, at=j)}"
             f'<p class="errors-here"></p><div class="canvas" style="height:540px"></div>{json_script(content)}</div>'
         ),
     )
+
+
+def _worst_cell(recordings: Sequence[RecordingData]) -> tuple[int, int]:
+    """Recording and joint that the curves open on: those with the largest error."""
+    errors = [
+        rms(np.nan_to_num(recording.error[:, j])) or 0.0
+        for recording in recordings
+        for j in range(recording.error.shape[1])
+    ]
+    return divmod(int(np.argmax(errors)), recordings[0].error.shape[1])
 
 
 def _encode(recording: RecordingData, per_curve: int) -> dict:
