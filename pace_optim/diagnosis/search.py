@@ -159,12 +159,13 @@ class _Search:
         # along the present reference, which is near enough for a look
         now, errors = self._settled(branch.problem, _combined(branch.problem, branch.now, other))
         way = _Branch(problem=branch.problem, now=now, errors=errors, rounds=[other])
-        better = unexplained & (RIVAL**2 * _reach(way, self.tried(way)) < reach)
+        beyond = self.tried(way)
+        better = unexplained & (RIVAL**2 * _reach(way, beyond) < reach)
         if not bool(better.any()):
             return first, ahead
         chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
         taken = self.grown(branch, replace(found, chosen=chosen))
-        return taken, self.tried(taken)
+        return taken, beyond if _is_same(taken, way) else self.tried(taken)
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
@@ -180,6 +181,12 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
         model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
         physical[has, :size] = values[has, :size]
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+
+
+def _is_same(one: _Branch, two: _Branch) -> bool:
+    """Whether two branches end at one model along one reference, so that what was tried on one holds for both."""
+    same_effects = one.now.model.effects == two.now.model.effects
+    return one.problem is two.problem and same_effects and torch.equal(one.now.x, two.now.x)
 
 
 def _next_choice(found: Round, unexplained: torch.Tensor) -> Round | None:
