@@ -9,7 +9,7 @@ import torch
 
 from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.descent import Fitted
-from pace_optim.diagnosis.model import start_values
+from pace_optim.diagnosis.model import BASE, start_values
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -20,6 +20,8 @@ _AT_BOUND = 1e-3
 _RIDGE = 1e-9
 _SEEN = 0.3
 """Part of an effect's amplitude: with less than this left, a base parameter takes it up."""
+_WIDE = 0.1
+"""Normalised step of that parameter: joints that stick make the error rough, and a narrow step sees the roughness."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,10 +76,18 @@ def absorbed_effects(
     suspects = [effect for effect in effects if effect.absorbed_by]
     if not suspects:
         return {}
-    probes, changes, _ = _simulated(problem, now, suspects, effort)
+    takers = sorted({BASE.index(effect.absorbed_by) for effect in suspects})
+    steps = torch.where(now.x > 0, -_WIDE, _WIDE)
+    beside = now.x.repeat(len(takers), 1, 1)
+    for row, taker in enumerate(takers):
+        beside[row, :, taker] += steps[:, taker]
+    probes, changes, _ = _simulated(problem, now, suspects, effort, beside)
     jacobian = _free_columns(now)
+    for taker, change in zip(takers, changes, strict=False):
+        at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
+        jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
     result = {effect: torch.ones(now.model.num_joints, dtype=torch.bool) for effect in suspects}
-    for (effect, _), change in zip(probes, changes, strict=True):
+    for (effect, _), change in zip(probes, changes[len(takers) :], strict=True):
         for j in range(now.model.num_joints):
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
             columns = columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12)
@@ -94,12 +104,20 @@ def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def _simulated(
-    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    problem: TwinProblem,
+    now: Fitted,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    beside: torch.Tensor | None = None,
 ) -> tuple[list[tuple[type[Effect], torch.Tensor]], torch.Tensor, torch.Tensor]:
-    """All probes with their values, what they change (probes, K, R, n), and where the samples are (T, R)."""
+    """All probes with their values, what they change (probes, K, R, n), and where the samples are (T, R).
+
+    ``beside``, (b, n, P) normalised, are more values of the model itself; what those change comes first.
+    """
     model = now.model
     physical = model.to_physical(now.x)
-    slots, values = [Slot(model=model, rows=1)], [physical[None]]
+    own = now.x[None] if beside is None else torch.cat([now.x[None], beside])
+    slots, values = [Slot(model=model, rows=len(own))], [model.to_physical(own)]
     probes: list[tuple[type[Effect], torch.Tensor]] = []
     for effect in effects:
         points = [_probe_values(effect, point, effort) for point in probe_points(effect)]
