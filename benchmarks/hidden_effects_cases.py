@@ -135,7 +135,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "absorbed": [effect.name for effect in found.absorbed],
         "explained": found.explained,
         "floor": float(found.data.floor.square().mean().sqrt()),
-        "ranking": ranking(outcome, problem.joint_names),
+        "ranking": ranking(outcome, problem.joint_names, found.verdict),
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
         "truth": truth["effects"],
         "seconds": {

@@ -144,7 +144,8 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
     floor = torch.tensor([1e-4])
     far = Outcome(problem=None, base=now, base_errors=errors_of(1e-2), final=now, final_errors=errors_of(2e-3))
     assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
-    assert stand_ins(far, ["servo"]) == ([f"{effect.name} (servo)"] if stuck else [])
+    stuck_one = f"At a bound, so that it stands in for something else: {effect.name} (servo)."
+    assert stand_ins(far, ["servo"]) == ([stuck_one] if stuck else [])
     assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
     two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [-0.2]))
     assert verdict(replace(far, final=two), floor)[0] == "effect"  # beside another that is inside its bounds
@@ -392,7 +393,10 @@ def with_effects(model, values, *effects):
     for effect, joints, own in effects:
         own = torch.tensor([own] * model.num_joints, dtype=torch.float64)
         model, values = model.extended(values, effect, torch.tensor(joints), own)
-    return Fitted.start(model, values)
+    result = Fitted.start(model, values)
+    result.error = torch.zeros(1, 1, model.num_joints)
+    result.jacobian = result.error.repeat(model.size, 1, 1, 1)
+    return result
 
 
 def two_joints(bench):

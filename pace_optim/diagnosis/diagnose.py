@@ -42,7 +42,13 @@ class Findings:
     verdict: str
     explained: float
     """Part of the error above the floor that the effects found explain."""
-    added: list[str]
+    paying: list[str]
+    """Effects that lower the error, as ``fit.py --effects`` takes them, also where they only stand in."""
+
+    @property
+    def added(self) -> list[str]:
+        """Those that are what is missing."""
+        return self.paying if self.verdict == "effect" else []
 
 
 def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) -> Diagnosis:
@@ -71,13 +77,13 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
     ).with_effects(())
     base = {name: result.parameters[name] for name in problem.space.slices}
     found = search_effects(problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say)
-    runs, ladder = [str(folder)], _ladder(found, problem.joint_names)
-    if settings.refit and found.added:
-        progress.say(f"fitting the whole robot with {', '.join(found.added)}")
+    runs, ladder = [str(folder)], _ladder(found)
+    if settings.refit and found.paying:
+        progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
         final = found.outcome.final
         refit_settings = replace(
             run_settings,
-            effects=found.added,
+            effects=found.paying,
             optimizer="least_squares",
             physics_dt=physics_dt,
             start=whole_values(final.model, final.x, problem.joint_names),
@@ -97,7 +103,8 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         summary=summary_of(found, problem),
         explained=found.explained,
         added=found.added,
-        ranking=ranking(found.outcome, problem.joint_names),
+        paying=found.paying,
+        ranking=ranking(found.outcome, problem.joint_names, found.verdict),
         joints=_joints(found, problem),
         data=found.data.sentences,
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
@@ -151,8 +158,8 @@ def search_effects(
     decision, explained = verdict(outcome, data.floor)
     if decision == "effect":
         keep_on(outcome, explained_joints(outcome, data.floor))
-    added = labels(outcome.final.model, problem.joint_names) if decision == "effect" else []
-    return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, added=added)
+    paying = labels(outcome.final.model, problem.joint_names)
+    return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, paying=paying)
 
 
 def summary_of(found: Findings, problem: Problem) -> str:
@@ -166,16 +173,13 @@ def summary_of(found: Findings, problem: Problem) -> str:
             f"floor of noise and numerics {floor:.3g} mrad."
         )
     if found.verdict == "unknown":
-        paying = labels(found.outcome.final.model, problem.joint_names)
-        shares = f"what pays, {', '.join(paying)}, explains" if paying else "the effects tried explain"
+        shares = f"what pays, {', '.join(found.paying)}, explains" if found.paying else "the effects tried explain"
         text = (
             f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
             f"mrad, the floor {floor:.3g} mrad, and {shares} {100 * max(0.0, found.explained):.0f} % of what lies "
             "between."
         )
-        if bent := stand_ins(found.outcome, problem.joint_names):
-            text += f" At a bound, so that it stands in for something else: {', '.join(bent)}."
-        return text
+        return " ".join([text, *stand_ins(found.outcome, problem.joint_names)])
     summary = (
         f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
@@ -185,11 +189,10 @@ def summary_of(found: Findings, problem: Problem) -> str:
     return summary
 
 
-def _ladder(found: Findings, names: Sequence[str]) -> list[dict]:
-    outcome = found.outcome
-    steps = [("base model", outcome.base_errors)]
-    if paying := labels(outcome.final.model, names):
-        steps.append((" + ".join(paying), outcome.final_errors))
+def _ladder(found: Findings) -> list[dict]:
+    steps = [("base model", found.outcome.base_errors)]
+    if found.paying:
+        steps.append((" + ".join(found.paying), found.outcome.final_errors))
     return [{"model": model, "validation_rmse": float(errors.mse.mean().sqrt())} for model, errors in steps]
 
 

@@ -25,7 +25,9 @@ class Diagnosis:
     explained: float = 1.0
     """Part of the error above the floor that the effects found explain."""
     added: list[str]
-    """Effects to add, as ``fit.py --effects`` takes them."""
+    """Effects that are what is missing, as ``fit.py --effects`` takes them; none unless the verdict is ``effect``."""
+    paying: list[str] = field(default_factory=list)
+    """Effects that lower the error, also where they only stand in for something else; the refit has them."""
     ranking: list[dict[str, Any]]
     """Every effect that was refitted, the best first."""
     joints: dict[str, dict[str, Any]]

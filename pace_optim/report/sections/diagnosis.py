@@ -40,8 +40,9 @@ def _verdict(content: dict[str, Any]) -> str:
     if content["verdict"] == "effect" and (part := content.get("explained", 1.0)) < _PARTLY:
         css, heading = "bad", f"Something is missing, and known effects explain {100 * part:.0f} % of it"
     add = ""
-    if content["added"]:
-        add = f"<p>Add it: <code>scripts/fit.py … --effects {esc(' '.join(content['added']))}</code></p>"
+    if effects := content["added"] or content.get("paying", []):
+        why = "Add it" if content["added"] else "Until it is known, what stands in for it lowers the error"
+        add = f"<p>{why}: <code>scripts/fit.py … --effects {esc(' '.join(effects))}</code></p>"
     return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
 
 

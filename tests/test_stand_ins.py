@@ -1,0 +1,102 @@
+"""An effect that has another size in each recording stands in for something that is not known."""
+
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diagnoses import hidden_run
+from problems import CALM
+
+from pace_actuators.effects import get_effect
+from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.diagnose import Findings
+from pace_optim.diagnosis.evenness import unevenness
+from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.verdict import stand_ins, verdict
+from pace_optim.report import write_report
+
+SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")
+FLOOR, YES = torch.tensor([1e-4]), torch.tensor([True])
+SAID = "Of another size in each recording, so that it stands in for something else: parallel_spring (servo)."
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return hidden_run(tmp_path_factory.mktemp("run"), None, duration=3.0)
+
+
+def fitted_to(problem, *sizes):
+    """A model with a spring, fitted to recordings that would each have the spring in another size, and a friction."""
+    model, values = JointModel.base(problem), torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64)
+    for effect, own in ((SPRING, [2.0, 0.1]), (QUADRATIC, [0.1])):
+        model, values = model.extended(values, effect, YES, torch.tensor([own], dtype=torch.float64))
+    now, generator = Fitted.start(model, values), torch.Generator().manual_seed(0)
+    now.jacobian = torch.randn(model.size, 500, len(sizes), 1, generator=generator)
+    spring = now.jacobian[model.columns(SPRING).start]
+    now.error = spring * (torch.tensor(sizes) - sum(sizes) / len(sizes))[:, None]
+    now.error += 0.3 * torch.randn(500, len(sizes), 1, generator=generator)
+    return now
+
+
+def ended(problem, rmse, friction=False):
+    """A search that came from 10 mrad to an RMSE [rad] with a spring that differs between recordings."""
+    now = fitted_to(problem, 1.0, 1.1, 0.9, 2.0)
+    final = now if friction else replace(now, model=now.model.without_effect(QUADRATIC, YES))
+    before, after = (
+        BlockErrors(square=torch.tensor([[each**2]]).double(), weight=torch.ones(1).double()) for each in (1e-2, rmse)
+    )
+    return Outcome(problem=None, base=now, base_errors=before, final=final, final_errors=after)
+
+
+def test_an_effect_whose_size_differs_between_recordings_is_seen(run):
+    sizes = torch.tensor([1.0, 1.1, 0.9, 2.0])
+    spring, friction = unevenness(fitted_to(run.problem, *sizes))[:, 0].tolist()
+    varied = sizes.var(correction=0)
+    assert spring == pytest.approx(float(varied / (varied + 0.3**2)), abs=0.05) and abs(friction) < 0.05
+    assert float(unevenness(fitted_to(run.problem, 1.0, 1.0, 1.0, 1.0)).max()) < 0.05
+    assert not unevenness(fitted_to(run.problem, 1.0, 2.0)).any()  # which of two is right?
+    with pytest.raises(ValueError, match="keep_jacobian"):
+        unevenness(replace(fitted_to(run.problem, 1.0), jacobian=None))
+
+
+def test_it_is_not_what_is_missing_unless_it_explains_nearly_all(run):
+    far = ended(run.problem, 5e-3)
+    assert verdict(far, FLOOR)[0] == "unknown" and stand_ins(far, ["servo"]) == [SAID]
+    assert verdict(ended(run.problem, 2e-3), FLOOR)[0] == "effect"
+    assert verdict(ended(run.problem, 5e-3, friction=True), FLOOR)[0] == "effect"  # beside another that does not differ
+
+
+def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
+    found = Findings(
+        outcome=ended(run.problem, 5e-3),
+        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        absorbed={},
+        verdict="unknown",
+        explained=0.75,
+        paying=["parallel_spring"],
+    )
+    refits = []
+
+    def fit(settings, progress):
+        refits.append(settings)
+        return None, run.folder.parent / "refit"
+
+    (run.folder.parent / "refit").mkdir()
+    module = sys.modules[Findings.__module__]
+    for name, made in (("search_effects", found), ("advise", []), ("error_map", {})):
+        monkeypatch.setattr(module, name, lambda *_, made=made: made)
+    monkeypatch.setattr(module, "fit", fit)
+    quiet = SimpleNamespace(say=lambda _: None, restart=lambda: None, close=lambda: None)
+    diagnosis = diagnose(DiagnosisSettings(run=run.folder), quiet)
+    assert refits[0].effects == ["parallel_spring"] and diagnosis.runs[-1].endswith("refit")
+    assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]
+    assert SAID in diagnosis.summary and "75 %" in diagnosis.summary
+    assert Diagnosis.load(run.folder) == diagnosis
+    page = write_report(run.folder).read_text("utf-8")
+    assert "lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>" in page
