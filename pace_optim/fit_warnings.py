@@ -8,9 +8,13 @@ import torch
 
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem import Problem
+from pace_optim.step_error import FINER, step_error
 from pace_optim.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
+_OF_THE_STEP = (0.3, 5.0)
+"""The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
+recording comes from a simulation with this very step."""
 _UNKNOWN = 0.5
 """A standard deviation above this part of the bound range leaves a parameter open."""
 
@@ -52,7 +56,22 @@ def fit_warnings(
             f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
             f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
         )
-    return warnings
+    return warnings + _coarse_step(problem, physical, rmse)
+
+
+def _coarse_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> list[str]:
+    """Whether a part of the error may come from the physics step."""
+    data = problem.dataset
+    part, where = ("validation", data.validation) if rmse["validation"].get("all") else ("train", data.train)
+    left, change = rmse[part].get("all"), float(step_error(problem, physical, where).square().mean().sqrt())
+    least, most = _OF_THE_STEP
+    if not left or not least * left <= change <= most * left:
+        return []
+    return [
+        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} mrad, "
+        f"and the error is {1e3 * left:.3g} mrad: part of it may come from the step. Fit with "
+        f"--physics_dt {problem.physics_dt / FINER:g}."
+    ]
 
 
 def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:

@@ -14,6 +14,7 @@ from pace_envs import set_physics_dt
 from pace_optim.diagnosis import next_experiment, one_round, pruning, search, sharing, swapping
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
+from pace_optim.diagnosis.data_check import check_data
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.far_starts import far_starts
@@ -335,6 +336,26 @@ def test_the_descent_finds_the_base_parameters(bench):
     assert values["encoder_bias"] == pytest.approx(CALM["encoder_bias"], abs=5e-4)
     assert float(fitted.score.sqrt()) < 1e-4
     assert fitted.jacobian is not None and fitted.error is not None and float(effort) > 0.1
+
+
+def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
+    model, values = JointModel.base(bench.problem), bench.truth_values.clone()
+    values[0, BASE.index("armature")] *= 1.2  # of such a size is what a coarse step does
+    base = Fitted.start(model, values)
+    left = search.validation_errors(bench.twins, [base])[0].mse.sqrt()
+    run = SimpleNamespace(effects=[], rmse={"validation": {"servo": 1e-7}}, physics_dt=DT)
+    for it, floor in (
+        (run, left),
+        (SimpleNamespace(**{**vars(run), "rmse": {"validation": {"servo": float(left)}}}), None),
+        (SimpleNamespace(**{**vars(run), "effects": ["torque_gain"]}), None),
+        (None, None),
+    ):
+        check = check_data(bench.problem, bench.twins, base, it)
+        said = [sentence for sentence in check.sentences if "comes from the step" in sentence]
+        if floor is None:
+            assert float(check.floor) < 0.5 * float(left) and not said
+        else:
+            assert check.floor == pytest.approx(floor) and "2.5 ms" in said[0] and "on servo" in said[0]
 
 
 def test_a_fit_that_starts_at_the_truth_stays_there(bench):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from problems import (
+    DT,
     PENDULUMS_TRUTH,
     TRUTH,
     chirp,
@@ -194,9 +195,23 @@ def test_sets_of_parameters_read_as_words(labels, words):
 def test_a_validation_error_far_above_the_training_error_is_told(train, validation, told):
     problem = make_problem(record(chirp(0.2)))
     found = fit_warnings(problem, physical(problem), known(problem), {"train": train, "validation": validation})
-    assert bool(found) is told
+    assert any("does not carry over" in warning for warning in found) is told
     if told:
         assert "1.6 mrad" in found[0] and "1.6 times" in found[0] and "does not carry over" in found[0]
+
+
+@pytest.mark.parametrize(("of_the_change", "told"), [(0.1, False), (0.5, True), (2.0, True), (5.0, False)])
+def test_a_physics_step_that_makes_the_error_is_told(of_the_change, told):
+    problem = make_problem(record(chirp(0.2)))
+    at, where = physical(problem), problem.dataset.train
+    coarse, fine = (
+        p.evaluator().residuals(at[None], where).error[0] for p in (problem, problem.with_physics_dt(DT / 2))
+    )
+    change = float((coarse - fine)[where[: len(coarse)]].square().mean().sqrt())
+    assert change > 1e-4
+    found = fit_warnings(problem, at, known(problem), {"train": {"all": of_the_change * change}, "validation": {}})
+    step = [warning for warning in found if "--physics_dt 0.00125" in warning]
+    assert bool(step) is told and all(f"by {1e3 * change:.3g} mrad" in warning for warning in step)
 
 
 def test_all_well_says_nothing():

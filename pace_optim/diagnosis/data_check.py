@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -11,10 +12,14 @@ import torch
 from pace_optim.comparison.noise import lattice_step, noise_floor
 from pace_optim.diagnosis.base_fit import whole_vector
 from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.validation import validation_errors
+from pace_optim.fit_result import FitResult
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem
+from pace_optim.step_error import step_error
 
-_FINER = 2
+FLOOR_MARGIN = 1.1
+"""An RMSE up to this many times the floor is at the floor."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -34,8 +39,16 @@ class DataCheck:
     """Number of different gains."""
 
 
-def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
-    """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are."""
+def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResult | None = None) -> DataCheck:
+    """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are.
+
+    Args:
+        problem: The whole robot with the base model.
+        twins: Its joints simulated alone.
+        base: The base model, fitted to them.
+        run: The whole robot's own fit. Where its base model is at the floor with its own physics step, what another
+            step leaves comes from the step: recordings of a simulation are such.
+    """
     data, names = problem.dataset, problem.joint_names
     squares, steps = [], {}
     for recording in data.recordings:
@@ -46,7 +59,7 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
             if step is not None:
                 steps[name] = step
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
-    numerical = _numerical_floor(problem, base)
+    numerical = step_error(problem, whole_vector(problem, base.model.to_physical(base.x)), data.validation)
     sentences = [
         f"Measurement noise: {1e3 * float(noise.min()):.2g} to {1e3 * float(noise.max()):.2g} mrad by joint; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
@@ -61,24 +74,26 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted) -> DataCheck:
         f"{_count(len(data.recordings), 'recording')} with {_count(len(loads), 'load')} and "
         f"{_count(len(gains), 'set')} of gains."
     )
+    floor = (noise**2 + numerical**2).sqrt()
+    if run is not None and not run.effects:
+        left = validation_errors(twins, [base])[0].mse.sqrt()
+        explained = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names]) <= FLOOR_MARGIN * floor
+        if bool((by_step := explained & (left > floor)).any()):
+            floor = torch.where(by_step, left, floor)
+            sentences.append(
+                f"With the run's physics step of {1e3 * run.physics_dt:g} ms its model leaves no more than noise on "
+                f"{', '.join(name for name, yes in zip(names, by_step.tolist(), strict=True) if yes)}. What "
+                f"{1e3 * problem.physics_dt:g} ms leave there comes from the step and counts as noise: recordings of a "
+                "simulation are such."
+            )
     return DataCheck(
-        floor=(noise**2 + numerical**2).sqrt(),
+        floor=floor,
         noise=noise,
         numerical=numerical,
         sentences=sentences,
         loads=len(loads),
         gains=len(gains),
     )
-
-
-def _numerical_floor(problem: Problem, base: Fitted) -> torch.Tensor:
-    """RMS change of each joint when the physics step is made finer, on validation (n,) [rad]."""
-    finer = problem.with_physics_dt(problem.physics_dt / _FINER)
-    physical = whole_vector(problem, base.model.to_physical(base.x))[None]
-    where = problem.dataset.validation
-    coarse, fine = (p.evaluator().residuals(physical, where) for p in (problem, finer))
-    change = (coarse.error[0] - fine.error[0])[coarse.where]
-    return change.square().mean(dim=0).sqrt().nan_to_num(nan=0.0, posinf=0.0)
 
 
 def _key(*values: object) -> str:

@@ -12,7 +12,7 @@ import torch
 from pace_actuators.effects import Effect, available_effects, get_effect
 from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.data_check import DataCheck, check_data
+from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
@@ -27,8 +27,6 @@ from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
 from pace_optim.problem import Problem, load_problem
 from pace_optim.progress import ProgressLine
-
-_FLOOR_MARGIN = 1.1
 
 
 @dataclass(kw_only=True, eq=False)
@@ -76,7 +74,9 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         physics_dt=physics_dt,
     ).with_effects(())
     base = {name: result.parameters[name] for name in problem.space.slices}
-    found = search_effects(problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say)
+    found = search_effects(
+        problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say, result
+    )
     runs, ladder = [str(folder)], _ladder(found)
     if settings.refit and found.paying:
         progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
@@ -136,6 +136,7 @@ def search_effects(
     candidates: Sequence[type[Effect]],
     max_effects: int,
     say: Callable[[str], None] = lambda _: None,
+    run: FitResult | None = None,
 ) -> Findings:
     """Look for missing effects, each joint simulated alone.
 
@@ -145,15 +146,16 @@ def search_effects(
         candidates: What is tried.
         max_effects: Most effects of a joint.
         say: Shows how far it is.
+        run: The whole robot's own fit, if there is one.
     """
     torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
-    data = check_data(problem, twins, base)
+    data = check_data(problem, twins, base, run)
     absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
     base.model = replace(base.model, barred=absorbed)
 
     follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
-    outcome = add_effects(twins, base, candidates, effort, _FLOOR_MARGIN * data.floor, max_effects, say, follow)
+    outcome = add_effects(twins, base, candidates, effort, FLOOR_MARGIN * data.floor, max_effects, say, follow)
     share(outcome)
     decision, explained = verdict(outcome, data.floor)
     if decision == "effect":
