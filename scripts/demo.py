@@ -17,6 +17,9 @@ from pace_optim.summary import summary
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
+PHYSICS_DT = (
+    0.00125  # [s], as the diagnosis has it: then the ladder shows what the effect does and not what the step does
+)
 MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
 
 
@@ -61,6 +64,7 @@ def main() -> None:
             data=files["train"],
             validation=files["validation"],
             optimizer="least_squares",
+            physics_dt=PHYSICS_DT,
             log_dir=str(args.log_dir),
         )
     )

@@ -100,3 +100,4 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
     assert Diagnosis.load(run.folder) == diagnosis
     page = write_report(run.folder).read_text("utf-8")
     assert "lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>" in page
+    assert "Something is missing, and known effects only stand in for it" in page

@@ -39,6 +39,8 @@ def _verdict(content: dict[str, Any]) -> str:
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     if content["verdict"] == "effect" and (part := content.get("explained", 1.0)) < _PARTLY:
         css, heading = "bad", f"Something is missing, and known effects explain {100 * part:.0f} % of it"
+    if content["verdict"] == "unknown" and content.get("paying"):
+        heading = "Something is missing, and known effects only stand in for it"
     add = ""
     if effects := content["added"] or content.get("paying", []):
         why = "Add it" if content["added"] else "Until it is known, what stands in for it lowers the error"
