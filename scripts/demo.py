@@ -18,8 +18,6 @@ from pace_optim.summary import summary
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
 PHYSICS_DT = 0.00125  # [s], as in the diagnosis: then the ladder shows what the effect does, and not the step
-    0.00125  # [s], as the diagnosis has it: then the ladder shows what the effect does and not what the step does
-)
 MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
 
 
