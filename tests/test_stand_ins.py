@@ -14,11 +14,11 @@ from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.data_check import DataCheck
 from pace_optim.diagnosis.descent import Fitted
-from pace_optim.diagnosis.diagnose import Findings
+from pace_optim.diagnosis.diagnose import Findings, summary_of
 from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.verdict import stand_ins, verdict
+from pace_optim.diagnosis.verdict import stand_ins, varying, verdict
 from pace_optim.report import write_report
 
 SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")
@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     return hidden_run(tmp_path_factory.mktemp("run"), None, duration=3.0)
 
 
-def fitted_to(problem, *sizes):
+def fitted_to(problem, *sizes, noise=0.3):
     """A model with a spring, fitted to recordings that would each have the spring in another size, and a friction."""
     model, values = JointModel.base(problem), torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64)
     for effect, own in ((SPRING, [2.0, 0.1]), (QUADRATIC, [0.1])):
@@ -40,13 +40,13 @@ def fitted_to(problem, *sizes):
     now.jacobian = torch.randn(model.size, 500, len(sizes), 1, generator=generator)
     spring = now.jacobian[model.columns(SPRING).start]
     now.error = spring * (torch.tensor(sizes) - sum(sizes) / len(sizes))[:, None]
-    now.error += 0.3 * torch.randn(500, len(sizes), 1, generator=generator)
+    now.error += noise * torch.randn(500, len(sizes), 1, generator=generator)
     return now
 
 
-def ended(problem, rmse, friction=False):
+def ended(problem, rmse, friction=False, noise=0.67):
     """A search that came from 10 mrad to an RMSE [rad] with a spring that differs between recordings."""
-    now = fitted_to(problem, 1.0, 1.1, 0.9, 2.0)
+    now = fitted_to(problem, 1.0, 1.1, 0.9, 2.0, noise=noise)
     final = now if friction else replace(now, model=now.model.without_effect(QUADRATIC, YES))
     before, after = (
         BlockErrors(square=torch.tensor([[each**2]]).double(), weight=torch.ones(1).double()) for each in (1e-2, rmse)
@@ -70,6 +70,22 @@ def test_it_is_not_what_is_missing_unless_it_explains_nearly_all(run):
     assert verdict(far, FLOOR)[0] == "unknown" and stand_ins(far, ["servo"]) == [SAID]
     assert verdict(ended(run.problem, 2e-3), FLOOR)[0] == "effect"
     assert verdict(ended(run.problem, 5e-3, friction=True), FLOOR)[0] == "effect"  # beside another that does not differ
+
+
+def test_an_effect_that_leaves_little_once_its_size_may_differ_is_there_and_depends_on_something(run):
+    right = ended(run.problem, 5e-3, noise=0.3)
+    assert verdict(right, FLOOR)[0] == "effect" and stand_ins(right, ["servo"]) == []
+    told = "Its size differs between recordings, so it depends on something more: parallel_spring (servo)."
+    assert varying(right, ["servo"]) == [told] and varying(ended(run.problem, 5e-3), ["servo"]) == []
+    found = Findings(
+        outcome=right,
+        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        absorbed={},
+        verdict="effect",
+        explained=0.75,
+        paying=["parallel_spring"],
+    )
+    assert summary_of(found, run.problem).endswith(told)
 
 
 def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):

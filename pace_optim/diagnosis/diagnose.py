@@ -21,7 +21,16 @@ from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.verdict import UNKNOWN_RATIO, explained_joints, keep_on, labels, ranking, stand_ins, verdict
+from pace_optim.diagnosis.verdict import (
+    UNKNOWN_RATIO,
+    explained_joints,
+    keep_on,
+    labels,
+    ranking,
+    stand_ins,
+    varying,
+    verdict,
+)
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings
@@ -187,7 +196,8 @@ def summary_of(found: Findings, problem: Problem) -> str:
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
     if after > UNKNOWN_RATIO * floor:
-        summary += " Something else is missing too, which no known effect explains."
+        told = ["Something else is missing too, which no known effect explains."]
+        return " ".join([summary, *told, *varying(found.outcome, problem.joint_names)])
     return summary
 
 
