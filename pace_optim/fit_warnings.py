@@ -8,7 +8,7 @@ import torch
 
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem import Problem
-from pace_optim.step_error import FINER, step_error
+from pace_optim.step_error import step_error
 from pace_optim.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
@@ -63,14 +63,16 @@ def _coarse_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[
     """Whether a part of the error may come from the physics step."""
     data = problem.dataset
     part, where = ("validation", data.validation) if rmse["validation"].get("all") else ("train", data.train)
-    left, change = rmse[part].get("all"), float(step_error(problem, physical, where).square().mean().sqrt())
-    least, most = _OF_THE_STEP
-    if not left or not least * left <= change <= most * left:
+    left = rmse[part].get("all")
+    if not left:
+        return []
+    change, (least, most) = float(step_error(problem, physical, where).square().mean().sqrt()), _OF_THE_STEP
+    if not least * left <= change <= most * left:
         return []
     return [
         f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} mrad, "
         f"and the error is {1e3 * left:.3g} mrad: part of it may come from the step. Fit with "
-        f"--physics_dt {problem.physics_dt / FINER:g}."
+        f"--physics_dt {problem.physics_dt / 2:.12g}."
     ]
 
 

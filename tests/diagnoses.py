@@ -109,14 +109,14 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
     model = SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")})
     model.at_bounds = lambda _: torch.zeros_like(has)
-    one_recording = torch.zeros(1, 1, len(before))
-    final = SimpleNamespace(model=model, x=None, jacobian=one_recording[None], error=one_recording)
+    final = SimpleNamespace(model=model, x=None)
     return Outcome(
         problem=None,
         base=final,
         base_errors=errors(before),
         final=final,
         final_errors=errors(after),
+        unevenness=torch.zeros(has.shape),
         rounds=list(rounds),
     )
 

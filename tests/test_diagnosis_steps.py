@@ -89,7 +89,14 @@ def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
         after = BlockErrors(square=cost * errors.square, weight=weights)
         monkeypatch.setattr(sharing, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
         monkeypatch.setattr(sharing, "validation_errors", lambda *_, after=after: [after])
-        outcome = Outcome(problem=None, base=final, base_errors=errors, final=final, final_errors=errors)
+        outcome = Outcome(
+            problem=None,
+            base=final,
+            base_errors=errors,
+            final=final,
+            final_errors=errors,
+            unevenness=torch.zeros(final.model.has.shape),
+        )
         sharing.share(outcome)
         assert (STRIBECK in outcome.final.model.shared) is shared
         values = outcome.final.model.to_physical(outcome.final.x)[:, model.columns(STRIBECK)]
@@ -143,13 +150,22 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
     now = with_effects(JointModel.base(bench.problem), bench.truth_values, (effect, [True], own))
     assert now.model.at_bounds(now.x).tolist() == [[stuck]]
     floor = torch.tensor([1e-4])
-    far = Outcome(problem=None, base=now, base_errors=errors_of(1e-2), final=now, final_errors=errors_of(2e-3))
+    even = torch.zeros(1, 1)
+    far = Outcome(
+        problem=None,
+        base=now,
+        base_errors=errors_of(1e-2),
+        final=now,
+        final_errors=errors_of(2e-3),
+        unevenness=even,
+    )
     assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
     stuck_one = f"At a bound, so that it stands in for something else: {effect.name} (servo)."
-    assert stand_ins(far, ["servo"]) == ([stuck_one] if stuck else [])
+    assert stand_ins(far, ["servo"], floor) == ([stuck_one] if stuck else [])
     assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
     two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [-0.2]))
-    assert verdict(replace(far, final=two), floor)[0] == "effect"  # beside another that is inside its bounds
+    two = replace(far, final=two, unevenness=even.repeat(2, 1))
+    assert verdict(two, floor)[0] == "effect"  # beside another that is inside its bounds
 
 
 def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):
@@ -348,6 +364,7 @@ def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
         (run, left),
         (SimpleNamespace(**{**vars(run), "rmse": {"validation": {"servo": float(left)}}}), None),
         (SimpleNamespace(**{**vars(run), "effects": ["torque_gain"]}), None),
+        (SimpleNamespace(**{**vars(run), "physics_dt": bench.problem.physics_dt}), None),
         (None, None),
     ):
         check = check_data(bench.problem, bench.twins, base, it)
@@ -414,10 +431,7 @@ def with_effects(model, values, *effects):
     for effect, joints, own in effects:
         own = torch.tensor([own] * model.num_joints, dtype=torch.float64)
         model, values = model.extended(values, effect, torch.tensor(joints), own)
-    result = Fitted.start(model, values)
-    result.error = torch.zeros(1, 1, model.num_joints)
-    result.jacobian = result.error.repeat(model.size, 1, 1, 1)
-    return result
+    return Fitted.start(model, values)
 
 
 def two_joints(bench):

@@ -73,6 +73,7 @@ def found(monkeypatch, *joints, follow=stays):
     monkeypatch.setattr(search, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
     monkeypatch.setattr(search, "fit_over_wide_steps", lambda _, now: now)
     monkeypatch.setattr(search, "swapped", lambda *_: None)
+    monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
     bounds = torch.ones(n, len(BASE)).double()
     model = JointModel(

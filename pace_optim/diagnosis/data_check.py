@@ -27,7 +27,8 @@ class DataCheck:
     """What the recordings can show."""
 
     floor: torch.Tensor
-    """RMSE that no model can go below: measurement noise and the error of the physics step, (n,) [rad]."""
+    """RMSE that no model can go below: measurement noise and the error of the physics step, (n,) [rad]. Where the
+    run's own step leaves no more than that, all that this one leaves."""
     noise: torch.Tensor
     """(n,) [rad]."""
     numerical: torch.Tensor
@@ -75,10 +76,11 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResul
         f"{_count(len(gains), 'set')} of gains."
     )
     floor = (noise**2 + numerical**2).sqrt()
-    if run is not None and not run.effects:
+    if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
+        by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
         left = validation_errors(twins, [base])[0].mse.sqrt()
-        explained = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names]) <= FLOOR_MARGIN * floor
-        if bool((by_step := explained & (left > floor)).any()):
+        by_step = (by_run <= FLOOR_MARGIN * floor) & (left > FLOOR_MARGIN * floor)
+        if bool(by_step.any()):
             floor = torch.where(by_step, left, floor)
             sentences.append(
                 f"With the run's physics step of {1e3 * run.physics_dt:g} ms its model leaves no more than noise on "

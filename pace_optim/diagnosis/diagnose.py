@@ -50,7 +50,8 @@ class Findings:
     explained: float
     """Part of the error above the floor that the effects found explain."""
     paying: list[str]
-    """Effects that lower the error, as ``fit.py --effects`` takes them, also where they only stand in."""
+    """Effects of the final model, as ``fit.py --effects`` takes them: with the verdict ``unknown`` all that lower the
+    error, though they are not what is missing."""
 
     @property
     def added(self) -> list[str]:
@@ -167,8 +168,8 @@ def search_effects(
     outcome = add_effects(twins, base, candidates, effort, FLOOR_MARGIN * data.floor, max_effects, say, follow)
     share(outcome)
     decision, explained = verdict(outcome, data.floor)
-    if decision == "effect":
-        keep_on(outcome, explained_joints(outcome, data.floor))
+    if decision != "unknown":
+        keep_on(outcome, explained_joints(outcome, data.floor) & (decision == "effect"))
     paying = labels(outcome.final.model, problem.joint_names)
     return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, paying=paying)
 
@@ -178,6 +179,7 @@ def summary_of(found: Findings, problem: Problem) -> str:
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
     after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
+    about = (found.outcome, problem.joint_names, found.data.floor)
     if found.verdict == "nothing_missing":
         return (
             f"Nothing is missing that these recordings could show: the validation error is {before:.3g} mrad, the "
@@ -190,15 +192,14 @@ def summary_of(found: Findings, problem: Problem) -> str:
             f"mrad, the floor {floor:.3g} mrad, and {shares} {100 * max(0.0, found.explained):.0f} % of what lies "
             "between."
         )
-        return " ".join([text, *stand_ins(found.outcome, problem.joint_names)])
+        return " ".join([text, *stand_ins(*about), *varying(*about)])
     summary = (
         f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
     if after > UNKNOWN_RATIO * floor:
-        told = ["Something else is missing too, which no known effect explains."]
-        return " ".join([summary, *told, *varying(found.outcome, problem.joint_names)])
-    return summary
+        summary += " Something else is missing too, which no known effect explains."
+    return " ".join([summary, *varying(*about)])
 
 
 def _ladder(found: Findings) -> list[dict]:

@@ -27,7 +27,7 @@ class Diagnosis:
     added: list[str]
     """Effects that are what is missing, as ``fit.py --effects`` takes them; none unless the verdict is ``effect``."""
     paying: list[str] = field(default_factory=list)
-    """Effects that lower the error, also where they only stand in for something else; the refit has them."""
+    """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
     ranking: list[dict[str, Any]]
     """Every effect that was refitted, the best first."""
     joints: dict[str, dict[str, Any]]

@@ -54,7 +54,7 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
     if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
     probes, changes, where = _simulated(problem, now, effects, effort)
-    scores, sizes = _explained(now.error, _free_columns(now), changes, _blocks(where, problem.control_dt))
+    scores, sizes = _explained(now.error, free_columns(now), changes, _blocks(where, problem.control_dt))
     result = []
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
         allowed = now.model.may_get(effect) & ((size > 0) | effect.two_sided)
@@ -82,8 +82,8 @@ def absorbed_effects(
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
     probes, changes, _ = _simulated(problem, now, suspects, effort, beside)
-    jacobian = _free_columns(now)
-    for taker, change in zip(takers, changes, strict=False):
+    jacobian = free_columns(now)
+    for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
     result = {effect: torch.ones(now.model.num_joints, dtype=torch.bool) for effect in suspects}
@@ -162,10 +162,10 @@ def _blocks(where: torch.Tensor, control_dt: float) -> torch.Tensor:
     return torch.where(where[steps], fold, -1)
 
 
-def _free_columns(now: Fitted) -> torch.Tensor:
+def free_columns(now: Fitted) -> torch.Tensor:
     """The Jacobian (P, K, R, n), without entries that sit at a bound."""
     if now.jacobian is None:
-        raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
+        raise ValueError("This needs a model that was fitted with keep_jacobian.")
     columns = now.jacobian.clone()
     fixed = (now.x.abs() > 1 - _AT_BOUND) | ~now.model.free
     for j, p in fixed.nonzero().tolist():

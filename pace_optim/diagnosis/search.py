@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
+from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.swapping import swapped
@@ -31,6 +32,8 @@ class Outcome:
     base_errors: BlockErrors
     final: Fitted
     final_errors: BlockErrors
+    unevenness: torch.Tensor
+    """Of the final model's effects, before joints share values, (effects, n)."""
     rounds: list[Round] = field(default_factory=list)
 
 
@@ -79,6 +82,7 @@ def add_effects(
         base_errors=errors,
         final=branch.now,
         final_errors=branch.errors,
+        unevenness=unevenness(branch.now),
         rounds=rounds,
     )
 

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
-from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.trials import Trial
@@ -21,11 +20,12 @@ EXPLAINED = 0.5
 """Less than this part of the error above the floor, and the effects found are not what is missing."""
 DOMINANT = 0.9
 """More than this part of it, and it does not matter whether their size is the same in every recording."""
-UNEVEN, VARYING = 0.15, 0.5
-"""An effect that would explain more than the first part of what is left, if its size differed between recordings, is
-none that is there in all of them; one that would explain more than the second has the right form in each, and its size
-depends on something. Measured: up to 0.08 for effects among many others as large together, 0.18 to 0.36 for such that
-stood in for another, 0.73 for a servo's friction at gains of 100 to 800."""
+UNEVEN = 0.15
+"""Above this unevenness an effect stands in for something else. Measured: up to 0.08 for the evenest effect among many
+others as large together, 0.18 to 0.36 for such that stood in."""
+VARYING = 0.5
+"""Above this one, most of what is left would go: the effect's form is right, and its size depends on something more.
+Measured: 0.73 for the friction of a servo at gains from 100 to 800."""
 SHARE = 0.2
 """Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
 
@@ -58,27 +58,23 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
     """
-    after = outcome.final_errors.mse
-    excess, left = _above(outcome.base_errors.mse, floor), _above(after, floor)
-    near = after.sqrt() <= UNKNOWN_RATIO * floor
-    has = outcome.final.model.has
-    uneven = _uneven(outcome) & (left > (1 - DOMINANT) * excess)
-    real = (has & ~_at_bounds(outcome) & ~uneven).any(dim=0)
-    return has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & real | near)
+    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
+    real = (outcome.final.model.has & ~_at_bounds(outcome) & ~_uneven(outcome, floor)).any(dim=0)
+    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & real | _near(outcome, floor))
 
 
-def stand_ins(outcome: Outcome, names: Sequence[str]) -> list[str]:
+def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects that stand in for something else, and what shows it: a sentence each."""
-    stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome)))
+    stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome, floor)))
     return [
         *([f"At a bound, so that it stands in for something else: {stuck}."] if stuck else []),
         *([f"Of another size in each recording, so that it stands in for something else: {uneven}."] if uneven else []),
     ]
 
 
-def varying(outcome: Outcome, names: Sequence[str]) -> list[str]:
+def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects of the right form whose size differs between recordings, in a sentence."""
-    said = _said(outcome, names, unevenness(outcome.final) >= VARYING)
+    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
     return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
 
 
@@ -86,7 +82,7 @@ def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
     """Effects on some joints, (effects, n) bool, in words."""
     return ", ".join(
         f"{effect.name} ({', '.join(name for name, yes in zip(names, joints.tolist(), strict=True) if yes)})"
-        for effect, joints in zip(outcome.final.model.effects, which, strict=True)
+        for effect, joints in zip(outcome.final.model.effects, which & outcome.final.model.has, strict=True)
         if bool(joints.any())
     )
 
@@ -95,9 +91,19 @@ def _at_bounds(outcome: Outcome) -> torch.Tensor:
     return outcome.final.model.at_bounds(outcome.final.x)
 
 
-def _uneven(outcome: Outcome) -> torch.Tensor:
-    share = unevenness(outcome.final)
-    return (share > UNEVEN) & (share < VARYING)
+def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    share = outcome.unevenness
+    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
+
+
+def _near(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    return outcome.final_errors.mse.sqrt() <= UNKNOWN_RATIO * floor
+
+
+def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
+    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
+    return (left > (1 - DOMINANT) * excess) & ~_near(outcome, floor)
 
 
 def _above(mse: torch.Tensor, floor: torch.Tensor) -> torch.Tensor:

@@ -37,13 +37,12 @@ def diagnosis(run: RunData) -> Section | None:
 
 def _verdict(content: dict[str, Any]) -> str:
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
-    if content["verdict"] == "effect" and (part := content.get("explained", 1.0)) < _PARTLY:
+    effects, part = content["added"] or content.get("paying", []), content.get("explained", 1.0)
+    if content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * part:.0f} % of it"
-    if content["verdict"] == "unknown" and content.get("paying"):
-        heading = "Something is missing, and known effects only stand in for it"
     add = ""
-    if effects := content["added"] or content.get("paying", []):
-        why = "Add it" if content["added"] else "Until it is known, what stands in for it lowers the error"
+    if effects:
+        why = "Add it" if content["added"] else "Until it is known, this lowers the error"
         add = f"<p>{why}: <code>scripts/fit.py … --effects {esc(' '.join(effects))}</code></p>"
     return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
 

@@ -37,7 +37,7 @@ def failure(run: RunData) -> Section | None:
         ],
     }
     notes = bullets(content["notes"], "notes") if content["notes"] else ""
-    r, j = _worst_cell(content)
+    r, j = _worst_place(content)
     return Section(
         id="failure",
         title="Where the model fails",
@@ -50,7 +50,7 @@ def failure(run: RunData) -> Section | None:
     )
 
 
-def _worst_cell(content: dict[str, Any]) -> tuple[int, int]:
+def _worst_place(content: dict[str, Any]) -> tuple[int, int]:
     """Recording and joint that the curves open on: of the worst place's joint, the recording with the largest error."""
     names = content["joint_names"]
     joint = content["worst_places"][0]["joint"] if content["worst_places"] else names[0]

@@ -28,7 +28,7 @@ def trajectories(run: RunData) -> Section | None:
         "joints": list(run.joint_names),
         "recordings": [_encode(recording, per_curve) for recording in run.recordings],
     }
-    r, j = _worst_cell(run.recordings)
+    r, j = _largest_error(run.recordings)
     return Section(
         id="trajectories",
         title="Trajectories",
@@ -41,10 +41,10 @@ def trajectories(run: RunData) -> Section | None:
     )
 
 
-def _worst_cell(recordings: Sequence[RecordingData]) -> tuple[int, int]:
+def _largest_error(recordings: Sequence[RecordingData]) -> tuple[int, int]:
     """Recording and joint that the curves open on: those with the largest error."""
     errors = [
-        rms(np.nan_to_num(recording.error[:, j])) or 0.0
+        rms(np.nan_to_num(recording.error[:, j], nan=1e3, posinf=1e3, neginf=-1e3)) or 0.0
         for recording in recordings
         for j in range(recording.error.shape[1])
     ]
