@@ -10,7 +10,7 @@ from diagnoses import hidden_run
 from problems import CALM
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.data_check import DataCheck
 from pace_optim.diagnosis.descent import Fitted
@@ -105,6 +105,42 @@ def test_an_effect_that_leaves_little_once_its_size_may_differ_is_there_and_depe
         paying=["parallel_spring"],
     )
     assert summary_of(found, run.problem).endswith(told)
+
+
+def four_joints(problem):
+    """A search on joints near the floor, one of which got a spring that brings it there."""
+    one = JointModel.base(problem)
+    model = replace(
+        one, has=torch.zeros(0, 4, dtype=torch.bool), lower=one.lower.expand(4, -1), upper=one.upper.expand(4, -1)
+    )
+    values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
+    base = Fitted.start(model, values)
+    spring = torch.tensor([[2.0, 0.1]], dtype=torch.float64).expand(4, -1)
+    final = Fitted.start(*model.extended(values, SPRING, torch.arange(4) == 0, spring))
+    before, after = (
+        BlockErrors(square=1e-8 * torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
+        for rmse in ([1.9, 2.9, 2.9, 2.9], [1.2, 2.9, 2.9, 2.9])
+    )
+    even = torch.zeros(1, 4)
+    return Outcome(problem=None, base=base, base_errors=before, final=final, final_errors=after, unevenness=even)
+
+
+def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
+    outcome, floor = four_joints(run.problem), FLOOR.expand(4)
+    module = sys.modules[Findings.__module__]
+    twins = SimpleNamespace(with_physics_dt=lambda _: None, control_dt=0.0025)
+    for name, made in (
+        ("fit_base", (twins, outcome.base, FLOOR)),
+        ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
+        ("absorbed_effects", {}),
+        ("add_effects", outcome),
+        ("share", None),
+    ):
+        monkeypatch.setattr(module, name, lambda *_, made=made: made)
+    joints = SimpleNamespace(joint_names=("a", "b", "c", "d"))
+    found = search_effects(joints, None, [SPRING], 3)
+    assert (found.verdict, found.paying, found.added) == ("nothing_missing", [], [])
+    assert outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())
 
 
 def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
