@@ -25,8 +25,9 @@ from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.screening import Probe, absorbed_effects
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.stand_ins import stand_ins
 from pace_optim.diagnosis.trials import Round
-from pace_optim.diagnosis.verdict import explained_joints, labels, stand_ins, verdict
+from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
 from pace_optim.joint_twins import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

@@ -18,7 +18,8 @@ from pace_optim.diagnosis.diagnose import Findings, summary_of
 from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.verdict import stand_ins, varying, verdict
+from pace_optim.diagnosis.stand_ins import stand_ins, varying
+from pace_optim.diagnosis.verdict import verdict
 from pace_optim.report import write_report
 
 SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")

@@ -21,16 +21,8 @@ from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.verdict import (
-    UNKNOWN_RATIO,
-    explained_joints,
-    keep_on,
-    labels,
-    ranking,
-    stand_ins,
-    varying,
-    verdict,
-)
+from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, stand_ins, varying
+from pace_optim.diagnosis.verdict import explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
 from pace_optim.fit_settings import FitSettings

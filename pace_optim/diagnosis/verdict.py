@@ -12,20 +12,11 @@ import torch
 from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, near_floor, real_effects
 from pace_optim.diagnosis.trials import Trial
 
-UNKNOWN_RATIO = 3.0
-"""An unexplained error above this many times the floor is a finding of its own."""
 EXPLAINED = 0.5
 """Less than this part of the error above the floor, and the effects found are not what is missing."""
-DOMINANT = 0.9
-"""More than this part of it, and it does not matter whether their size is the same in every recording."""
-UNEVEN = 0.15
-"""Above this unevenness an effect stands in for something else. Measured: up to 0.08 for the evenest effect among many
-others as large together, 0.18 to 0.36 for such that stood in."""
-VARYING = 0.5
-"""Above this one, most of what is left would go: the effect's form is right, and its size depends on something more.
-Measured: 0.73 for the friction of a servo at gains from 100 to 800."""
 SHARE = 0.2
 """Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
 
@@ -37,7 +28,7 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
     """
-    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
+    excess, left = above_floor(outcome, floor)
     explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
     if bool(outcome.final.model.has.any()):
         good = explained_joints(outcome, floor)
@@ -58,56 +49,9 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
     """
-    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
-    real = (outcome.final.model.has & ~_at_bounds(outcome) & ~_uneven(outcome, floor)).any(dim=0)
-    return outcome.final.model.has.any(dim=0) & ((left <= (1 - EXPLAINED) * excess) & real | _near(outcome, floor))
-
-
-def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
-    """Effects that stand in for something else, and what shows it: a sentence each."""
-    stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome, floor)))
-    return [
-        *([f"At a bound, so that it stands in for something else: {stuck}."] if stuck else []),
-        *([f"Of another size in each recording, so that it stands in for something else: {uneven}."] if uneven else []),
-    ]
-
-
-def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
-    """Effects of the right form whose size differs between recordings, in a sentence."""
-    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
-    return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
-
-
-def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
-    """Effects on some joints, (effects, n) bool, in words."""
-    return ", ".join(
-        f"{effect.name} ({', '.join(name for name, yes in zip(names, joints.tolist(), strict=True) if yes)})"
-        for effect, joints in zip(outcome.final.model.effects, which & outcome.final.model.has, strict=True)
-        if bool(joints.any())
-    )
-
-
-def _at_bounds(outcome: Outcome) -> torch.Tensor:
-    return outcome.final.model.at_bounds(outcome.final.x)
-
-
-def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    share = outcome.unevenness
-    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
-
-
-def _near(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    return outcome.final_errors.mse.sqrt() <= UNKNOWN_RATIO * floor
-
-
-def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
-    excess, left = _above(outcome.base_errors.mse, floor), _above(outcome.final_errors.mse, floor)
-    return (left > (1 - DOMINANT) * excess) & ~_near(outcome, floor)
-
-
-def _above(mse: torch.Tensor, floor: torch.Tensor) -> torch.Tensor:
-    return (mse - floor**2).clamp(min=0.0)
+    excess, left = above_floor(outcome, floor)
+    enough = (left <= (1 - EXPLAINED) * excess) & real_effects(outcome, floor).any(dim=0)
+    return outcome.final.model.has.any(dim=0) & (enough | near_floor(outcome, floor))
 
 
 def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
