@@ -21,6 +21,7 @@ from pace_optim.fit import fit
 from pace_optim.fit_settings import FitSettings
 from pace_optim.recording import Load, save_recording
 from pace_optim.report import write_report
+from pace_optim.report.sections.failure import _worst_place
 
 ROOT = Path(__file__).parents[1]
 
@@ -294,6 +295,16 @@ def test_the_page_opens_without_a_complaint_and_draws_every_figure(browser):
         ".map((c) => c.querySelectorAll('svg.main-svg').length)"
     )
     assert len(drawn) == 7 and all(drawn)
+
+
+@pytest.mark.parametrize(("worst", "place"), [([], (1, 0)), ([{"joint": "b"}], (2, 1))])
+def test_the_worst_place_is_a_joint_and_its_worst_recording(worst, place):
+    errors = {"a": [0.1, 0.3, 0.2], "b": [0.1, 0.2, 0.4]}
+    joints = {
+        name: {"recordings": [{"rmse": {"train": None, "validation": each}} for each in own]}
+        for name, own in errors.items()
+    }
+    assert _worst_place({"joint_names": ["a", "b"], "worst_places": worst, "joints": joints}) == place
 
 
 def test_the_curves_open_where_the_error_is_largest(browser):

@@ -39,7 +39,7 @@ def _verdict(content: dict[str, Any]) -> str:
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content["added"] or content.get("paying", []), content.get("explained", 1.0)
     if content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
-        css, heading = "bad", f"Something is missing, and known effects explain {100 * part:.0f} % of it"
+        css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
     add = ""
     if effects:
         why = "Add it" if content["added"] else "Until it is known, this lowers the error"
