@@ -9,13 +9,14 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
 from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.own_motion import OwnMotion
@@ -23,7 +24,7 @@ from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.diagnosis.verdict import ranking
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.plant import Case, library_effects, outside_effects, write_case
-from pace_optim.problem import load_problem
+from pace_optim.problem import Problem, load_problem
 
 GROUPS = ("effects", "clean", "outside", "pairs", "background", "harmonic")
 ROBOTS = {"bench": ("Pace-TestBench-v0", ".*"), "leg": ("Pace-AnymalD-v0", "LF_.*")}
@@ -102,15 +103,8 @@ def run_job(job: Job) -> dict[str, Any]:
 def run_case(job: Job) -> dict[str, Any]:
     """Make the recordings, diagnose, and fit the model that has the true effects and no others."""
     start = time.perf_counter()
-    files = write_case(job.case, job.folder)
-    truth = json.loads(files.truth.read_text())
+    problem, truth = _load(job, job.case)
     made = time.perf_counter()
-    problem = load_problem(
-        job.case.task,
-        data=[str(path) for path in files.train],
-        validation=[str(path) for path in files.validation],
-        physics_dt=job.physics_dt,
-    )
     middle = problem.space.to_physical(problem.space.start)
     found = search_effects(problem, middle, candidate_effects(), job.max_effects)
     diagnosed = time.perf_counter()
@@ -126,7 +120,7 @@ def run_case(job: Job) -> dict[str, Any]:
             with_truth = _rms(validation_errors(twins, [final])[0])
         else:
             with_truth = _rms(outcome.final_errors)
-    shutil.rmtree(job.folder, ignore_errors=True)  # a case can be made again from its name
+    alone = {part: _base_error(job, part) for part in ("effects", "background")} if job.case.background else None
     return {
         "size": truth["size"],
         "noise": job.case.noise,
@@ -136,6 +130,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "explained": found.explained,
         "floor": float(found.data.floor.square().mean().sqrt()),
         "ranking": ranking(outcome, problem.joint_names, found.verdict),
+        "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
         "truth": truth["effects"],
         "seconds": {
@@ -144,6 +139,27 @@ def run_case(job: Job) -> dict[str, Any]:
             "true_fit": time.perf_counter() - diagnosed,
         },
     }
+
+
+def _load(job: Job, case: Case) -> tuple[Problem, dict[str, Any]]:
+    """Record a case and load it; its files are dropped, as it can be made again from its name."""
+    files = write_case(case, job.folder)
+    problem = load_problem(
+        case.task,
+        data=[str(path) for path in files.train],
+        validation=[str(path) for path in files.validation],
+        physics_dt=job.physics_dt,
+    )
+    truth = json.loads(files.truth.read_text())
+    shutil.rmtree(job.folder, ignore_errors=True)
+    return problem, truth
+
+
+def _base_error(job: Job, part: Literal["effects", "background"]) -> float:
+    """Validation RMSE [rad] of the base model where only one part of what is hidden is there."""
+    problem, _ = _load(job, replace(job.case, part=part))
+    twins, base, _ = fit_base(problem, problem.space.to_physical(problem.space.start))
+    return _rms(validation_errors(twins, [base])[0])
 
 
 def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]) -> Fitted:

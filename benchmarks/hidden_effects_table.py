@@ -55,6 +55,8 @@ def make_table(lines: Sequence[Line]) -> str:
     groups = sorted({line["group"] for line in done})
     if judged:
         parts += ["", _summary(judged, groups), "", _confusion(judged), "", _false_alarms(judged)]
+    if besides := [line for line in judged if line.get("alone")]:
+        parts += ["", _backgrounds(besides)]
     if done:
         parts += ["", _errors(done, groups), "", _times(done)]
     return "\n".join(parts)
@@ -103,6 +105,23 @@ def _false_alarms(lines: Sequence[Line]) -> str:
         f"{len(wrong)} outside cases given a name, {len(more)} single effects with a second one added, "
         f"{len(extra)} cases with an effect beside the declared set"
     )
+
+
+def _backgrounds(lines: Sequence[Line]) -> str:
+    """How large an effect must be beside many small ones to be named."""
+    rows = [("error of the effect / of the background", "cases", "named first", "in declared set", "unknown")]
+    for low, high in ((3.0, np.inf), (1.0, 3.0), (0.0, 1.0)):
+        of = [line for line in lines if low <= line["alone"]["effects"] / line["alone"]["background"] < high]
+        rows.append(
+            (
+                f"{low:g} or more" if np.isinf(high) else f"{low:g} to {high:g}",
+                str(len(of)),
+                _share(named(line)[:1] == line["effects"] for line in of),
+                _share(in_declared_set(line) for line in of),
+                _share(line["verdict"] == "unknown" for line in of),
+            )
+        )
+    return _aligned(rows)
 
 
 def _errors(lines: Sequence[Line], groups: Sequence[str]) -> str:

@@ -71,6 +71,21 @@ def test_the_tables_count_what_was_named_missed_and_invented():
     assert rows["backlash"][1:] == ["backlash", "1,", "nothing_missing", "1"]
 
 
+def test_effects_beside_a_background_are_counted_by_how_far_they_exceed_it():
+    def beside(ratio, named, verdict="effect"):
+        alone = {"effects": ratio * 1e-3, "background": 1e-3}
+        return {**line("background", ["backlash"], verdict, named, seed=ratio), "alone": alone}
+
+    found = [beside(3.5, ["backlash", "payload"]), beside(4, ["payload", "backlash"])]
+    table = make_table([*found, beside(1.2, ["backlash"]), beside(0.5, [], "unknown")])
+    _, *rows = table[table.index("error of the effect") :].splitlines()[:4]
+    assert [row.split()[-4:] for row in rows] == [
+        ["2", "1/2", "2/2", "0/2"],
+        ["1", "1/1", "1/1", "0/1"],
+        ["1", "0/1", "0/1", "1/1"],
+    ]
+
+
 def test_results_of_fits_alone_make_a_table_without_a_diagnosis():
     fitted = {key: value for key, value in RIGHT.items() if key not in ("verdict", "added", "ranking")}
     assert "true effect known" in make_table([fitted]) and "false alarms" not in make_table([fitted])

@@ -5,6 +5,7 @@ import json
 import runpy
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from pace_optim.plant import (
     write_case,
 )
 from pace_optim.plant.friction_solver import friction_impulse
+from pace_optim.plant.suite import make_suite
 from pace_optim.recording import Drive, Load, conform_recording, load_recording
 from pace_optim.rollout import Rollout
 
@@ -282,6 +284,21 @@ def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path):
     assert recordings[7].load.added_mass == {"load": 0.8} and recordings[0].load.load_mass == 2.0
     truth = json.loads(files.truth.read_text())
     assert list(truth["effects"]) == ["torque_ripple"] and truth["size"] >= 3e-4
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
+    monkeypatch.setattr("pace_optim.plant.case.make_suite", partial(make_suite, duration=2.5))
+    case = Case(effects=("torque_gain",), background=0.5, kind="chirp")
+    (_, both), (_, main), (_, rest) = (
+        make_case(replace(case, part=part)) for part in ("both", "effects", "background")
+    )
+    assert set(main.truth.effects) == {"torque_gain"} and len(rest.truth.effects) >= 15
+    assert {**main.truth.effects, **rest.truth.effects} == both.truth.effects
+    assert both.truth.base == main.truth.base == rest.truth.base
+    change = {name: [r.dof_pos for r in part.recordings] for name, part in (("both", both), ("main", main))}
+    assert all((a != b).any() for a, b in zip(change["both"], change["main"], strict=True))
+    assert len({replace(case, part=part).name for part in ("both", "effects", "background")}) == 3
 
 
 @pytest.mark.slow

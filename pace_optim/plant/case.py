@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from pace_optim.recording import save_recording
 from .draw import Drawn, draw_visible, with_background
 from .hidden import effect_named
 from .robot import PlantRobot, plant_robot
+from .simulate import simulate_truths
 from .suite import Kind, Suite, make_suite
 from .truth import BaseTruth, PlantCfg, Truth
 
@@ -36,6 +38,8 @@ class Case:
     """Which recordings."""
     background: float = 0.0
     """RMS change of the motion by about twenty other small effects, as a share of the effect's own; 0 for none."""
+    part: Literal["both", "effects", "background"] = "both"
+    """What of a case with a background the recordings have: one part alone shows how much error that part makes."""
     harmonic_drive: bool = False
     """A 20:1 harmonic drive with a resonance above 0 dB at 4 to 8 Hz, in place of a drawn elasticity."""
     noise: float = 1e-4
@@ -48,6 +52,7 @@ class Case:
         """A name for its folder."""
         what = "harmonic_drive" if self.harmonic_drive else "+".join(self.effects) or "clean"
         small = f"_background{self.background:g}" if self.background else ""
+        small += f"_{self.part}" if self.part != "both" else ""
         return f"{self.task}_{self.kind}_{what}{small}_{self.seed}"
 
 
@@ -82,9 +87,18 @@ def make_case(case: Case) -> tuple[Suite, Drawn]:
         drawn = draw_visible(robot, suite.runs, (), rng, cfg=cfg, base=harmonic_drive(robot, rng))
     else:
         drawn = draw_visible(robot, suite.runs, case.effects, rng, cfg=cfg, joints=case.joints)
-    if case.background:
-        drawn = with_background(robot, suite.runs, drawn, rng, size=case.background * drawn.size, cfg=cfg)
+    if case.background and case.part != "effects":
+        both = with_background(robot, suite.runs, drawn, rng, size=case.background * drawn.size, cfg=cfg)
+        drawn = both if case.part == "both" else _without(robot, suite, both, drawn.truth.effects, cfg)
     return suite, drawn
+
+
+def _without(robot: PlantRobot, suite: Suite, drawn: Drawn, effects: Iterable[str], cfg: PlantCfg) -> Drawn:
+    """The same recorded without some effects."""
+    left = {name: values for name, values in drawn.truth.effects.items() if name not in effects}
+    truth = replace(drawn.truth, effects=left)
+    made = simulate_truths(robot, suite.runs, [truth], cfg)[0]
+    return Drawn(truth=truth, recordings=tuple(made), size=drawn.size)
 
 
 def write_case(case: Case, folder: str | os.PathLike[str]) -> CaseFiles:
