@@ -7,15 +7,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from problems import BENCH, CALM
+from problems import BENCH, CALM, DT, chirp, env_cfg, make_problem, physical, record
 from run_folders import JOINTS, make_result
 
 from pace_actuators.effects import Effect, get_effect
+from pace_envs import set_physics_dt
 from pace_optim.atomic import write_json
 from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.trials import Trial
+from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem import load_problem
 from pace_optim.recording import save_recording
@@ -146,3 +149,31 @@ def hidden_run(folder, effect, seed=0, duration=4.0):
     settings = {"task": BENCH, "data": data, "validation": validation, "log_dir": str(folder / "logs")}
     write_json(run / "settings.json", {"settings": settings, "digests": {}})
     return SimpleNamespace(folder=run, problem=load_problem(BENCH, data=data, validation=validation))
+
+
+def joint_alone() -> SimpleNamespace:
+    """A short chirp without noise, its problem with a twin of each joint, and the truth."""
+    fine = env_cfg()  # what the robot does, not what a coarse step makes of it
+    set_physics_dt(fine, DT / 10)
+    recordings = [record(target, CALM, cfg=fine) for target in (chirp(5.0), chirp(4.0, 0.2, 3.0))]
+    problem = make_problem(recordings[:1], validation=recordings[1:]).with_physics_dt(DT / 2)
+    truth = physical(problem, CALM)
+    return SimpleNamespace(
+        problem=problem,
+        truth=truth,
+        truth_values=torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64),
+        twins=twin_problem(problem, reference_path(problem, truth, ["com_offset"])),
+    )
+
+
+def errors_of(*rmse):
+    """Validation errors of joints with these RMSE [rad]."""
+    return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
+
+
+def with_effects(model, values, *effects):
+    """A model of joints with effects: (effect, joints, values)."""
+    for effect, joints, own in effects:
+        own = torch.tensor([own] * model.num_joints, dtype=torch.float64)
+        model, values = model.extended(values, effect, torch.tensor(joints), own)
+    return Fitted.start(model, values)

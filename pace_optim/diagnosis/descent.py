@@ -10,6 +10,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.model import JointModel
+from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.least_squares import bounded_step
@@ -117,6 +118,17 @@ def fit_side_by_side(
         part: Only so much of the beginning of the recordings is simulated.
         rough: Whether derivatives are taken over wide steps first.
     """
+    return spread(
+        lambda own: _fit(problem, own, max_iteration, keep_jacobian, part, rough),
+        starts,
+        [start.tried for start in starts],
+    )
+
+
+def _fit(
+    problem: TwinProblem, starts: Sequence[Fitted], max_iteration: int, keep_jacobian: bool, part: float, rough: bool
+) -> list[Fitted]:
+    """:func:`fit_side_by_side` in one process."""
     slots = [Slot(model=s.model, rows=s.model.size + len(_TRIALS)) for s in starts]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train.clone()

@@ -9,6 +9,7 @@ import torch
 from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel, start_values
+from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -30,6 +31,11 @@ def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]
         now: The present model.
         effects: What is tried.
     """
+    return spread(lambda own: _best_points(problem, now, own), effects, effects)
+
+
+def _best_points(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
+    """:func:`far_starts` in one process."""
     bases = _bases(now)
     slots, values = [], []
     for effect in effects:

@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE, start_values
+from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -51,15 +52,24 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
     """
+    each = spread(lambda own: _screened(problem, now, own, effort), effects, effects)
+    return [probe for probes in each for probe in probes]
+
+
+def _screened(
+    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+) -> list[list[Probe]]:
+    """:func:`screen` in one process; the probes of each effect."""
     if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
     probes, changes, where = _simulated(problem, now, effects, effort)
     scores, sizes = _explained(now.error, free_columns(now), changes, _blocks(where, problem.control_dt))
-    result = []
+    result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
         allowed = now.model.may_get(effect) & ((size > 0) | effect.two_sided)
-        result.append(Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size))
-    return result
+        probe = Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size)
+        result[effect].append(probe)
+    return list(result.values())
 
 
 def absorbed_effects(

@@ -1,0 +1,173 @@
+"""Effects that are tried side by side, shared out among processes.
+
+The torque law of a few hundred rows costs its calls, not its numbers, so that threads inside a call gain nothing; every
+effect that is tried adds calls of its own.
+"""
+
+from __future__ import annotations
+
+import gc
+import io
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import TypeVar
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_envs.simulation import available_processors
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_STIFF = 5.0
+"""What a stiff effect costs, as a multiple of another one."""
+
+
+def spread(
+    work: Callable[[list[Item]], list[Result]], items: Sequence[Item], effects: Sequence[type[Effect] | None]
+) -> list[Result]:
+    """``work(items)``, with the items shared out among as many processes as there are processors.
+
+    Processes are forked, so that nothing but results is pickled; where that is unsafe (other systems than Linux), and
+    in worker processes, one process does it all. Items must not influence each other.
+
+    Args:
+        work: Gives one result per item, in order.
+        items: What there is to do.
+        effects: The effect of each item; items of one effect stay together.
+
+    Raises:
+        RuntimeError: If a process ended without a result.
+    """
+    shares = _shares(effects, _processes())
+    if len(shares) < 2:
+        return work(list(items))
+    results: list[Result | None] = [None] * len(items)
+    with _own_processors(len(shares)) as processors:
+        others = [_Other(work, [items[i] for i in share], processors[k]) for k, share in enumerate(shares[1:], start=1)]
+        try:
+            own = work([items[i] for i in shares[0]])
+            parts = [own, *(other.result() for other in others)]
+        finally:
+            for other in others:
+                other.end()
+    for share, part in zip(shares, parts, strict=True):
+        for i, result in zip(share, part, strict=True):
+            results[i] = result
+    return results  # type: ignore[return-value]
+
+
+def _processes() -> int:
+    forks = sys.platform == "linux" and not multiprocessing.current_process().daemon
+    return available_processors() if forks else 1
+
+
+def _shares(effects: Sequence[type[Effect] | None], count: int) -> list[list[int]]:
+    """Indices for each process, about as much work for each; the dearest effects are dealt out first."""
+    groups: dict[type[Effect] | None, list[int]] = {}
+    for i, effect in enumerate(effects):
+        groups.setdefault(effect, []).append(i)
+    cost = {effect: _STIFF if effect is not None and effect.is_stiff else 1.0 for effect in groups}
+    shares: list[list[int]] = [[] for _ in range(min(count, len(groups)))]
+    load = [0.0] * len(shares)
+    for effect in sorted(groups, key=lambda effect: -cost[effect]):
+        k = load.index(min(load))
+        shares[k] += groups[effect]
+        load[k] += cost[effect]
+    return [sorted(share) for share in shares]
+
+
+@contextmanager
+def _own_processors(count: int) -> Iterator[list[set[int]]]:
+    """Processors for each process; this one keeps to the first while the context lasts."""
+    every = os.sched_getaffinity(0)
+    processors = [set(sorted(every)[k::count]) for k in range(count)]
+    os.sched_setaffinity(0, processors[0])
+    try:
+        yield processors
+    finally:
+        os.sched_setaffinity(0, every)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage; a process that is forked meanwhile never does."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+class _Other:
+    """A share of the work in a process of its own."""
+
+    def __init__(self, work: Callable[[list[Item]], list[Result]], share: list[Item], processors: set[int]):
+        context = multiprocessing.get_context("fork")
+        self._receiver, sender = context.Pipe(duplex=False)
+        self._process = context.Process(target=_run, args=(work, share, processors, sender), daemon=True)
+        with _no_collection():  # in the fork, a simulation that is collected would wait for threads that are not there
+            self._process.start()
+        sender.close()
+
+    def result(self) -> list:
+        """What it found, or its error."""
+        try:
+            result = _Unpickler(io.BytesIO(self._receiver.recv_bytes())).load()
+        except EOFError:
+            self._process.join()
+            raise RuntimeError(
+                f"A process that shared the work ended without a result (exit code {self._process.exitcode}). Most "
+                "often memory has run out: close other programs, or use one processor (taskset -c 0 python ...)."
+            ) from None
+        if isinstance(result, BaseException):
+            raise result
+        return result
+
+    def end(self) -> None:
+        """Stop it, if it still runs."""
+        self._process.terminate()
+        self._process.join()
+        self._receiver.close()
+
+
+def _run(work: Callable, share: list, processors: set[int], sender: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process is interrupted and ends the others
+    os.sched_setaffinity(0, processors)
+    torch.set_num_threads(1)  # threads of the first process did not come along
+    try:
+        result = work(share)
+    except Exception as error:
+        result = error
+    file = io.BytesIO()
+    _Pickler(file).dump(result)
+    sender.send_bytes(file.getvalue())
+
+
+class _Pickler(pickle.Pickler):
+    """Sends effects by address, which is the same in both processes: a user's class may be defined anywhere."""
+
+    def persistent_id(self, obj: object) -> int | None:
+        return id(obj) if isinstance(obj, type) and issubclass(obj, Effect) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Gets them back."""
+
+    def persistent_load(self, pid: int) -> type[Effect]:
+        return next(effect for effect in _subclasses(Effect) if id(effect) == pid)
+
+
+def _subclasses(effect: type[Effect]) -> Iterator[type[Effect]]:
+    for each in effect.__subclasses__():
+        yield each
+        yield from _subclasses(each)

@@ -1,0 +1,151 @@
+"""Models of joints alone: how they move, and how they are fitted."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diagnoses import joint_alone
+from problems import CALM, DT
+
+from pace_actuators.effects import get_effect
+from pace_optim.diagnosis import search
+from pace_optim.diagnosis.base_fit import fit_base
+from pace_optim.diagnosis.data_check import check_data
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
+from pace_optim.diagnosis.own_motion import OwnMotion
+from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.joint_twins import reference_path, twin_problem
+
+STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A short chirp of one joint."""
+    return joint_alone()
+
+
+def test_an_effect_in_one_slot_changes_no_other(bench):
+    base = JointModel.base(bench.problem)
+    with_effects = [base.with_effect(e, torch.tensor([True])) for e in (STRIBECK, QUADRATIC)]
+    values = torch.tensor([[*(CALM[name] for name in BASE)]], dtype=torch.float64)
+    slots = [
+        Slot(model=base, rows=1),
+        Slot(model=with_effects[0], rows=2),
+        Slot(model=with_effects[1], rows=1),
+    ]
+    batch = SideBySide(bench.twins, slots, training=True)
+
+    def simulate(strength):
+        stribeck = torch.tensor([[[0.0, 0.1]], [[strength, 0.1]]], dtype=torch.float64)
+        physical = [
+            values[None],
+            torch.cat([values.repeat(2, 1, 1), stribeck], dim=-1),
+            torch.cat([values[None], torch.zeros(1, 1, 1, dtype=torch.float64)], dim=-1),
+        ]
+        return batch.simulate(physical, batch.dataset.train)
+
+    off, on = simulate(0.0), simulate(1.0)
+    for row in (1, 3):  # null values are the base model, bit for bit
+        assert torch.equal(off[0], off[row])
+    assert torch.equal(on[[0, 1, 3]], off[[0, 1, 3]])
+    assert float((on[2] - off[2]).abs().max()) > 1e-3
+    assert float(off[0].square().mean().sqrt()) < 5e-5  # the twins move as the robot
+
+
+def test_the_descent_finds_the_base_parameters(bench):
+    _, fitted, effort = fit_base(bench.problem, bench.problem.space.to_physical(bench.problem.space.start))
+    values = dict(zip(BASE, fitted.model.to_physical(fitted.x)[0].tolist(), strict=True))
+    for name in ("armature", "viscous_friction", "friction", "delay"):
+        assert values[name] == pytest.approx(CALM[name], rel=0.01), name
+    assert values["encoder_bias"] == pytest.approx(CALM["encoder_bias"], abs=5e-4)
+    assert float(fitted.score.sqrt()) < 1e-4
+    assert fitted.jacobian is not None and fitted.error is not None and float(effort) > 0.1
+
+
+def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
+    model, values = JointModel.base(bench.problem), bench.truth_values.clone()
+    values[0, BASE.index("armature")] *= 1.2  # of such a size is what a coarse step does
+    base = Fitted.start(model, values)
+    left = search.validation_errors(bench.twins, [base])[0].mse.sqrt()
+    run = SimpleNamespace(effects=[], rmse={"validation": {"servo": 1e-7}}, physics_dt=DT)
+    for it, floor in (
+        (run, left),
+        (SimpleNamespace(**{**vars(run), "rmse": {"validation": {"servo": float(left)}}}), None),
+        (SimpleNamespace(**{**vars(run), "effects": ["torque_gain"]}), None),
+        (SimpleNamespace(**{**vars(run), "physics_dt": bench.problem.physics_dt}), None),
+        (None, None),
+    ):
+        check = check_data(bench.problem, bench.twins, base, it)
+        said = [sentence for sentence in check.sentences if "comes from the step" in sentence]
+        if floor is None:
+            assert float(check.floor) < 0.5 * float(left) and not said
+        else:
+            assert check.floor == pytest.approx(floor) and "2.5 ms" in said[0] and "on servo" in said[0]
+
+
+def test_a_fit_that_starts_at_the_truth_stays_there(bench):
+    model = JointModel.base(bench.problem)
+    x = model.to_normalised(torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64))
+    fitted = fit_side_by_side(
+        bench.twins,
+        [Fitted.start(model, model.to_physical(x))],
+        max_iteration=2,
+    )[0]
+    assert float((fitted.x - x).abs().max()) < 0.02
+
+
+def test_models_far_behind_are_left_at_the_coarse_step(bench):
+    model = JointModel.base(bench.problem)
+    heavy = bench.truth_values.clone()
+    heavy[:, BASE.index("armature")] *= 4
+    held = replace(model, lower=heavy, upper=heavy)
+    far, near = fit_coarse_to_fine(bench.twins, [Fitted.start(held, heavy), Fitted.start(model, bench.truth_values)])
+    assert far.jacobian is None and near.jacobian is not None
+    assert float(far.score.sqrt()) > 3 * float(near.score.sqrt())
+
+
+def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):
+    heavy = bench.truth_values.clone()
+    model = JointModel.base(bench.problem)
+    heavy[:, BASE.index("armature")] = model.upper[:, BASE.index("armature")]
+    coarse, now = bench.twins.with_physics_dt(DT), Fitted.start(model, heavy)
+    starts = far_starts(coarse, now, [STRIBECK, get_effect("joint_elasticity")])
+    assert [start.tried.name for start in starts] == ["stribeck_friction", "joint_elasticity"]
+    slots = [Slot(model=model, rows=1), *(Slot(model=start.model, rows=1) for start in starts)]
+    batch = SideBySide(coarse, slots, training=True)
+    rows = [heavy[None], *(start.model.to_physical(start.x)[None] for start in starts)]
+    errors = batch.simulate(rows, batch.dataset.train).square().mean(dim=(1, 2, 3)).sqrt()
+    assert float(errors[1]) < 0.7 * float(errors[0]) and float(errors[2]) < 0.7 * float(errors[0])
+
+
+@pytest.mark.parametrize(("name", "value"), [("payload", 0.3), ("stribeck_friction", 1.0)])
+def test_joints_along_the_motion_of_a_robot_with_an_effect_move_as_it_does(bench, name, value):
+    effect = get_effect(name)
+    own = start_values(effect, {effect.parameters[0].name: value})[None]
+    model, physical = JointModel.base(bench.problem).extended(bench.truth_values, effect, torch.tensor([True]), own)
+    whole = bench.problem.with_effects([name])
+    names = bench.problem.joint_names
+    values = whole.space.from_dict(whole_values(model, model.to_normalised(physical), names))
+    path = reference_path(whole, values, [name] if effect.overrides("write_model") else [])
+    batch = SideBySide(twin_problem(bench.problem, path), [Slot(model=model, rows=1)], training=False)
+    moved = batch.simulate([physical[None]], torch.ones_like(batch.dataset.train))[0]
+    expected = path.position - CALM["encoder_bias"] - batch.dataset.measured
+    assert float((moved - expected).abs().max()) < 5e-4
+    assert float((path.position - bench.twins.path.position).abs().max()) > 3e-3  # the effect is seen
+
+
+def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
+    heavy = bench.truth.clone()
+    heavy[bench.problem.space["armature"]] *= 3
+    elsewhere = twin_problem(bench.problem, reference_path(bench.problem, heavy))
+    now = Fitted.start(JointModel.base(bench.problem), bench.truth_values)
+    follow = OwnMotion(problem=bench.problem, candidates=[]).follow
+    along, fitted = follow(elsewhere, now)
+    assert float((along.path.position - bench.twins.path.position).abs().max()) < 1e-9
+    assert float(fitted.score.sqrt()) < 1e-4 and fitted.jacobian is not None
+    again, same = follow(along, fitted)
+    assert again is along and same is fitted  # it has not moved

@@ -1,0 +1,139 @@
+"""Models of joints alone with effects: their parameters, values that joints share, what is dropped."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from diagnoses import joint_alone
+
+from pace_actuators.effects import get_effect, probe_points
+from pace_optim.diagnosis import pruning, sharing
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
+from pace_optim.diagnosis.one_round import _ranked
+from pace_optim.diagnosis.screening import Probe
+from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.verdict import labels
+
+STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A short chirp of one joint."""
+    return joint_alone()
+
+
+def test_normalised_values_go_there_and_back(bench):
+    model = JointModel.base(bench.problem).with_effect(STRIBECK, torch.tensor([True]))
+    assert model.size == len(BASE) + 2 and bool(model.log[-1]) and not bool(model.log[-2])
+    x = torch.linspace(-1, 1, model.size, dtype=torch.float64)[None]
+    assert model.to_normalised(model.to_physical(x)) == pytest.approx(x, abs=1e-9)
+    low = model.to_physical(torch.full_like(x, -1.0))
+    assert low == pytest.approx(model.lower)
+
+
+def test_joints_without_an_effect_do_not_fit_it(bench):
+    model = JointModel.base(bench.problem).with_effect(STRIBECK, torch.tensor([False]))
+    assert model.free[0].tolist() == [True] * len(BASE) + [False] * 2
+
+
+def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(bench):
+    one = JointModel.base(bench.problem)
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    base = replace(one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1))
+    values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
+    model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
+    model, physical = model.extended(physical, STRIBECK, torch.tensor([False, True]), values + 1)
+    assert model.size == len(BASE) + 2 and model.has.all()
+    assert physical[:, model.columns(STRIBECK)].tolist() == [[1.0, 0.1], [3.0, 1.3]]
+
+
+def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
+    base = JointModel.base(bench.problem)
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    model = replace(base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1))
+    both = torch.tensor([True, True])
+    found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
+    model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, found)
+    final = Fitted.start(model, physical)
+    final.jacobian = torch.randn(model.size, 40, 3, 2, generator=torch.Generator().manual_seed(0))
+    final.jacobian[..., 0] *= 10  # the first joint knows its values better
+    weights = torch.ones(1).double()
+    errors = BlockErrors(square=torch.tensor([[1e-8, 1e-8]]).double(), weight=weights)
+    for cost, shared in ((1.0, True), (1.2, False)):
+        after = BlockErrors(square=cost * errors.square, weight=weights)
+        monkeypatch.setattr(sharing, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+        monkeypatch.setattr(sharing, "validation_errors", lambda *_, after=after: [after])
+        outcome = Outcome(
+            problem=None,
+            base=final,
+            base_errors=errors,
+            final=final,
+            final_errors=errors,
+            unevenness=torch.zeros(final.model.has.shape),
+        )
+        sharing.share(outcome)
+        assert (STRIBECK in outcome.final.model.shared) is shared
+        values = outcome.final.model.to_physical(outcome.final.x)[:, model.columns(STRIBECK)]
+        if shared:
+            assert values[0] == pytest.approx(values[1]) and values[0] == pytest.approx(found[0], rel=0.01)
+            assert bool(outcome.final.model.free.all())
+        else:
+            assert values == pytest.approx(found)
+
+
+def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench, monkeypatch):
+    base = JointModel.base(bench.problem)
+    values, yes = bench.truth_values, torch.tensor([True])
+    for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1])):
+        base, values = base.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
+    now, weights = Fitted.start(base, values), torch.ones(1).double()
+    before = BlockErrors(square=torch.tensor([[1e-8]]).double(), weight=weights)
+    for cost, kept in ((1.05, [False, True]), (1.3, [True, True])):
+        after = BlockErrors(square=cost * before.square, weight=weights)
+        for name in ("fit_coarse_to_fine", "fit_side_by_side"):
+            monkeypatch.setattr(pruning, name, lambda _, starts, **kwargs: starts)
+        monkeypatch.setattr(pruning, "validation_errors", lambda *_, after=after: [after])
+        left, _ = pruning.pruned(bench.twins, now, before, [QUADRATIC])
+        assert left.model.has[:, 0].tolist() == kept
+        assert labels(left.model, ["servo"]) == [e.name for e, k in zip((STRIBECK, QUADRATIC), kept, strict=True) if k]
+        assert ("stribeck_friction.effort" in whole_values(left.model, left.x, ["servo"])) is kept[0]
+
+
+def test_every_structure_that_an_effect_can_have_starts_a_fit():
+    elasticity = get_effect("joint_elasticity")
+    probes = [
+        Probe(effect=effect, values=start_values(effect, point)[None], score=torch.tensor([score]), size=torch.ones(1))
+        for effect in (elasticity, STRIBECK)
+        for score, point in enumerate(probe_points(effect))
+    ]
+    sides = [float(p.values[0, 2]) for p in _ranked([p for p in probes if p.effect is elasticity], 0)]
+    assert sorted(sides) == [0.0, 1.0]
+    own = [p for p in probes if p.effect is STRIBECK]
+    assert [float(p.score) for p in _ranked(own, 0)] == [len(own) - 1, len(own) - 2]
+
+
+def test_where_an_encoder_sits_is_chosen_and_not_walked_to(bench):
+    elasticity, yes = get_effect("joint_elasticity"), torch.tensor([True])
+    fits = []
+    for side in (0.0, 1.0):
+        own = start_values(elasticity, {"encoder_side": side})[None]
+        model, physical = JointModel.base(bench.problem).extended(bench.truth_values, elasticity, yes, own)
+        fits.append(Fitted.start(model.structure_held(elasticity, physical), physical))
+    assert fits[0].model.free[0].tolist() == [True] * (len(BASE) + 2) + [False]
+    link, motor = fits
+    assert [float(f.model.to_physical(f.x)[0, -1]) for f in fits] == [0.0, 1.0]
+    link.take(motor, torch.tensor([False]))
+    assert float(link.model.to_physical(link.x)[0, -1]) == 0.0
+    link.take(motor, yes)
+    assert float(link.model.to_physical(link.x)[0, -1]) == 1.0
+    assert model.structure_held(STRIBECK, physical) is model  # it has nothing of the kind
+
+
+def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):
+    backlash, elasticity = get_effect("backlash"), get_effect("joint_elasticity")
+    model = JointModel.base(bench.problem).with_effect(backlash, torch.tensor([True]))
+    assert not model.may_get(elasticity) and not model.may_get(backlash) and model.may_get(STRIBECK)
+    assert not replace(model, barred={STRIBECK: torch.tensor([True])}).may_get(STRIBECK)

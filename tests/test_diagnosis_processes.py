@@ -1,0 +1,133 @@
+"""Effects tried side by side in several processes."""
+
+import gc
+import os
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diagnoses import joint_alone
+
+from pace_actuators.effects import Effect, get_effect
+from pace_optim.diagnosis import processes
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.model import JointModel, start_values
+from pace_optim.diagnosis.processes import spread
+from pace_optim.diagnosis.screening import screen
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
+
+GAIN, STRIBECK, RIPPLE = (get_effect(name) for name in ("torque_gain", "stribeck_friction", "torque_ripple"))
+ELASTICITY = get_effect("joint_elasticity")
+
+
+@pytest.fixture(autouse=True)
+def two_processors(monkeypatch):
+    monkeypatch.setattr(processes, "available_processors", lambda: 2)
+
+
+def test_results_come_back_in_order_from_two_processes():
+    items, effects = list("abcde"), [GAIN, STRIBECK, GAIN, None, RIPPLE]
+    found = spread(lambda own: [(item, os.getpid()) for item in own], items, effects)
+    assert [item for item, _ in found] == items
+    assert len({process for _, process in found}) == 2
+    assert found[0][1] == found[2][1], "items of one effect stay together"
+
+
+def test_one_effect_needs_no_second_process():
+    assert set(spread(lambda own: [os.getpid()] * len(own), "ab", [GAIN, GAIN])) == {os.getpid()}
+
+
+def test_stiff_effects_are_dealt_out_first():
+    shares = processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE, None], 2)
+    assert shares == [[2], [0, 1, 3, 4]]
+    assert processes._shares([GAIN, RIPPLE], 8) == [[0], [1]]
+
+
+def test_worker_processes_and_other_systems_do_it_alone(monkeypatch):
+    def pids():
+        return set(spread(lambda own: [os.getpid()] * len(own), "ab", [GAIN, RIPPLE]))
+
+    monkeypatch.setattr(processes.sys, "platform", "darwin")
+    assert pids() == {os.getpid()}
+    monkeypatch.setattr(processes.sys, "platform", "linux")
+    assert len(pids()) == 2
+    worker = SimpleNamespace(daemon=True)
+    monkeypatch.setattr(processes.multiprocessing, "current_process", lambda: worker)
+    assert pids() == {os.getpid()}
+
+
+def test_effects_and_tensors_of_a_user_survive_the_way_back():
+    class Own(Effect):
+        """Defined where pickle cannot find it."""
+
+        name = "own"
+        is_stiff = False
+
+    def work(own):
+        return [SimpleNamespace(effect=effect, x=torch.full((2, 3), 0.1, dtype=torch.float64)) for effect in own]
+
+    for order in ([GAIN, Own], [Own, GAIN]):
+        found = spread(work, order, order)
+        assert [each.effect for each in found] == order
+        assert all(torch.equal(each.x, torch.full((2, 3), 0.1, dtype=torch.float64)) for each in found)
+
+
+@pytest.mark.parametrize("wrong", ["first", "other"])
+def test_an_error_reaches_the_caller_and_leaves_nothing_behind(wrong):
+    before, collects = os.sched_getaffinity(0), gc.isenabled()
+    here = os.getpid()
+
+    def work(own):
+        if (os.getpid() == here) == (wrong == "first"):
+            raise ValueError(f"{own[0]} is wrong")
+        return own
+
+    with pytest.raises(ValueError, match="is wrong"):
+        spread(work, "ab", [GAIN, RIPPLE])
+    assert os.sched_getaffinity(0) == before and gc.isenabled() == collects
+    with pytest.raises(ChildProcessError):  # no process is left
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_a_process_that_is_killed_is_told():
+    here = os.getpid()
+
+    def work(own):
+        if os.getpid() != here:
+            os.kill(os.getpid(), 9)
+        return own
+
+    with pytest.raises(RuntimeError, match=r"exit code -9.*taskset"):
+        spread(work, "ab", [GAIN, RIPPLE])
+
+
+def test_a_collection_in_the_fork_does_not_touch_simulations(monkeypatch):
+    found = spread(lambda own: [gc.isenabled()] * len(own), "ab", [GAIN, RIPPLE])
+    assert found == [True, False]
+
+
+def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
+    bench = joint_alone()
+    model, yes = JointModel.base(bench.problem), torch.tensor([True])
+    base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
+    effects, effort = [GAIN, ELASTICITY, RIPPLE], torch.tensor([5.0], dtype=torch.float64)
+
+    def found():
+        probes = screen(bench.twins, base, effects, effort)
+        starts = [
+            Fitted.start(*model.extended(bench.truth_values, e, yes, start_values(e, {})[None]), e) for e in effects
+        ]
+        return probes, fit_side_by_side(bench.twins, starts, 2), far_starts(bench.twins, base, effects)
+
+    probes, fits, far = found()
+    monkeypatch.setattr(processes, "available_processors", lambda: 1)
+    probes_alone, fits_alone, far_alone = found()
+    assert [p.effect for p in probes] == [p.effect for p in probes_alone]
+    assert [float(p.score) for p in probes] == pytest.approx([float(p.score) for p in probes_alone], abs=1e-6)
+    for several, alone in ((fits, fits_alone), (far, far_alone)):
+        assert [fit.tried for fit in several] == effects
+        for one, other in zip(several, alone, strict=True):
+            assert torch.allclose(one.x, other.x, atol=1e-6) and one.model.effects == other.model.effects
