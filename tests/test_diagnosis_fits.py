@@ -9,7 +9,7 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import search
+from pace_optim.diagnosis import descent, search
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import check_data
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
@@ -149,3 +149,22 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     assert float(fitted.score.sqrt()) < 1e-4 and fitted.jacobian is not None
     again, same = follow(along, fitted)
     assert again is along and same is fitted  # it has not moved
+
+
+def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench):
+    """After such a step derivatives are new, which is no gain and no failure."""
+    model = JointModel.base(bench.problem)
+    way = descent._Way(Fitted.start(model, bench.truth_values), samples=1.0, keep=False, rough=False)
+    lowest, last = 1.0, model.size + 2
+    for asked in range(1, 10):
+        rows = way.ask()
+        error = torch.full((len(rows), 1, 1, 1), 1.1 * lowest)
+        if bool((rows[0] == way.x).all()):  # derivatives are asked for
+            error[0] = lowest
+        else:
+            lowest *= 1 - 1e-5
+            error[last] = lowest
+        way.tell(rows, error)
+        if way.finished:
+            break
+    assert asked == 4 and float(way.score) == pytest.approx(lowest**2)

@@ -24,6 +24,8 @@ _TRIALS = (1.0, 30.0, 1e3)
 _DAMPING = 1e-3
 _ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
+_STILL = 2
+"""Steps that fail in a row, after which a joint has converged."""
 _BEHIND = 2.0
 """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
 _COARSE, _FINE = 8, 3
@@ -65,21 +67,24 @@ class Fitted:
         self.score = torch.where(joints, other.score, self.score)
 
 
-def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
+def fit_coarse_to_fine(
+    problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False, joints: torch.Tensor | None = None
+) -> list[Fitted]:
     """Go most of the way at the control step, which costs half, and the rest at the problem's physics step.
 
-    Models that the control step shows to be far behind the best one on every joint stay where it left them.
+    Models that the control step shows to be far behind the best one on every joint that counts stay where it left them.
 
     Args:
         problem: The joints simulated alone.
         starts: Models and where they start.
         rough: Whether to go on over wide steps where narrow ones have led.
+        joints: Which joints count, (n,) bool; ``None`` for all.
     """
     at_control_step = problem.with_physics_dt(problem.control_dt)
     result = fit_side_by_side(at_control_step, starts, _COARSE)
     if rough:
-        result = _near_ones(result, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
-    return _near_ones(result, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
+        result = _near_ones(result, joints, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
+    return _near_ones(result, joints, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
 
 
 def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
@@ -89,9 +94,11 @@ def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
     return fit_side_by_side(problem, coarse, _FINE, keep_jacobian=True)[0]
 
 
-def _near_ones(models: Sequence[Fitted], fit: Callable[[list[Fitted]], list[Fitted]]) -> list[Fitted]:
-    """All models, fitted again those that are near the best one on some joint."""
-    scores = torch.stack([each.score for each in models])
+def _near_ones(
+    models: Sequence[Fitted], joints: torch.Tensor | None, fit: Callable[[list[Fitted]], list[Fitted]]
+) -> list[Fitted]:
+    """All models, fitted again those that are near the best one on some joint that counts."""
+    scores = torch.stack([each.score if joints is None else each.score[joints] for each in models])
     near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
     again = iter(fit([each for each, yes in zip(models, near, strict=True) if yes]))
     return [next(again) if yes else each for each, yes in zip(models, near, strict=True)]
@@ -159,6 +166,7 @@ class _Way:
         self._gradient = torch.zeros(n, size, dtype=torch.float64)
         self._known = torch.zeros(n, dtype=torch.bool)
         self._still = torch.zeros(n, dtype=torch.long)
+        self._converged = torch.zeros(n, dtype=torch.bool)
         self._widths = torch.tensor(_ROUGH if rough else _SMOOTH, dtype=torch.float64)
         self._width = torch.zeros(n, dtype=torch.long)
         self._free = start.model.free
@@ -167,8 +175,8 @@ class _Way:
 
     @property
     def finished(self) -> bool:
-        """Whether no joint gets any better."""
-        return bool((self._still >= 2).all())
+        """Whether every joint has once come to its end."""
+        return bool(self._converged.all())
 
     def ask(self) -> torch.Tensor:
         """Normalised rows, (P + trials, n, P)."""
@@ -198,12 +206,15 @@ class _Way:
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
         better = lowest < self.score
-        # a joint whose Jacobian was not known has not moved: its favoured row is x itself
+        # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and tells nothing of a gain
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
-        self._still = torch.where(fresh | (gain > _ENOUGH), 0, self._still + 1)
+        # a full step that gains next to nothing is the end; one that fails may want more damping
+        weight = torch.where(better & (best == 0), _STILL, 1)
+        self._still = torch.where(fresh, self._still, torch.where(gain > _ENOUGH, 0, self._still + weight))
         narrower = (self._still > 0) & (self._width + 1 < len(self._widths))
         self._still[narrower] = 0
+        self._converged |= self._still >= _STILL
         chosen = x[choice].gather(0, best[None, :, None].expand(1, -1, size))[0]
         moved = better & ~fresh
         self.x = torch.where(moved[:, None], chosen, self.x)

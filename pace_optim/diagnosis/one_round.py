@@ -70,7 +70,7 @@ def try_effects(
     if not listed:  # no effect does better than the base parameters alone
         return None
     say(f"refitting with {_names(listed)}")
-    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough=rough)
+    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough, open_joints)
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
     tried = len(effects) * int(open_joints.sum())
