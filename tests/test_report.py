@@ -114,6 +114,15 @@ def test_what_a_run_says_is_escaped(tmp_path):
     assert "alert(1)</script>" not in write_report(folder).read_text("utf-8")
 
 
+@pytest.mark.parametrize(("count", "folded"), [(6, 0), (7, 0), (8, 2)])
+def test_many_warnings_do_not_hide_the_page(tmp_path, count, folded):
+    result = make_result(warnings=[f"warning {i} of many" for i in range(count)])
+    html = write_report(write_run(tmp_path / "run", result)).read_text("utf-8")
+    shown, _, rest = html[html.index("read before") : html.index("Error of each joint")].partition("<details>")
+    assert shown.count("of many") == count - folded and rest.count("of many") == folded
+    assert (f"<summary>{folded} more</summary>" in rest) == bool(folded)
+
+
 def test_warnings_come_before_everything_else(tmp_path):
     text = page_of(write_run(tmp_path / "run", make_result(warnings=["friction of hip is at its upper bound"]))).text
     assert text.index("1 warning: read before") < text.index("Error of each joint") < text.index("Drag to zoom")

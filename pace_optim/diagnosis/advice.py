@@ -27,7 +27,7 @@ def advise(
             "another proportional gain (stiffness in the recording)."
         )
     result += [
-        f"A {effect.name} would not show in these recordings: the {effect.absorbed_by} takes it up. What would tell "
+        f"{effect.name} would not show in these recordings: the {effect.absorbed_by} takes it up. What would tell "
         f"them apart: {effect.separates}."
         for effect in absorbed
     ]

@@ -150,7 +150,7 @@ def menu(problem: Problem, joint: int) -> Iterator[Choice]:
         target = trajectory.des_dof_pos
         for words, arguments, facts in conditions:
             yield Choice(
-                words=f"A {motion} of {_DURATION:g} s{words}",
+                words=f"Another recording ({motion}, {_DURATION:g} s{words})",
                 arguments=f"--excitation {motion} --duration {_DURATION:g}{arguments}",
                 recording=Recording(
                     name=motion,
@@ -180,7 +180,7 @@ def _other_gain(like: Recording) -> Iterator[tuple[str, str, Recording]]:
     stiffness = like.drive.stiffness
     if stiffness is None:
         return
-    words = f" with {_GAIN:g} times the proportional gain"
+    words = f", {_GAIN:g} times the proportional gain"
     same = bool(np.ptp(stiffness) < 1e-9)
     arguments = f" --stiffness {_GAIN * stiffness[0]:g}" if same else ""
     yield words, arguments, replace(like, drive=replace(like.drive, stiffness=_GAIN * stiffness))
@@ -189,7 +189,7 @@ def _other_gain(like: Recording) -> Iterator[tuple[str, str, Recording]]:
 def _other_load(problem: Problem, like: Recording, joint: int) -> Iterator[tuple[str, str, Recording]]:
     if like.load.load_mass is not None:
         mass = round(_LOAD * like.load.load_mass, 2)
-        yield f" with {mass:g} kg on the arm", f" --load_mass {mass:g}", _loaded(like, load_mass=mass)
+        yield f", {mass:g} kg on the arm", f" --load_mass {mass:g}", _loaded(like, load_mass=mass)
         return
     env = problem.make_env(1)
     model = env.sim.model
@@ -198,7 +198,7 @@ def _other_load(problem: Problem, like: Recording, joint: int) -> Iterator[tuple
     env.close()
     added = {**like.load.added_mass, body.name: like.load.added_mass.get(body.name, 0.0) + mass}
     yield (
-        f" with {mass:g} kg fixed to {body.name}",
+        f", {mass:g} kg fixed to {body.name}",
         f" --added_mass {body.name}={mass:g}",
         _loaded(like, added_mass=added),
     )

@@ -140,9 +140,12 @@ class _Search:
         rounds = [each.copy() for each in [*branch.rounds, found]]
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         now, errors = self._settled(problem, now)
+        self.say("trying others in place of what was found")
         if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
             problem, now = self.follow(problem, exchanged)
             errors = validation_errors(problem, [now])[0]
+        if branch.rounds:
+            self.say("trying to do without what was found earlier")
         now, errors = pruned(problem, now, errors, found.chosen)
         return _Branch(problem=problem, now=now, errors=errors, rounds=rounds)
 

@@ -15,6 +15,9 @@ from ..wording import duration, pretty_unit
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
 
+_WARNINGS = 6
+"""Warnings that are shown at once; a click shows the others."""
+
 
 def overview(run: RunData) -> Section:
     """The head of the page."""
@@ -103,7 +106,11 @@ def _warnings(result: FitResult) -> str:
         text = "No parameter is at a bound, without influence, or impossible to tell from another."
         return f'<div class="callout good"><h3>No warnings</h3><p>{text}</p></div>'
     title = "1 warning" if count == 1 else f"{count} warnings"
-    said = bullets([_sentence(text) for text in result.warnings])
+    sentences = [_sentence(text) for text in result.warnings]
+    most = _WARNINGS if count > _WARNINGS + 1 else count  # one more takes no more room than its heading would
+    said = bullets(sentences[:most])
+    if rest := sentences[most:]:
+        said += f"<details><summary>{len(rest)} more</summary>{bullets(rest)}</details>"
     return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{said}</div>'
 
 
