@@ -51,8 +51,10 @@ def spread(
         return work(list(items))
     results: list[Result | None] = [None] * len(items)
     with _own_processors(len(shares)) as processors:
-        others = [_Other(work, [items[i] for i in share], processors[k]) for k, share in enumerate(shares[1:], start=1)]
+        others: list[_Other] = []
         try:
+            for own_processors, share in zip(processors[1:], shares[1:], strict=True):
+                others.append(_Other(work, [items[i] for i in share], own_processors))
             own = work([items[i] for i in shares[0]])
             parts = [own, *(other.result() for other in others)]
         finally:
@@ -134,8 +136,8 @@ class _Other:
         return result
 
     def end(self) -> None:
-        """Stop it, if it still runs."""
-        self._process.terminate()
+        """Stop it, if it still runs; a program's own handlers of signals came along and must not run."""
+        self._process.kill()
         self._process.join()
         self._receiver.close()
 
