@@ -40,9 +40,9 @@ def test_one_effect_needs_no_second_process():
     assert set(spread(lambda own: [os.getpid()] * len(own), "ab", [GAIN, GAIN])) == {os.getpid()}
 
 
-def test_stiff_effects_are_dealt_out_first():
-    shares = processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE, None], 2)
-    assert shares == [[2], [0, 1, 3, 4]]
+def test_every_process_gets_about_as_much():
+    assert processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE], 2) == [[2], [0, 1, 3]]
+    assert processes._shares([GAIN, GAIN, GAIN, None, STRIBECK, RIPPLE], 2) == [[0, 1, 2], [3, 4, 5]]
     assert processes._shares([GAIN, RIPPLE], 8) == [[0], [1]]
 
 

@@ -26,8 +26,8 @@ from pace_envs.simulation import available_processors
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_STIFF = 5.0
-"""What a stiff effect costs, as a multiple of another one."""
+_STIFF = 3.0
+"""What an item of a stiff effect costs, as a multiple of another one's."""
 
 
 def spread(
@@ -76,7 +76,9 @@ def _shares(effects: Sequence[type[Effect] | None], count: int) -> list[list[int
     groups: dict[type[Effect] | None, list[int]] = {}
     for i, effect in enumerate(effects):
         groups.setdefault(effect, []).append(i)
-    cost = {effect: _STIFF if effect is not None and effect.is_stiff else 1.0 for effect in groups}
+    cost = {
+        effect: len(own) * (_STIFF if effect is not None and effect.is_stiff else 1.0) for effect, own in groups.items()
+    }
     shares: list[list[int]] = [[] for _ in range(min(count, len(groups)))]
     load = [0.0] * len(shares)
     for effect in sorted(groups, key=lambda effect: -cost[effect]):
