@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import shutil
 import time
 import traceback
@@ -120,6 +122,7 @@ def run_case(job: Job) -> dict[str, Any]:
             with_truth = _rms(validation_errors(twins, [final])[0])
         else:
             with_truth = _rms(outcome.final_errors)
+    fitted = time.perf_counter()
     alone = {part: _base_error(job, part) for part in ("effects", "background")} if job.case.background else None
     return {
         "size": truth["size"],
@@ -136,7 +139,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "seconds": {
             "recordings": made - start,
             "diagnosis": diagnosed - made,
-            "true_fit": time.perf_counter() - diagnosed,
+            "true_fit": fitted - diagnosed,
         },
     }
 
@@ -156,10 +159,15 @@ def _load(job: Job, case: Case) -> tuple[Problem, dict[str, Any]]:
 
 
 def _base_error(job: Job, part: Literal["effects", "background"]) -> float:
-    """Validation RMSE [rad] of the base model where only one part of what is hidden is there."""
+    """Validation RMSE above the noise [rad] of the base model where only one part of what is hidden is there.
+
+    On the joints that have the effect.
+    """
     problem, _ = _load(job, replace(job.case, part=part))
     twins, base, _ = fit_base(problem, problem.space.to_physical(problem.space.start))
-    return _rms(validation_errors(twins, [base])[0])
+    joints = torch.tensor([bool(re.fullmatch(job.case.joints, name)) for name in problem.joint_names])
+    square = validation_errors(twins, [base])[0].mse[joints].mean()
+    return math.sqrt(max(float(square) - job.case.noise**2, 0.0))
 
 
 def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]) -> Fitted:

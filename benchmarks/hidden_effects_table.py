@@ -111,7 +111,7 @@ def _backgrounds(lines: Sequence[Line]) -> str:
     """How large an effect must be beside many small ones to be named."""
     rows = [("error of the effect / of the background", "cases", "named first", "in declared set", "unknown")]
     for low, high in ((3.0, np.inf), (1.0, 3.0), (0.0, 1.0)):
-        of = [line for line in lines if low <= line["alone"]["effects"] / line["alone"]["background"] < high]
+        of = [line for line in lines if low <= _excess(line) < high]
         rows.append(
             (
                 f"{low:g} or more" if np.isinf(high) else f"{low:g} to {high:g}",
@@ -122,6 +122,11 @@ def _backgrounds(lines: Sequence[Line]) -> str:
             )
         )
     return _aligned(rows)
+
+
+def _excess(line: Line) -> float:
+    """How many times the background's error the effect's is."""
+    return float(line["alone"]["effects"] / max(line["alone"]["background"], 1e-9))
 
 
 def _errors(lines: Sequence[Line], groups: Sequence[str]) -> str:

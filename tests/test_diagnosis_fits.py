@@ -168,3 +168,45 @@ def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench
             error[last] = lowest
         way.tell(rows, error)
     assert asked == 4 and float(way.score) == pytest.approx(lowest**2)
+
+
+def gaining(model, truth, gains):
+    """A descent whose favoured steps lower the error by these parts, (asks, joints); how often it had to be asked."""
+    way = descent._Way(Fitted.start(model, truth), samples=1.0, keep=False, rough=False)
+    lowest, asked = torch.ones(model.num_joints), 0
+    for gain in [torch.zeros(model.num_joints), *(torch.tensor(each) for each in gains)]:  # derivatives come first
+        if way.finished:
+            break
+        asked += 1
+        rows = way.ask()
+        lowest = lowest * (1 - gain)
+        error = 1.1 * lowest.repeat(len(rows), 1)
+        error[0] = lowest
+        way.tell(rows, error[:, None, None])
+    return way, asked
+
+
+def test_a_full_step_that_gains_next_to_nothing_ends_a_descent(bench):
+    way, asked = gaining(JointModel.base(bench.problem), bench.truth_values, [[0.5], [1e-5], [1e-5], [1e-5]])
+    assert way.finished and asked == 3
+
+
+def test_a_descent_ends_when_every_joint_has_once_come_to_its_end(bench):
+    one = JointModel.base(bench.problem)
+    two = replace(
+        one, has=torch.zeros(0, 2, dtype=torch.bool), lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1)
+    )
+    gains = [[1e-5, 0.5], [0.5, 0.5], [0.5, 1e-5], [0.5, 0.5]]  # the first joint gains again later
+    way, asked = gaining(two, bench.truth_values.repeat(2, 1), gains)
+    assert way.finished and asked == 4
+
+
+def test_a_model_that_is_near_on_other_joints_only_stays_behind():
+    def model(*scores):
+        return SimpleNamespace(score=torch.tensor(scores))
+
+    best, elsewhere = model(1.0, 1.0), model(9.0, 0.5)
+    fitted = []
+    for joints in (None, torch.tensor([True, False])):
+        descent._near_ones([best, elsewhere], joints, lambda near: fitted.append(near) or near)
+    assert fitted == [[best, elsewhere], [best]]

@@ -2,7 +2,10 @@
 
 import gc
 import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +16,7 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import processes
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
-from pace_optim.diagnosis.model import JointModel, start_values
+from pace_optim.diagnosis.model import BASE, JointModel, start_values
 from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.screening import screen
 
@@ -54,8 +57,7 @@ def test_worker_processes_and_other_systems_do_it_alone(monkeypatch):
     assert pids() == {os.getpid()}
     monkeypatch.setattr(processes.sys, "platform", "linux")
     assert len(pids()) == 2
-    worker = SimpleNamespace(daemon=True)
-    monkeypatch.setattr(processes.multiprocessing, "current_process", lambda: worker)
+    monkeypatch.setattr(processes.multiprocessing, "parent_process", lambda: SimpleNamespace())
     assert pids() == {os.getpid()}
 
 
@@ -104,6 +106,57 @@ def test_a_process_that_is_killed_is_told():
         spread(work, "ab", [GAIN, RIPPLE])
 
 
+class TwoWordsError(Exception):
+    """Pickle cannot make it again."""
+
+    def __init__(self, one, two):
+        super().__init__(f"{one} and {two}")
+
+
+@pytest.mark.parametrize("error", [ValueError("this and that"), TwoWordsError("this", "that")])
+def test_what_went_wrong_elsewhere_is_told_with_its_place(error):
+    here = os.getpid()
+
+    def work_of_a_user(own):
+        if os.getpid() != here:
+            raise error
+        return own
+
+    with pytest.raises(Exception, match="this and that") as caught:
+        spread(work_of_a_user, "ab", [GAIN, RIPPLE])
+    told = "".join([str(caught.value), *getattr(caught.value, "__notes__", [])])
+    assert "in work_of_a_user" in told
+
+
+def test_a_process_ends_with_the_one_that_started_it(tmp_path):
+    """A result that nobody reads must not keep it."""
+    script = tmp_path / "started.py"
+    script.write_text(
+        "import os, sys\n"
+        "from pace_actuators.effects import get_effect\n"
+        "from pace_optim.diagnosis import processes\n"
+        "processes.available_processors = lambda: 2\n"
+        "here = os.getpid()\n"
+        "def work(own):\n"
+        "    if os.getpid() == here:\n"
+        "        sys.stdin.readline()\n"
+        "        os.kill(here, 9)\n"
+        "    print(os.getpid(), flush=True)\n"
+        "    return [bytes(10**7)]\n"
+        "processes.spread(work, 'ab', [get_effect('torque_gain'), get_effect('torque_ripple')])\n"
+    )
+    first = subprocess.Popen([sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    other = int(first.stdout.readline())
+    first.stdin.write("\n")
+    first.stdin.flush()
+    first.wait(timeout=60)
+    for _ in range(100):
+        if not Path(f"/proc/{other}").exists():
+            return
+        time.sleep(0.1)
+    pytest.fail("the other process still runs")
+
+
 def test_a_collection_in_the_fork_does_not_touch_simulations(monkeypatch):
     found = spread(lambda own: [gc.isenabled()] * len(own), "ab", [GAIN, RIPPLE])
     assert found == [True, False]
@@ -114,13 +167,17 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     model, yes = JointModel.base(bench.problem), torch.tensor([True])
     base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
     effects, effort = [GAIN, ELASTICITY, RIPPLE], torch.tensor([5.0], dtype=torch.float64)
+    heavy = bench.truth_values.clone()
+    heavy[:, BASE.index("armature")] *= 2  # takes longer than one at the truth
 
     def found():
-        probes = screen(bench.twins, base, effects, effort)
+        own = [start_values(effect, {})[None] for effect in effects]
         starts = [
-            Fitted.start(*model.extended(bench.truth_values, e, yes, start_values(e, {})[None]), e) for e in effects
+            Fitted.start(*model.extended(values, effect, yes, each), effect)
+            for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
-        return probes, fit_side_by_side(bench.twins, starts, 2), far_starts(bench.twins, base, effects)
+        fits = fit_side_by_side(bench.twins, starts, 8, keep_jacobian=True, part=0.4)
+        return screen(bench.twins, base, effects, effort), fits, far_starts(bench.twins, base, effects)
 
     probes, fits, far = found()
     monkeypatch.setattr(processes, "available_processors", lambda: 1)
@@ -130,4 +187,8 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     for several, alone in ((fits, fits_alone), (far, far_alone)):
         assert [fit.tried for fit in several] == effects
         for one, other in zip(several, alone, strict=True):
-            assert torch.allclose(one.x, other.x, atol=1e-6) and one.model.effects == other.model.effects
+            assert torch.allclose(one.x, other.x, atol=1e-5) and one.model.effects == other.model.effects
+    for one, other in zip(fits, fits_alone, strict=True):
+        assert torch.allclose(one.score, other.score, rtol=1e-3)
+        assert torch.allclose(one.error, other.error, atol=1e-6)
+        assert torch.allclose(one.jacobian, other.jacobian, rtol=1e-2, atol=1e-3)

@@ -296,9 +296,11 @@ def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
     assert set(main.truth.effects) == {"torque_gain"} and len(rest.truth.effects) >= 15
     assert {**main.truth.effects, **rest.truth.effects} == both.truth.effects
     assert both.truth.base == main.truth.base == rest.truth.base
-    change = {name: [r.dof_pos for r in part.recordings] for name, part in (("both", both), ("main", main))}
-    assert all((a != b).any() for a, b in zip(change["both"], change["main"], strict=True))
+    alone, beside = motion_change(both.recordings, rest.recordings), motion_change(both.recordings, main.recordings)
+    assert alone == pytest.approx(both.size, rel=0.5) and beside == pytest.approx(0.5 * both.size, rel=0.5)
     assert len({replace(case, part=part).name for part in ("both", "effects", "background")}) == 3
+    with pytest.raises(ValueError, match="no background"):
+        make_case(replace(case, part="effects", background=0.0))
 
 
 @pytest.mark.slow

@@ -147,7 +147,8 @@ def _fit(
         physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
         errors = batch.split(batch.simulate(physical, where, _STRIDE))
         for way, x, error in zip(ways, rows, errors, strict=True):
-            way.tell(x, error)
+            if not way.finished:  # where it ends must not depend on what is fitted beside it
+                way.tell(x, error)
         if all(way.finished for way in ways):
             break
     return [way.result() for way in ways]
@@ -209,8 +210,8 @@ class _Way:
         # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and tells nothing of a gain
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
-        # a full step that gains next to nothing is the end; one that fails may want more damping
-        weight = torch.where(better & (best == 0), _STILL, 1)
+        # a full step that gains next to nothing is the end; one that fails, or is damped, may want another damping
+        weight = torch.where(better & (best == 0) & (self._damping <= _DAMPING), _STILL, 1)
         self._still = torch.where(fresh, self._still, torch.where(gain > _ENOUGH, 0, self._still + weight))
         narrower = (self._still > 0) & (self._width + 1 < len(self._widths))
         self._still[narrower] = 0

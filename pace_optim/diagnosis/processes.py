@@ -6,6 +6,7 @@ effect that is tried adds calls of its own.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import io
 import multiprocessing
@@ -13,6 +14,7 @@ import os
 import pickle
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
@@ -26,6 +28,8 @@ from pace_envs.simulation import available_processors
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_PR_SET_PDEATHSIG = 1
+"""Of Linux's prctl: the signal that a process gets when its parent dies."""
 _STIFF = 3.0
 """What an item of a stiff effect costs, as a multiple of another one's."""
 
@@ -67,7 +71,7 @@ def spread(
 
 
 def _processes() -> int:
-    forks = sys.platform == "linux" and not multiprocessing.current_process().daemon
+    forks = sys.platform == "linux" and multiprocessing.parent_process() is None
     return available_processors() if forks else 1
 
 
@@ -92,7 +96,7 @@ def _shares(effects: Sequence[type[Effect] | None], count: int) -> list[list[int
 def _own_processors(count: int) -> Iterator[list[set[int]]]:
     """Processors for each process; this one keeps to the first while the context lasts."""
     every = os.sched_getaffinity(0)
-    processors = [set(sorted(every)[k::count]) for k in range(count)]
+    processors = [set(sorted(every)[k::count]) or every for k in range(count)]
     os.sched_setaffinity(0, processors[0])
     try:
         yield processors
@@ -130,8 +134,8 @@ class _Other:
         except EOFError:
             self._process.join()
             raise RuntimeError(
-                f"A process that shared the work ended without a result (exit code {self._process.exitcode}). Most "
-                "often memory has run out: close other programs, or use one processor (taskset -c 0 python ...)."
+                f"A process that shared the work ended without a result (exit code {self._process.exitcode}; -9 mostly "
+                "means that memory has run out). Close other programs, or use one processor (taskset -c 0 python ...)."
             ) from None
         if isinstance(result, BaseException):
             raise result
@@ -145,16 +149,32 @@ class _Other:
 
 
 def _run(work: Callable, share: list, processors: set[int], sender: Connection) -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # where the first process dies, this one does too
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process is interrupted and ends the others
     os.sched_setaffinity(0, processors)
     torch.set_num_threads(1)  # threads of the first process did not come along
     try:
-        result = work(share)
+        content = _dumped(work(share))
     except Exception as error:
-        result = error
+        content = _dumped(_portable(error))
+    sender.send_bytes(content)
+
+
+def _dumped(value: object) -> bytes:
     file = io.BytesIO()
-    _Pickler(file).dump(result)
-    sender.send_bytes(file.getvalue())
+    _Pickler(file).dump(value)
+    return file.getvalue()
+
+
+def _portable(error: Exception) -> Exception:
+    """The error with where it came from, as one that can be sent."""
+    trace = traceback.format_exc()
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # pickle calls what the error's class defines
+        return RuntimeError(f"{type(error).__name__}: {error}\n{trace}")
+    error.add_note(trace)
+    return error
 
 
 class _Pickler(pickle.Pickler):
@@ -168,7 +188,8 @@ class _Unpickler(pickle.Unpickler):
     """Gets them back."""
 
     def persistent_load(self, pid: int) -> type[Effect]:
-        return next(effect for effect in _subclasses(Effect) if id(effect) == pid)
+        every: list[type[Effect]] = [Effect, *_subclasses(Effect)]
+        return next(effect for effect in every if id(effect) == pid)
 
 
 def _subclasses(effect: type[Effect]) -> Iterator[type[Effect]]:

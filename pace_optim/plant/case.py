@@ -78,6 +78,8 @@ def make_case(case: Case) -> tuple[Suite, Drawn]:
         effect_named(name)
     if case.background and not (case.effects or case.harmonic_drive):
         raise ValueError("A background is a share of an effect's size, and the case has no effect. Name one.")
+    if case.part != "both" and not case.background:
+        raise ValueError(f"part is {case.part!r}, and the case has no background. Give one, or leave part at 'both'.")
     robot = plant_robot(case.task)
     key = sum(ord(c) * 31**i for i, c in enumerate("+".join(case.effects))) % 2**31
     rng = np.random.default_rng([case.seed, key])
