@@ -25,7 +25,7 @@ _DAMPING = 1e-3
 _ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
 _STILL = 2
-"""Steps that fail in a row, after which a joint has converged."""
+"""Steps in a row that gain less than that, after which a joint has converged."""
 _BEHIND = 2.0
 """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
 _COARSE, _FINE = 8, 3
@@ -210,9 +210,7 @@ class _Way:
         # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and tells nothing of a gain
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
-        # a full step that gains next to nothing is the end; one that fails, or is damped, may want another damping
-        weight = torch.where(better & (best == 0) & (self._damping <= _DAMPING), _STILL, 1)
-        self._still = torch.where(fresh, self._still, torch.where(gain > _ENOUGH, 0, self._still + weight))
+        self._still = torch.where(fresh, self._still, torch.where(gain > _ENOUGH, 0, self._still + 1))
         narrower = (self._still > 0) & (self._width + 1 < len(self._widths))
         self._still[narrower] = 0
         self._converged |= self._still >= _STILL
