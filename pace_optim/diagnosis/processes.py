@@ -89,7 +89,7 @@ def _shares(effects: Sequence[type[Effect] | None], count: int) -> list[list[int
         k = load.index(min(load))
         shares[k] += groups[effect]
         load[k] += cost[effect]
-    return [sorted(share) for share in shares]
+    return shares
 
 
 @contextmanager
