@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pace_actuators.effects import EffectCfg
-from pace_actuators.joint_values import JointValue
+from pace_actuators.joint_values import JointValue, match_names, resolve_joint_values
 
 if TYPE_CHECKING:
     from pace_actuators.identified import IdentifiedAt
@@ -84,6 +85,25 @@ class PaceDCMotorCfg:
 
     identified: IdentifiedAt | None = None
     """Time steps of the identification that the values come from: the drive warns where its own are too different."""
+
+    def on_joints(self, joint_names: Sequence[str], chosen: Sequence[str]) -> PaceDCMotorCfg | None:
+        """The same for some of the joints of its group, without effects; ``None`` if it moves none of them.
+
+        Args:
+            joint_names: All joints of the robot, in order.
+            chosen: Those wanted.
+        """
+        found = {i for indices in match_names(self.joint_names_expr, joint_names) for i in indices}
+        group = [name for i, name in enumerate(joint_names) if i in found]
+        kept = [i for i, name in enumerate(group) if name in chosen]
+        if not kept:
+            return None
+        per_joint: dict[str, Any] = {
+            f.name: resolve_joint_values(value, group, field=f.name)[kept]
+            for f in fields(self)
+            if "JointValue" in str(f.type) and (value := getattr(self, f.name)) is not None
+        }
+        return replace(self, joint_names_expr=[re.escape(group[i]) for i in kept], effects=(), **per_joint)
 
     @classmethod
     def from_result(

@@ -251,10 +251,8 @@ class Articulation:
                 data.computed_torque[:, ids] = actuator.computed_effort
                 data.applied_torque[:, ids] = efforts
             self._sim.qfrc_applied[:, place] = actuator.held_effort
-            if actuator.changes_passive:
-                self._write_friction(actuator, place)
-            if actuator.changes_armature:
-                self._sim.expand("dof_armature")[:, place] = actuator.joint_armature
+            if actuator.changes_passive or actuator.changes_armature:
+                self._write_what_drags(actuator, place)
 
     def update(self) -> None:
         """Read the state after a physics step."""
@@ -374,17 +372,19 @@ class Articulation:
         self._sim.note_model_effect(effect, self._columns_of(actuator))
         self._sim.constants_changed()
 
-    def _write_friction(self, actuator: PaceDCMotor, place: torch.Tensor | slice) -> None:
+    def _write_what_drags(self, actuator: PaceDCMotor, place: torch.Tensor | slice) -> None:
         self._sim.write_passive(
-            place, actuator.joint_friction, actuator.joint_viscous_friction, actuator.joint_implicit_damping
+            place,
+            actuator.joint_armature,
+            actuator.joint_friction,
+            actuator.joint_viscous_friction,
+            actuator.joint_implicit_damping,
         )
 
     def _write_passive(self, actuator: PaceDCMotor) -> None:
         """Write what the simulator carries of a drive: rotor inertia, friction, the link's rigid body."""
         actuator.update_effects()
-        place = self._place_of(actuator)
-        self._sim.expand("dof_armature")[:, place] = actuator.joint_armature
-        self._write_friction(actuator, place)
+        self._write_what_drags(actuator, self._place_of(actuator))
         self._sim.constants_changed()
 
     def _build_actuators(self) -> None:
@@ -422,7 +422,7 @@ class Articulation:
             )
         for actuator in self.actuators.values():
             actuator.holds_line = actuator.cfg.control_decimation > 1 or self._sim.is_trapezoidal
-            actuator.centred = actuator.holds_line and self._sim.is_semi_implicit
+            actuator.centred = actuator.holds_line and not self._sim.is_trapezoidal
             if actuator.effects is not None:
                 actuator.effects.is_trapezoidal = self._sim.is_trapezoidal
             driven = actuator.joint_indices

@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium as gym
 
-from pace_actuators.effects import effect_cfgs
 from pace_envs.gym_vector import PaceVectorEnv
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
@@ -116,7 +115,7 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
-    The finer steps are Runge-Kutta's, unless a drive has an effect with fast dynamics of its own: those are implicit.
+    The finer steps are Runge-Kutta's.
 
     Raises:
         ValueError: If the present time step is no multiple of the finer one.
@@ -131,11 +130,9 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
         return
     cfg.sim.dt /= ratio
     cfg.decimation *= ratio
-    drives = cfg.scene.robot.actuators.values()
-    for drive in drives:
+    cfg.sim.integrator = "rk4"
+    for drive in cfg.scene.robot.actuators.values():
         drive.control_decimation *= ratio
-    if not any(effect.effect_class.is_stiff for drive in drives for effect in effect_cfgs(drive.effects)):
-        cfg.sim.integrator = "rk4"
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

@@ -26,6 +26,10 @@ _INTEGRATORS = {
 }
 
 
+_EXPLICIT = 0.5
+"""Part of its speed that a rotor may lose to viscous friction in a step of an explicit integrator."""
+
+
 @dataclass(kw_only=True)
 class SimulationCfg:
     """How the physics is stepped."""
@@ -66,13 +70,10 @@ def available_processors() -> int:
 class Simulation:
     """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (float64, no copies)."""
 
-    is_trapezoidal = False
-    """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
-
     @property
-    def is_semi_implicit(self) -> bool:
-        """Whether speeds are updated first, and positions move with the new ones."""
-        return self.cfg.integrator != "rk4"
+    def is_trapezoidal(self) -> bool:
+        """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
+        return self.cfg.integrator == "rk4"
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
         """Compile the model and start the thread pool.
@@ -127,20 +128,31 @@ class Simulation:
     def write_passive(
         self,
         columns: torch.Tensor | slice,
+        armature: torch.Tensor,
         friction: torch.Tensor,
         viscous: torch.Tensor,
         implicit: torch.Tensor | None,
     ) -> None:
-        """Write what drives leave to the simulation until the next step, (num_envs, number of columns).
+        """Write what drives leave to the simulation, (num_envs, len(columns)) each; after the applied torques.
 
         Args:
             columns: Degrees of freedom.
+            armature: Rotor inertia [kg m²].
             friction: Coulomb friction [N m].
             viscous: Viscous friction [N m s/rad].
             implicit: Viscous friction that must act on the speed at the end of the step [N m s/rad].
         """
+        if not self.is_trapezoidal:
+            viscous = viscous if implicit is None else viscous + implicit
+        else:  # the integrator is explicit: - D v₊ = - D v - h D a is a torque and an inertia; so is too steep a line
+            h = self.cfg.dt
+            steep = (viscous - _EXPLICIT * armature / h).clamp(min=0.0)
+            drag, inertia = (steep, 0.5 * steep) if implicit is None else (steep + implicit, 0.5 * steep + implicit)
+            self.qfrc_applied[:, columns] -= drag * self.qvel[:, columns]
+            armature, viscous = armature + h * inertia, viscous - steep
+        self.expand("dof_armature")[:, columns] = armature
         self.expand("dof_frictionloss")[:, columns] = friction
-        self.expand("dof_damping")[:, columns] = viscous if implicit is None else viscous + implicit
+        self.expand("dof_damping")[:, columns] = viscous
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What hinge joints carry, as it was computed last, (num_envs, len(columns)) each.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from pace_optim.recording import Recording, validation_start
+from pace_optim.recording import Recording, validation_start, with_columns
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,6 +60,18 @@ class Dataset:
             torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
             validation_only=tuple(self.validation_only[r] for r in chosen),
             session_start=self.session_start[chosen],
+        )
+
+    def on_joints(self, joints: Sequence[int]) -> Dataset:
+        """The same of some of the joints, by index."""
+        chosen = list(joints)
+        names = tuple(self.recordings[0].joint_names[j] for j in chosen)
+        return replace(
+            self,
+            recordings=tuple(with_columns(recording, chosen, names) for recording in self.recordings),
+            command=self.command[..., chosen],
+            measured=self.measured[..., chosen],
+            measured_vel=self.measured_vel[..., chosen],
         )
 
     def trained(self) -> list[int]:

@@ -41,6 +41,7 @@ class Bench:
         task: str = BENCH,
         num_envs: int = 1,
         calls: int = 1,
+        integrator: str = "implicitfast",
         drive: Mapping[str, float] | None = None,
         delay_mode: str = "command",
         load: Mapping[str, float] | None = None,
@@ -54,6 +55,7 @@ class Bench:
             task: The environment.
             num_envs: Number of environments.
             calls: How often the drives are called in a control step; as many physics steps are made.
+            integrator: How they are integrated.
             drive: Fields of the drives.
             delay_mode: What the drives' delay delays.
             load: The bench's load.
@@ -62,6 +64,7 @@ class Bench:
         cfg.set_effects(effects)
         cfg.scene.num_envs = num_envs
         cfg.sim.dt /= calls
+        cfg.sim.integrator = integrator
         cfg.decimation *= calls
         for each in cfg.scene.robot.actuators.values():
             each.control_decimation *= calls

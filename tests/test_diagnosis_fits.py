@@ -143,7 +143,7 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     heavy[bench.problem.space["armature"]] *= 3
     elsewhere = twin_problem(bench.problem, reference_path(bench.problem, heavy))
     now = Fitted.start(JointModel.base(bench.problem), bench.truth_values)
-    follow = OwnMotion(problem=bench.problem, candidates=[]).follow
+    follow = OwnMotion(problem=bench.problem, candidates=[], enough=torch.zeros(1)).follow
     along, fitted = follow(elsewhere, now)
     assert float((along.path.position - bench.twins.path.position).abs().max()) < 1e-9
     assert float(fitted.score.sqrt()) < 1e-4 and fitted.jacobian is not None
@@ -197,12 +197,11 @@ def test_a_descent_ends_when_every_joint_has_once_come_to_its_end(bench):
     assert way.finished and asked == 5
 
 
-def test_a_model_that_is_near_on_other_joints_only_stays_behind():
+def test_a_model_goes_on_that_is_near_the_best_on_any_joint():
     def model(*scores):
         return SimpleNamespace(score=torch.tensor(scores))
 
-    best, elsewhere = model(1.0, 1.0), model(9.0, 0.5)
+    best, elsewhere, behind = model(1.0, 1.0), model(9.0, 0.5), model(9.0, 9.0)
     fitted = []
-    for joints in (None, torch.tensor([True, False])):
-        descent._near_ones([best, elsewhere], joints, lambda near: fitted.append(near) or near)
-    assert fitted == [[best, elsewhere], [best]]
+    descent._near_ones([best, elsewhere, behind], lambda near: fitted.append(near) or near)
+    assert fitted == [[best, elsewhere]]

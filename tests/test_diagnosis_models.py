@@ -7,7 +7,7 @@ import torch
 from diagnoses import joint_alone
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis import pruning, sharing
+from pace_optim.diagnosis import pruning, sharing, some_joints
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
@@ -93,9 +93,10 @@ def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench, monkeyp
     before = BlockErrors(square=torch.tensor([[1e-8]]).double(), weight=weights)
     for cost, kept in ((1.05, [False, True]), (1.3, [True, True])):
         after = BlockErrors(square=cost * before.square, weight=weights)
-        for name in ("fit_coarse_to_fine", "fit_side_by_side"):
-            monkeypatch.setattr(pruning, name, lambda _, starts, **kwargs: starts)
-        monkeypatch.setattr(pruning, "validation_errors", lambda *_, after=after: [after])
+        for module, name in ((some_joints, "fit_coarse_to_fine"), (pruning, "fit_side_by_side")):
+            monkeypatch.setattr(module, name, lambda _, starts, **kwargs: starts)
+        for module in (some_joints, pruning):
+            monkeypatch.setattr(module, "validation_errors", lambda *_, after=after: [after])
         left, _ = pruning.pruned(bench.twins, now, before, [QUADRATIC])
         assert left.model.has[:, 0].tolist() == kept
         assert labels(left.model, ["servo"]) == [e.name for e, k in zip((STRIBECK, QUADRATIC), kept, strict=True) if k]

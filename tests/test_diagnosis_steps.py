@@ -10,7 +10,7 @@ from diagnoses import errors_of, hidden_run, joint_alone, make_trial, outcome_of
 from problems import DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import next_experiment, one_round, search, swapping
+from pace_optim.diagnosis import next_experiment, one_round, search, some_joints, swapping
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
@@ -159,11 +159,11 @@ def test_an_error_map_names_the_variable_that_friction_depends_on(tmp_path):
 @pytest.fixture
 def no_fits(monkeypatch):
     """Models stay where they start; returns how to say which errors they have, by the effect that is tried."""
-    for name in ("fit_coarse_to_fine", "fit_side_by_side"):
-        monkeypatch.setattr(swapping, name, lambda _, starts, *args, **kwargs: starts)
+    for module, name in ((some_joints, "fit_coarse_to_fine"), (swapping, "fit_side_by_side")):
+        monkeypatch.setattr(module, name, lambda _, starts, *args, **kwargs: starts)
 
     def say(errors_of):
-        monkeypatch.setattr(swapping, "validation_errors", lambda _, models: [errors_of[m.tried] for m in models])
+        monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [errors_of[m.tried] for m in models])
 
     return say
 

@@ -39,18 +39,18 @@ class World:
             result.append(BlockErrors(square=torch.tensor([squares]).double(), weight=torch.ones(1).double()))
         return result
 
-    def try_effects(self, _, now, errors, effects, effort, floor, open_joints, say, rough):
+    def try_effects(self, _, now, errors, effects, effort, floor, say, rough):
         self.rounds += 1
         trials, models = [], {}
         for effect in effects:
             values = torch.zeros(now.model.num_joints, len(effect.parameters)).double()
             model, physical = now.model.extended(
-                now.model.to_physical(now.x), effect, now.model.may_get(effect) & open_joints, values
+                now.model.to_physical(now.x), effect, now.model.may_get(effect), values
             )
             models[effect] = Fitted.start(model, physical, tried=effect)
         for j, has in enumerate(self.effects_of(now)):
             before = float(errors.mse[j].sqrt())
-            own = [e for e in effects if open_joints[j] and now.model.may_get(e)[j]]
+            own = [e for e in effects if now.model.may_get(e)[j]]
             after = {e: self.rmse(j, [*has, e]) for e in own}
             trials.append([make_trial(e, j, after[e], after[e] * 1.2 < before) for e in sorted(own, key=after.get)])
         chosen = [next((t.effect for t in each if t.significant), None) for each in trials]

@@ -144,19 +144,48 @@ def test_a_finer_physics_step_keeps_the_control_rate():
     assert 1e-7 < (a - b).abs().max() < 5e-3
 
 
-def test_fast_dynamics_of_a_drive_keep_the_simulation_implicit():
-    plain, stiff = load_env_cfg("Pace-TestBench-v0"), load_env_cfg("Pace-TestBench-v0")
-    stiff.set_effects(["joint_elasticity"])
-    for cfg, integrator in ((plain, "rk4"), (stiff, "implicitfast")):
-        set_physics_dt(cfg, 0.0005)
-        assert cfg.sim.integrator == integrator and cfg.decimation == 5
-        assert cfg.scene.robot.actuators["servo"].control_decimation == 5
+def test_finer_steps_are_runge_kutta_with_fast_dynamics_of_a_drive_too():
+    cfg = load_env_cfg("Pace-TestBench-v0")
+    cfg.set_effects(["joint_elasticity"])
+    set_physics_dt(cfg, 0.0005)
+    assert cfg.sim.integrator == "rk4" and cfg.decimation == 5
+    assert cfg.scene.robot.actuators["servo"].control_decimation == 5
 
 
-def test_between_control_steps_the_torque_is_held():
+@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
+def test_implicit_damping_acts_on_the_speed_after_the_step(integrator):
+    """(M + J) (v₊ - v) = h (τ - D v₊), whatever D is."""
+    cfg = load_env_cfg("Pace-TestBench-v0")
+    cfg.sim.integrator, cfg.sim.gravity = integrator, (0.0, 0.0, 0.0)
+    env = ManagerBasedRLEnv(cfg)
+    start(env, velocity=2.0)
+    sim, h = env.sim, env.physics_dt
+    armature, damping, effort = 0.05, 500.0, 3.0
+
+    def of(value):
+        return torch.full((1, 1), value, dtype=torch.float64)
+
+    sim.qfrc_applied[:] = effort
+    sim.write_passive(slice(None), of(armature), of(0.0), of(0.0), of(damping))
+    sim.step()
+    expected = ((INERTIA + armature) * 2.0 + h * effort) / (INERTIA + armature + h * damping)
+    assert float(sim.qvel) == pytest.approx(expected, rel=1e-9)
+
+
+def test_finer_steps_bear_any_torque_speed_line():
+    """Runge-Kutta's own damping would diverge beyond 2.8 M / h."""
+    env = bench(gravity=False, physics_dt=0.00125, damping=0.0, armature=0.01, viscous_friction=2000.0)
+    start(env, velocity=2.0)
+    q = roll(env, 0.2)[:, 0]
+    assert float(q.max()) < 2 * (INERTIA + 0.01) * 2.0 / 2000.0 and float(q.min()) >= -1e-9
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
+def test_between_control_steps_the_torque_is_held(integrator):
     cfg = load_env_cfg("Pace-TestBench-v0")
     cfg.set_effects(["backlash"])
     set_physics_dt(cfg, 0.0005)
+    cfg.sim.integrator = integrator
     env = ManagerBasedRLEnv(cfg)
     start(env, position=0.2)
     robot, seen = env.scene["robot"], []
@@ -168,7 +197,9 @@ def test_between_control_steps_the_torque_is_held():
         env.scene.update()
         seen.append(robot.data.applied_torque.item())
     assert len(set(seen[:5])) == 1 and len(set(seen[6:])) == 1 and seen[0] != seen[6]
-    assert seen[5] == pytest.approx(0.5 * (seen[0] + seen[6]))  # a torque acts half a physics step early, else
+    # where positions move with the new speed, a torque acts half a physics step early, else
+    expected = seen[6] if integrator == "rk4" else 0.5 * (seen[0] + seen[6])
+    assert seen[5] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("physics_dt", [0.001, 0.005, 0.0, -0.0025, math.nan, math.inf])

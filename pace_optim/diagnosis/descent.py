@@ -67,24 +67,21 @@ class Fitted:
         self.score = torch.where(joints, other.score, self.score)
 
 
-def fit_coarse_to_fine(
-    problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False, joints: torch.Tensor | None = None
-) -> list[Fitted]:
+def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
     """Go most of the way at the control step, which costs half, and the rest at the problem's physics step.
 
-    Models that the control step shows to be far behind the best one on every joint that counts stay where it left them.
+    Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
     Args:
         problem: The joints simulated alone.
         starts: Models and where they start.
         rough: Whether to go on over wide steps where narrow ones have led.
-        joints: Which joints count, (n,) bool; ``None`` for all.
     """
     at_control_step = problem.with_physics_dt(problem.control_dt)
     result = fit_side_by_side(at_control_step, starts, _COARSE)
     if rough:
-        result = _near_ones(result, joints, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
-    return _near_ones(result, joints, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
+        result = _near_ones(result, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
+    return _near_ones(result, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
 
 
 def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
@@ -94,11 +91,9 @@ def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
     return fit_side_by_side(problem, coarse, _FINE, keep_jacobian=True)[0]
 
 
-def _near_ones(
-    models: Sequence[Fitted], joints: torch.Tensor | None, fit: Callable[[list[Fitted]], list[Fitted]]
-) -> list[Fitted]:
-    """All models, fitted again those that are near the best one on some joint that counts."""
-    scores = torch.stack([each.score if joints is None else each.score[joints] for each in models])
+def _near_ones(models: Sequence[Fitted], fit: Callable[[list[Fitted]], list[Fitted]]) -> list[Fitted]:
+    """All models, fitted again those that are near the best one on some joint."""
+    scores = torch.stack([each.score for each in models])
     near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
     again = iter(fit([each for each, yes in zip(models, near, strict=True) if yes]))
     return [next(again) if yes else each for each, yes in zip(models, near, strict=True)]

@@ -22,6 +22,7 @@ from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.sharing import share
 from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, stand_ins, varying
+from pace_optim.diagnosis.trials import NEXT_FLOOR
 from pace_optim.diagnosis.verdict import explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
@@ -156,8 +157,9 @@ def search_effects(
     absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
     base.model = replace(base.model, barred=absorbed)
 
-    follow = OwnMotion(problem=problem, candidates=candidates, say=say).follow
-    outcome = add_effects(twins, base, candidates, effort, FLOOR_MARGIN * data.floor, max_effects, say, follow)
+    floor = FLOOR_MARGIN * data.floor
+    follow = OwnMotion(problem=problem, candidates=candidates, enough=NEXT_FLOOR * floor, say=say).follow
+    outcome = add_effects(twins, base, candidates, effort, floor, max_effects, say, follow)
     share(outcome)
     decision, explained = verdict(outcome, data.floor)
     if decision != "unknown":

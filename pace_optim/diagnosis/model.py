@@ -76,6 +76,24 @@ class JointModel:
             start += len(other.parameters)
         return slice(start, start + len(effect.parameters))
 
+    def on_joints(self, joints: torch.Tensor) -> tuple[JointModel, list[int]]:
+        """The same of some joints, (n,) bool, with the effects that any of them has; and which entries those are."""
+        kept = [row for row, has in enumerate(self.has) if bool(has[joints].any())]
+        entries = list(range(len(BASE)))
+        for row in kept:
+            columns = self.columns(self.effects[row])
+            entries += range(columns.start, columns.stop)
+        model = replace(
+            self,
+            effects=tuple(self.effects[row] for row in kept),
+            has=self.has[kept][:, joints],
+            lower=self.lower[joints][:, entries],
+            upper=self.upper[joints][:, entries],
+            log=self.log[entries],
+            barred={effect: barred[joints] for effect, barred in self.barred.items()},
+        )
+        return model, entries
+
     def with_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
         """The same with an effect on some joints, (n,) bool, beside those that have it already."""
         if effect in self.effects:

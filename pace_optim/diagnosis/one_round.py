@@ -37,7 +37,6 @@ def try_effects(
     effects: Sequence[type[Effect]],
     effort: torch.Tensor,
     floor: torch.Tensor,
-    open_joints: torch.Tensor,
     say: Callable[[str], None],
     rough: bool = False,
 ) -> Round | None:
@@ -50,12 +49,11 @@ def try_effects(
         effects: Candidates.
         effort: Typical torque of each joint, (n,) [N m].
         floor: Below this RMSE of each joint there is nothing to find, (n,) [rad].
-        open_joints: Joints that something is sought for, (n,) bool.
         say: Shows how far it is.
         rough: Whether refits go on over wide steps.
     """
     probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
-    excess = torch.where(open_joints, (errors.mse - floor**2).clamp(min=0.0), 0.0)
+    excess = (errors.mse - floor**2).clamp(min=0.0)
     listed = _short_list(_promising(probes, excess), excess)
     first = not now.model.effects
     far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
@@ -70,14 +68,14 @@ def try_effects(
     if not listed:  # no effect does better than the base parameters alone
         return None
     say(f"refitting with {_names(listed)}")
-    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough, open_joints)
+    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough)
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
-    tried = len(effects) * int(open_joints.sum())
+    tried = len(effects) * n
     trials: list[list[Trial]] = [[] for _ in range(n)]
     keep: dict[type[Effect], Fitted] = {}
     for effect, chosen, after in zip(listed, fitted, blocks, strict=True):
-        for j in (open_joints & now.model.may_get(effect)).nonzero()[:, 0].tolist():
+        for j in now.model.may_get(effect).nonzero()[:, 0].tolist():
             verdict = judge(errors, after, j, tried, first)
             values = chosen.model.to_physical(chosen.x)[j, chosen.model.columns(effect)].tolist()
             trials[j].append(
@@ -185,9 +183,10 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
     """Each joint's best significant effect; among rivals, the one that most joints want."""
     wanted: dict[type[Effect], int] = {}
     near: list[list[Trial]] = []
+    refused = _worse_for_the_robot(trials)
     for own in trials:
         own.sort(key=lambda t: t.mse_after)
-        good = [t for t in own if t.significant]
+        good = [t for t in own if t.significant and t.effect not in refused]
         close = [t for t in good if t.mse_after <= good[0].mse_after * RIVAL**2] if good else []
         near.append(close)
         for trial in close:
@@ -203,3 +202,20 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
         chosen.append(best.effect)
         rivals.append([t.effect for t in close if t.effect is not best.effect])
     return chosen, rivals
+
+
+def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]:
+    """Effects that all joints share by their nature, and that leave more over all joints than effects of their own."""
+    good = [[trial for trial in own if trial.significant] for own in trials if own]
+    before = [own[0].mse_before for own in trials if own]
+
+    def left(effects: set[type[Effect]]) -> float:
+        """Squared error over all joints with the best of some effects."""
+        return sum(
+            min([without, *(t.mse_after for t in own if t.effect in effects)])
+            for own, without in zip(good, before, strict=True)
+        )
+
+    found = {trial.effect for own in good for trial in own}
+    shared = {effect for effect in found if effect.shared}
+    return {effect for effect in shared if left({effect}) > left(found - shared)}

@@ -8,7 +8,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -37,9 +38,9 @@ def pruned(
     if not older:
         return now, errors
     starts = [Fitted.start(model.without_effect(e, joints), model.to_physical(now.x), tried=e) for e, joints in older]
-    fitted = fit_coarse_to_fine(problem, starts)
+    which = torch.stack([joints for _, joints in older]).any(dim=0)
+    fitted, after = SomeJoints(which).refitted(problem, starts, errors)
     dropped, x = model, now.x.clone()
-    after = validation_errors(problem, fitted)
     for j in range(n):
         without = [k for k, (_, joints) in enumerate(older) if bool(joints[j])]
         if not without:

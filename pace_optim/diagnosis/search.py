@@ -13,6 +13,7 @@ from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_b
 from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned
+from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
 from pace_optim.diagnosis.validation import validation_errors
@@ -108,17 +109,19 @@ class _Search:
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
             return None
         self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
-        return try_effects(
-            branch.problem,
-            branch.now,
-            branch.errors,
+        part = SomeJoints(open_joints)
+        now, errors = part.of_fit(branch.now), part.of_errors(branch.errors)
+        found = try_effects(
+            part.of_problem(branch.problem),
+            now,
+            errors,
             untried,
-            self.effort,
-            self.floor,
-            open_joints,
+            self.effort[open_joints],
+            self.floor[open_joints],
             self.say,
             rough=self._is_rough(branch.now, branch.errors),
         )
+        return None if found is None else part.round_of_all(found, branch.now)
 
     def _is_rough(self, now: Fitted, errors: BlockErrors) -> bool:
         """Whether contacts or springs of joints far from the floor may keep narrow derivatives from leading on."""
@@ -187,7 +190,7 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
         values = source.model.to_physical(source.x)
         model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
         physical[has, :size] = values[has, :size]
-    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=1, keep_jacobian=True)[0]
 
 
 def _is_same(one: _Branch, two: _Branch) -> bool:

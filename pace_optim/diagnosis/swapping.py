@@ -8,10 +8,10 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.model import BASE
+from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
-from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
 _PER_JOINT = 3
@@ -41,9 +41,10 @@ def swapped(
     if not exchanges:
         return None
     starts = [_start(now, effect, joints, rounds) for effect, joints in exchanges.items()]
-    fitted = fit_coarse_to_fine(problem, starts)
-    after = dict(zip(exchanges, validation_errors(problem, fitted), strict=True))
-    models = dict(zip(exchanges, fitted, strict=True))
+    which = torch.zeros(now.model.num_joints, dtype=torch.bool)
+    which[[j for joints in exchanges.values() for j in joints]] = True
+    fitted, blocks = SomeJoints(which).refitted(problem, starts, errors)
+    after, models = dict(zip(exchanges, blocks, strict=True)), dict(zip(exchanges, fitted, strict=True))
     chosen = _choose(now, errors, exchanges, {effect: block.mse for effect, block in after.items()})
     if not chosen:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -60,19 +60,26 @@ class ReferencePath:
         effort = (self.feel.inertia[1:] + armature) * acceleration - self.feel.torque[1:]
         return effort.square().mean(dim=(0, 1)).sqrt()
 
+    def on_joints(self, joints: Sequence[int]) -> ReferencePath:
+        """Of some of the joints, by index."""
+        chosen = list(joints)
+        return self._part((..., chosen), columns=self.columns[chosen])
+
     def select(self, recordings: Sequence[int]) -> ReferencePath:
         """Some of the recordings, by index."""
-        chosen = list(recordings)
+        return self._part((slice(None), list(recordings)))
 
+    def _part(self, index: tuple, **changes: Any) -> ReferencePath:
         def part(feel: Feel) -> Feel:
-            return Feel(inertia=feel.inertia[:, chosen], torque=feel.torque[:, chosen])
+            return Feel(inertia=feel.inertia[index], torque=feel.torque[index])
 
         return replace(
             self,
-            position=self.position[:, chosen],
+            position=self.position[index],
             feel=part(self.feel),
-            stiffness=self.stiffness[:, chosen],
+            stiffness=self.stiffness[index],
             model_effects={key: part(feel) for key, feel in self.model_effects.items()},
+            **changes,
         )
 
 

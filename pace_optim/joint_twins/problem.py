@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 from pace_actuators.effects import EffectCfg
@@ -30,6 +30,13 @@ class TwinProblem(Problem):
         """An evaluator of candidates on the recordings that are trained on."""
         trained = self.dataset.trained()
         return self._evaluator(self.dataset.select(trained), self.path.select(trained))
+
+    def on_joints(self, joints: Sequence[int]) -> TwinProblem:
+        """The same of some of the joints, by index, without effects: the others cost nothing."""
+        names = [self.joint_names[j] for j in joints]
+        cfg = self.plain_cfg.on_joints(names)
+        part = replace(self, plain_cfg=cfg, dataset=self.dataset.on_joints(joints), path=self.path.on_joints(joints))
+        return part.with_effects(()).with_physics_dt(self.physics_dt)
 
     def with_effects(self, effects: Sequence[EffectCfg | str]) -> TwinProblem:
         """The same with these effects instead of its own."""

@@ -23,7 +23,6 @@ class TwinSimulation(Simulation):
     """
 
     is_trapezoidal = True
-    is_semi_implicit = False
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int, path: ReferencePath):
         """Set up the state.
@@ -36,7 +35,7 @@ class TwinSimulation(Simulation):
         """
         self.cfg, self.num_envs, self.path = cfg, num_envs, path
         self.device = torch.device("cpu")
-        self.model = self._compile(spec)
+        self._take_joints(path.columns, spec)
         self.batch = None
         model = self.model
         self._fields: dict[str, torch.Tensor] = {}
@@ -47,9 +46,8 @@ class TwinSimulation(Simulation):
         self._is_implicit = False
         self._constants_changed = False
         self._steps = 0
-        self._columns = path.columns
-        self._as_in_model = torch.equal(path.columns, torch.arange(model.nv))
-        self._shape = (-1, path.position.shape[1], len(path.columns))
+        self._as_in_model = torch.equal(self._columns, torch.arange(model.nv))
+        self._shape = (-1, path.position.shape[1], len(self._columns))
         self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
         # one tensor an interval: taking them out of a list costs nothing at each step
@@ -91,11 +89,13 @@ class TwinSimulation(Simulation):
     def write_passive(
         self,
         columns: torch.Tensor | slice,
+        armature: torch.Tensor,
         friction: torch.Tensor,
         viscous: torch.Tensor,
         implicit: torch.Tensor | None,
     ) -> None:
         """Write what drives leave to the simulation."""
+        self.expand("dof_armature")[:, columns] = armature
         self.expand("dof_frictionloss")[:, columns] = friction
         self.expand("dof_damping")[:, columns] = viscous
         if implicit is not None:
@@ -148,6 +148,18 @@ class TwinSimulation(Simulation):
 
     def close(self) -> None:
         """Nothing to release."""
+
+    def _take_joints(self, columns: torch.Tensor, spec: mujoco.MjSpec) -> None:
+        """Set the model, without joints that are not on the path, and where those that are have their columns."""
+        self.model = self._compile(spec)
+        names = [self.model.joint(self.model.dof_jntid[column]).name for column in columns.tolist()]
+        alone = self._stands_alone[columns]
+        if others := [joint for joint in spec.joints if joint.name not in names]:
+            for element in [*spec.sensors, *spec.equalities, *spec.tendons, *others]:
+                spec.delete(element)
+            self.model = self._compile(spec)
+        self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in names])
+        self._stands_alone = torch.zeros(self.model.nv, dtype=torch.bool).index_put((self._columns,), alone)
 
     def _feel(self, k: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Inertia and torque in an interval, (candidates or 1, recordings, n)."""

@@ -5,7 +5,7 @@
 >>> recording.dof_pos, recording.command, recording.notes
 """
 
-from .conform import conform_recording
+from .conform import conform_recording, with_columns
 from .data import Drive, Load, Recording, validation_start
 from .files import SUFFIXES, load_recording, save_recording
 
@@ -18,4 +18,5 @@ __all__ = [
     "load_recording",
     "save_recording",
     "validation_start",
+    "with_columns",
 ]

@@ -53,7 +53,7 @@ def conform_recording(
         raise ValueError(f"joint_order names a joint twice: {listed(joint_order)}. Name each joint once.")
     check_load(recording, load_bodies, accepts_load)
     columns, notes = column_order(recording, joint_order)
-    recording = _with_columns(recording, columns, tuple(joint_order))
+    recording = with_columns(recording, columns, tuple(joint_order))
     notes += check_motion(recording, joint_pos_limits, limit_margin)
     if recording.command is not None:
         _check_conformed(recording, control_dt)
@@ -70,7 +70,10 @@ def conform_recording(
     )
 
 
-def _with_columns(recording: Recording, columns: list[int], joint_order: tuple[str, ...]) -> Recording:
+def with_columns(recording: Recording, columns: Sequence[int], joint_order: tuple[str, ...]) -> Recording:
+    """The same with these columns, of joints of these names."""
+    columns = list(columns)
+
     def take(array: np.ndarray | None) -> np.ndarray | None:
         return None if array is None else array[..., columns]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,20 @@ class PaceCfg:
             row = int(wrong[0])
             low, high = self.bounds_params[row].tolist()
             raise ValueError(f"bounds_params row {row} is ({low:g}, {high:g}), expected lower <= upper.")
+
+    def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
+        """The same for some of the joints, in their order here; only the base parameters, and no motion to record."""
+        kept, n = [i for i, name in enumerate(self.joint_order) if name in joint_names], len(self.joint_order)
+        rows = [group * n + i for group in range(len(PARAMETER_GROUPS)) for i in kept]
+        return replace(
+            self,
+            joint_order=tuple(self.joint_order[i] for i in kept),
+            bounds_params=self.bounds_params[[*rows, -1]],
+            excitation=None,
+            sample_params={},
+            effects=(),
+            extra_parameters=(),
+        )
 
 
 def make_bounds(

@@ -1,9 +1,12 @@
 """The identification environment."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pace_actuators import resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import mdp
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
@@ -81,3 +84,32 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         self.sim2real.effects = tuple(cfgs)
         for drive in self.scene.robot.actuators.values():
             drive.effects = tuple(cfgs)
+
+    def on_joints(self, joint_names: Sequence[str]) -> PaceSim2realEnvCfg:
+        """The same for some of the joints: the drives of the others, effects and terms of one's own are left out."""
+        robot, names = self.scene.robot, self.sim2real.joint_order
+        drives = {group: cfg.on_joints(names, joint_names) for group, cfg in robot.actuators.items()}
+        state = robot.init_state
+        kept = [name in joint_names for name in names]
+        state = dataclasses.replace(
+            state,
+            joint_pos=resolve_joint_values(state.joint_pos, names, field="joint_pos", default=0.0)[kept],
+            joint_vel=resolve_joint_values(state.joint_vel, names, field="joint_vel", default=0.0)[kept],
+        )
+        robot = dataclasses.replace(
+            robot,
+            actuators={group: cfg for group, cfg in drives.items() if cfg is not None},
+            init_state=state,
+        )
+        return dataclasses.replace(
+            self,
+            scene=dataclasses.replace(self.scene, robot=robot),
+            sim2real=self.sim2real.on_joints(joint_names),
+            actions=_actions(),
+            observations=_observations(),
+            terminations=_terminations(),
+            events={},
+            commands={},
+            rewards={},
+            curriculum={},
+        )
