@@ -117,7 +117,7 @@ def run_case(job: Job) -> dict[str, Any]:
     if true_effects and not job.case.background:
         same = set(true_effects) == set(final.model.effects)
         if not same:
-            follow = OwnMotion(problem=problem, candidates=candidate_effects()).follow
+            follow = OwnMotion(problem=problem, candidates=candidate_effects(), enough=found.data.floor).follow
             twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
             with_truth = _rms(validation_errors(twins, [final])[0])
         else:
@@ -132,7 +132,8 @@ def run_case(job: Job) -> dict[str, Any]:
         "absorbed": [effect.name for effect in found.absorbed],
         "explained": found.explained,
         "floor": float(found.data.floor.square().mean().sqrt()),
-        "ranking": ranking(outcome, problem.joint_names, found.verdict),
+        "shares": {effect.name: share for effect, share in found.shares.items()},
+        "ranking": ranking(outcome, problem.joint_names, found.verdict, list(found.shares)),
         "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
         "truth": truth["effects"],

@@ -162,6 +162,18 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     json.dumps(entries)
 
 
+def test_the_ranking_begins_with_the_largest_share():
+    rounds = [
+        Round(trials=[[make_trial(effect, 0, 2e-4)]], chosen=[effect], rivals=[[]], models={})
+        for effect in (GAIN, STRIBECK)
+    ]
+    outcome = outcome_of([1e-3], [3e-4], [GAIN, STRIBECK], rounds=rounds)
+    assert [e["effect"] for e in ranking(outcome, ["hip"])] == ["torque_gain", "stribeck_friction"]
+    by_share = [STRIBECK, GAIN]
+    assert [e["effect"] for e in ranking(outcome, ["hip"], order=by_share)] == ["stribeck_friction", "torque_gain"]
+    assert labels(outcome.final.model, ["hip"], by_share)[0] == "stribeck_friction"
+
+
 # ------------------------------------------------------------------ from a run's folder
 
 

@@ -104,6 +104,7 @@ def test_an_effect_that_leaves_little_once_its_size_may_differ_is_there_and_depe
         verdict="effect",
         explained=0.75,
         paying=["parallel_spring"],
+        shares={SPRING: 1.0},
     )
     assert summary_of(found, run.problem).endswith(told)
 
@@ -152,6 +153,7 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
         verdict="unknown",
         explained=0.75,
         paying=["parallel_spring"],
+        shares={SPRING: 1.0},
     )
     refits = []
 

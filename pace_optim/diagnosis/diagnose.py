@@ -20,6 +20,7 @@ from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.screening import absorbed_effects
 from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
+from pace_optim.diagnosis.shares import DOMINANT, shares
 from pace_optim.diagnosis.sharing import share
 from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, stand_ins, varying
 from pace_optim.diagnosis.trials import NEXT_FLOOR
@@ -43,8 +44,10 @@ class Findings:
     explained: float
     """Part of the error above the floor that the effects found explain."""
     paying: list[str]
-    """Effects of the final model, as ``fit.py --effects`` takes them: with the verdict ``unknown`` all that lower the
-    error, though they are not what is missing."""
+    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
+    ``unknown`` all that lower the error, though they are not what is missing."""
+    shares: dict[type[Effect], float]
+    """How much of what they explain is due to each, the largest first."""
 
     @property
     def added(self) -> list[str]:
@@ -107,7 +110,8 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         explained=found.explained,
         added=found.added,
         paying=found.paying,
-        ranking=ranking(found.outcome, problem.joint_names, found.verdict),
+        shares={effect.name: share for effect, share in found.shares.items()},
+        ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
         joints=_joints(found, problem),
         data=found.data.sentences,
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
@@ -164,8 +168,16 @@ def search_effects(
     decision, explained = verdict(outcome, data.floor)
     if decision != "unknown":
         keep_on(outcome, explained_joints(outcome, data.floor) & (decision == "effect"))
-    paying = labels(outcome.final.model, problem.joint_names)
-    return Findings(outcome=outcome, data=data, absorbed=absorbed, verdict=decision, explained=explained, paying=paying)
+    each = shares(outcome)
+    return Findings(
+        outcome=outcome,
+        data=data,
+        absorbed=absorbed,
+        verdict=decision,
+        explained=explained,
+        paying=labels(outcome.final.model, problem.joint_names, list(each)),
+        shares=each,
+    )
 
 
 def summary_of(found: Findings, problem: Problem) -> str:
@@ -188,12 +200,22 @@ def summary_of(found: Findings, problem: Problem) -> str:
         )
         return " ".join([text, *stand_ins(*about), *varying(*about)])
     summary = (
-        f"Missing: {', '.join(found.added)}. With it the validation error falls from {before:.3g} to {after:.3g} mrad "
+        f"{_missing(found)} With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
     if after > UNKNOWN_RATIO * floor:
         summary += " Something else is missing too, which no known effect explains."
     return " ".join([summary, *varying(*about)])
+
+
+def _missing(found: Findings) -> str:
+    """The effects found; where there are several, what is due to each, and whether one of them stands out."""
+    if len(found.added) < 2:
+        return f"Missing: {found.added[0]}."
+    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
+    if max(found.shares.values()) >= DOMINANT:
+        return f"Missing: {', '.join(parts)}."
+    return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
 
 
 def _ladder(found: Findings) -> list[dict]:

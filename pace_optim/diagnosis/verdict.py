@@ -69,10 +69,17 @@ def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
     outcome.final_errors = replace(errors, square=square)
 
 
-def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
-    """The effects found as ``fit.py --effects`` takes them."""
+def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
+    """The effects found as ``fit.py --effects`` takes them.
+
+    Args:
+        model: The model that has them.
+        joint_names: Its joints.
+        order: Which comes first; none keeps the model's order.
+    """
     result = []
-    for effect, has in zip(model.effects, model.has, strict=True):
+    for effect in order or model.effects:
+        has = model.has[model.effects.index(effect)]
         own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
         if not own:
             continue
@@ -86,13 +93,16 @@ def labels(model: JointModel, joint_names: Sequence[str]) -> list[str]:
     return result
 
 
-def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effect") -> list[dict[str, Any]]:
-    """Every effect that was refitted, those that were added first, then by what they explain.
+def ranking(
+    outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
+) -> list[dict[str, Any]]:
+    """Every effect that was refitted, those that were added first, then round by round by what they explain.
 
     Args:
         outcome: Where the search ended.
         joint_names: The joints.
         decision: The verdict; unless it is ``effect``, nothing counts as added.
+        order: Which of those added comes first; none keeps that of the rounds.
     """
     entries: list[dict[str, Any]] = []
     for depth, this in enumerate(outcome.rounds):
@@ -131,11 +141,13 @@ def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effec
                     "values": {joint_names[t.joint]: t.values for t in shown},
                 }
             )
+    names = [effect.name for effect in order]
     return sorted(
         entries,
         key=lambda e: (
-            e["round"],
             not e["added"],
+            names.index(e["effect"]) if e["added"] and names else 0,
+            e["round"],
             -e["validation_rmse_before"] / max(e["validation_rmse_after"], 1e-12),
         ),
     )

@@ -1,0 +1,80 @@
+"""How much of what was found together is due to each effect, and how it is told."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diagnoses import errors_of, joint_alone, with_effects
+
+from pace_actuators.effects import get_effect
+from pace_optim.diagnosis import some_joints
+from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.diagnose import Findings, summary_of
+from pace_optim.diagnosis.model import JointModel
+from pace_optim.diagnosis.shares import shares
+from pace_optim.diagnosis.verdict import labels
+
+STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A short chirp of one joint."""
+    return joint_alone()
+
+
+def findings(outcome, each):
+    floor = torch.tensor([1e-4])
+    return Findings(
+        outcome=outcome,
+        data=DataCheck(floor=floor, noise=floor, numerical=floor),
+        absorbed={},
+        verdict="effect",
+        explained=0.9,
+        paying=labels(outcome.final.model, ["servo"], list(each)),
+        shares=each,
+    )
+
+
+@pytest.mark.parametrize(
+    ("without", "expected", "said"),
+    [
+        ((9e-4, 2e-4), (0.964, 0.036), "Missing: stribeck_friction (96 %), quadratic_friction (4 %). With"),
+        ((2e-4, 9e-4), (0.964, 0.036), "Missing: quadratic_friction (96 %), stribeck_friction (4 %). With"),
+        ((0.5e-4, 2e-4), (1.0, 0.0), "Missing: quadratic_friction (100 %), stribeck_friction (0 %). With"),
+    ],
+)
+def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, monkeypatch, without, expected, said):
+    base, values = JointModel.base(bench.problem), bench.truth_values
+    final = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]))
+    after = {STRIBECK: errors_of(without[0]), QUADRATIC: errors_of(without[1])}
+    monkeypatch.setattr(some_joints, "fit_coarse_to_fine", lambda _, starts: starts)
+    monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [after[m.tried] for m in models])
+    outcome = SimpleNamespace(
+        problem=bench.twins,
+        final=final,
+        final_errors=errors_of(1e-4),
+        base_errors=errors_of(1e-3),
+        unevenness=torch.zeros(2, 1),
+    )
+    each = shares(outcome)
+    assert list(each.values()) == pytest.approx(expected, abs=1e-3)
+    found = findings(outcome, each)
+    assert summary_of(found, bench.problem).startswith(said)
+    assert shares(SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [-0.2])))) == {GAIN: 1.0}
+
+
+def test_no_name_is_claimed_where_none_dominates(bench):
+    base, values = JointModel.base(bench.problem), bench.truth_values
+    effects = ((STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]), (GAIN, [True], [-0.1]))
+    outcome = SimpleNamespace(
+        final=with_effects(base, values, *effects),
+        final_errors=errors_of(1e-4),
+        base_errors=errors_of(1e-3),
+        unevenness=torch.zeros(3, 1),
+    )
+    found = findings(outcome, {QUADRATIC: 0.4, GAIN: 0.35, STRIBECK: 0.25})
+    assert summary_of(found, bench.problem).startswith(
+        "Missing: several effects, none of which dominates: quadratic_friction (40 %), torque_gain (35 %), "
+        "stribeck_friction (25 %). With"
+    )
