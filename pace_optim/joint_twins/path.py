@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 import torch
 
-from pace_actuators.effects import EffectCfg, get_effect, probe_points
+from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
+from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem import Problem
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
-    from pace_envs.articulation import Articulation
+    from pace_optim.rollout import Rollout
 
 _STEP = 1e-4
 """Change of a position for a derivative [rad]."""
@@ -31,6 +32,20 @@ class Feel:
     """Rigid-body inertia, without armature [kg m²]."""
     torque: torch.Tensor
     """Torque of gravity and of the other joints' motion [N m]."""
+    load: torch.Tensor
+    """The same without what the other joints' accelerations do: what a robot's drives are told of their load [N m]."""
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Feel:
+        """The same change of each."""
+        return Feel(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
+
+    def less(self, other: Feel, times: torch.Tensor) -> Feel:
+        """This less a multiple of another."""
+        return Feel(
+            inertia=self.inertia - times * other.inertia,
+            torque=self.torque - times * other.torque,
+            load=self.load - times * other.load,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,15 +85,12 @@ class ReferencePath:
         return self._part((slice(None), list(recordings)))
 
     def _part(self, index: tuple, **changes: Any) -> ReferencePath:
-        def part(feel: Feel) -> Feel:
-            return Feel(inertia=feel.inertia[index], torque=feel.torque[index])
-
         return replace(
             self,
             position=self.position[index],
-            feel=part(self.feel),
+            feel=self.feel.map(lambda each: each[index]),
             stiffness=self.stiffness[index],
-            model_effects={key: part(feel) for key, feel in self.model_effects.items()},
+            model_effects={key: feel.map(lambda each: each[index]) for key, feel in self.model_effects.items()},
             **changes,
         )
 
@@ -91,8 +103,9 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
         physical: The candidate's physical parameters, (size,).
         model_effects: Effects on the rigid-body model whose influence is wanted.
     """
+    problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = problem.evaluator().rollout(1)
-    rollout.start(physical[None], problem.dataset.sampled)
+    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
     robot, positions, velocities = rollout.robot, [], []
     for _ in rollout.simulated(rollout.duration_steps):
         positions.append(robot.data.joint_pos.clone())
@@ -100,16 +113,17 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
     q, v = torch.stack(positions), torch.stack(velocities)
     middle_q, middle_v = 0.5 * (q[:-1] + q[1:]), 0.5 * (v[:-1] + v[1:])
     motion = (middle_q, middle_v, (v[1:] - v[:-1]) / problem.control_dt)
-    written = _take_off(robot)
     models = _models(rollout.env)
     columns = robot.dof_columns.numpy()
-    feel = _feel(models, columns, *motion)
+    whole = feel = _feel(models, columns, *motion)
     stiffness = _stiffness(models, columns, problem, *motion)
     changes = {}
     for name in model_effects:
         for parameter in get_effect(name).parameters:
-            key = name, parameter.name
-            changes[key] = _change(problem, columns, *key, written.get(key), motion, feel)
+            now = torch.tensor(list(values[f"{name}.{parameter.name}"].values()), dtype=torch.float64)
+            change = _change(problem, rollout, name, parameter.name, now, motion, whole)
+            feel = feel.less(change, now)  # each twin has its own part of the effect itself; its neighbours' stays
+            changes[name, parameter.name] = change
     rollout.env.close()
     return ReferencePath(
         position=q,
@@ -121,19 +135,20 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
     )
 
 
-def _take_off(robot: Articulation) -> dict[tuple[str, str], torch.Tensor]:
-    """Take effects off the rigid bodies; what they were, (n,) by (effect, parameter)."""
-    written: dict[tuple[str, str], torch.Tensor] = {}
-    for actuator in robot.actuators.values():
-        for effect in [] if actuator.effects is None else actuator.effects.effects:
-            if not effect.overrides("write_model"):
-                continue
-            for parameter in effect.parameters:
-                values = written.setdefault((effect.name, parameter.name), torch.zeros(robot.num_joints).double())
-                values[actuator.joint_indices] = getattr(effect, parameter.name)[0]
-    for effect_name, parameter_name in written:
-        robot.write_effect_parameter_to_sim(effect_name, parameter_name, torch.zeros(robot.num_envs, robot.num_joints))
-    return written
+def _on_all_joints(
+    problem: Problem, physical: torch.Tensor, effects: Sequence[str]
+) -> tuple[Problem, dict[str, dict[str, float]]]:
+    """The problem with these effects on all joints, and the same candidate there: null where it did not have them."""
+    names, values = problem.joint_names, problem.space.to_dict(physical)
+    had = {cfg.effect_class.name: cfg for cfg in effect_cfgs(problem.env_cfg.sim2real.effects)}
+    for effect in effects:
+        joints = had[effect].joints(names) if effect in had else []
+        for parameter in get_effect(effect).parameters:
+            own = values.get(key := f"{effect}.{parameter.name}", {})
+            null = parameter.start if parameter.null is None else parameter.null
+            values[key] = {j: own.get(j, own.get(GLOBAL, null)) if j in joints else null for j in names}
+    others = [cfg for name, cfg in had.items() if name not in effects]
+    return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
 def _models(env: ManagerBasedEnv) -> list[mujoco.MjModel]:
@@ -155,7 +170,7 @@ def _feel(
     """Inertia of each joint, and the torque that the rest of the robot leaves on it, -(bias_j + Σ_{k≠j} M_jk a_k)."""
     steps, count, n = q.shape
     own_block = np.ix_(columns, columns)
-    inertia, torque = np.empty((steps, count, n)), np.empty((steps, count, n))
+    inertia, torque, load = (np.empty((steps, count, n)) for _ in range(3))
     for r, model in enumerate(models):
         data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
         data.qpos[:] = model.qpos0
@@ -169,8 +184,9 @@ def _feel(
             own = mass[own_block]
             diagonal = own.diagonal()
             inertia[k, r] = diagonal
-            torque[k, r] = -(data.qfrc_bias[columns] + own @ accelerations[k] - diagonal * accelerations[k])
-    return Feel(inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque))
+            load[k, r] = -data.qfrc_bias[columns]
+            torque[k, r] = load[k, r] - (own @ accelerations[k] - diagonal * accelerations[k])
+    return Feel(inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load))
 
 
 def _stiffness(
@@ -186,9 +202,7 @@ def _stiffness(
     q, v, a = q[some], v[some], a[some]
     at = _feel(models, columns, q, v, a)
     result = torch.zeros_like(q)
-    names = problem.joint_names
-    for i in range(max(len(tree) for tree in problem.trees)):
-        moved = [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
+    for moved in _one_of_each_tree(problem):
         shifted = q.clone()
         shifted[..., moved] += _STEP
         there = _feel(models, columns, shifted, v, a)
@@ -197,32 +211,37 @@ def _stiffness(
     return result.repeat_interleave(_STIFFNESS_EVERY, dim=0)
 
 
+def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:
+    """Joints that can be changed at once because none moves another, until all have been."""
+    names = problem.joint_names
+    for i in range(max(len(tree) for tree in problem.trees)):
+        yield [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
+
+
 def _change(
     problem: Problem,
-    columns: np.ndarray,
+    rollout: Rollout,
     effect: str,
     parameter: str,
-    written: torch.Tensor | None,
+    now: torch.Tensor,
     motion: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    base: Feel,
+    whole: Feel,
 ) -> Feel:
     """What a unit of a parameter of an effect on the model changes of each joint's own feel.
 
-    Measured between null and the values that the effect has (n,), or where it has none, a probe's.
+    Measured between what the joint has, ``now`` (n,), and null, or where it has null, a probe.
     """
-    probe = torch.full((len(problem.joint_names),), probe_points(get_effect(effect))[0][parameter], dtype=torch.float64)
-    value = probe if written is None else torch.where(written == 0, probe, written)
-    inertia, torque = torch.zeros_like(base.inertia), torch.zeros_like(base.torque)
-    names = problem.joint_names
-    changed = problem.with_effects([EffectCfg(effect=effect)])
-    rollout = changed.evaluator().rollout(1)
-    for i in range(max(len(tree) for tree in problem.trees)):
-        moved = [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
-        values = torch.zeros(rollout.env.num_envs, len(names), dtype=torch.float64)
-        values[:, moved] = value[moved]
-        rollout.robot.write_effect_parameter_to_sim(effect, parameter, values)
-        there = _feel(_models(rollout.env), columns, *motion)
-        inertia[..., moved] = ((there.inertia - base.inertia) / value)[..., moved]
-        torque[..., moved] = ((there.torque - base.torque) / value)[..., moved]
-    rollout.env.close()
-    return Feel(inertia=inertia, torque=torque)
+    robot = rollout.robot
+    probe = torch.full_like(now, probe_points(get_effect(effect))[0][parameter])
+    other = torch.where(now == 0, probe, 0.0)
+    result = whole.map(torch.zeros_like)
+    for moved in _one_of_each_tree(problem):
+        values = now.clone()
+        values[moved] = other[moved]
+        robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
+        there = _feel(_models(rollout.env), robot.dof_columns.numpy(), *motion)
+        for field in ("inertia", "torque", "load"):
+            change = (getattr(there, field) - getattr(whole, field)) / (other - now)
+            getattr(result, field)[..., moved] = change[..., moved]
+    robot.write_effect_parameter_to_sim(effect, parameter, now.expand(robot.num_envs, -1))
+    return result

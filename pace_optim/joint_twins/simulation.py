@@ -14,9 +14,10 @@ from pace_optim.joint_twins.path import ReferencePath
 class TwinSimulation(Simulation):
     """Stands in for :class:`Simulation`: environment c * R + r is on recording r.
 
-    Integrated by the trapezoidal rule, Coulomb friction exactly (a joint sticks where friction can hold it):
+    Integrated by the trapezoidal rule, Coulomb friction exactly (it turns within a step, where the speed passes zero,
+    and a joint sticks where friction can hold it):
 
-        (M + J + h d/2 + h D) (v₊ - v) = h (τ + f + K (q + h v/2 - q_ref) - d v - D v)        then v₊ towards 0 by h F
+        (M + J + h d/2 + h D) (v₊ - v) = h (τ + f + K (q + h v/2 - q_ref) - d v - D v - F sgn v)
         q₊ = q + h (v + v₊)/2
 
     with J armature, d viscous and F Coulomb friction, D what must act on v₊.
@@ -52,11 +53,14 @@ class TwinSimulation(Simulation):
         self._steps_per_interval = round(path.control_dt / cfg.dt)
         # one tensor an interval: taking them out of a list costs nothing at each step
         self._inertia, self._torque = path.feel.inertia.unbind(), path.feel.torque.unbind()
-        self._stiffness, self._position = path.stiffness[: self._intervals].unbind(), path.position.unbind()
-        parts = [(part + 0.5) / self._steps_per_interval for part in range(self._steps_per_interval)]
-        self._middle = [torch.lerp(path.position[:-1], path.position[1:], part).unbind() for part in parts]
+        self._stiffness = path.stiffness[: self._intervals].unbind()
+        parts = [part / self._steps_per_interval for part in range(self._steps_per_interval)]
+        middle = 0.5 / self._steps_per_interval
+        self._middle = [_between(path.position, part + middle).unbind() for part in parts]
+        self._begin = [_between(path.position, part).unbind() for part in parts]
+        load = _at_instants(path.feel.load)
+        self._load = [_between(load, part).unbind() for part in parts]
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
-        self.forward()
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Take over the parameters of an effect on the model, of joints with these degrees of freedom."""
@@ -71,8 +75,11 @@ class TwinSimulation(Simulation):
     @property
     def qfrc_bias(self) -> torch.Tensor:  # type: ignore[override]
         """Less the torque of gravity and of the other joints, (num_envs, nv) [N m]."""
-        load, stiffness, reference = self._felt
-        load = torch.addcmul(load, stiffness, self._joints(self.qpos) - reference)
+        k, part = self._interval()
+        load = self._load[part][k]
+        for key, values in self._model_values.items():
+            load = load + values.view(self._shape) * self.path.model_effects[key].load[k]
+        load = torch.addcmul(load, self._stiffness[k], self._joints(self.qpos) - self._begin[part][k])
         if self._as_in_model:
             return load.neg_().view(self.qvel.shape)
         result = torch.zeros_like(self.qvel)
@@ -105,8 +112,7 @@ class TwinSimulation(Simulation):
     def step(self) -> None:
         """Advance by ``dt``."""
         self._constants_changed = False
-        h, (k, part) = self.cfg.dt, divmod(self._steps, self._steps_per_interval)
-        k = min(k, self._intervals - 1)
+        h, (k, part) = self.cfg.dt, self._interval()
         q, v = self._joints(self.qpos), self._joints(self.qvel)
         inertia, torque = self._feel(k)
         stiffness = self._stiffness[k]
@@ -118,17 +124,16 @@ class TwinSimulation(Simulation):
             damping = damping + implicit
         bent = torch.add(q, v, alpha=0.5 * h).sub_(self._middle[part][k]).mul_(stiffness)
         push = bent.add_(self._joints(self.qfrc_applied)).add_(torque).addcmul_(damping, v, value=-1)
-        free = torch.addcdiv(v, push, resisting, value=h)
+        pushed = torch.div(push, resisting).mul_(h)
         stop = torch.div(self._joints(self.expand("dof_frictionloss")), resisting).mul_(h)
-        new = free - torch.clamp(free, -stop, stop)
+        new = _with_friction(v, pushed, stop)
         self._set(self.qpos, torch.add(q, v, alpha=0.5 * h).add_(new, alpha=0.5 * h))
         self._set(self.qvel, new)
-        self._felt = torque, stiffness, self._position[k + 1]
         self._steps += 1
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as :meth:`Simulation.felt_link`."""
-        k = min(self._steps // self._steps_per_interval, self._intervals - 1)
+        k, _ = self._interval()
         rows = (self.num_envs // self._shape[1], -1, -1)
         inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)
         stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)
@@ -138,13 +143,11 @@ class TwinSimulation(Simulation):
         return inertia, -stiffness, inertia * self._stands_alone[columns]
 
     def forward(self, env_ids: EnvIds = None) -> None:
-        """What the joints feel at the start."""
-        self._felt = self._feel(0)[1], self._stiffness[0], self._position[0]
+        """Nothing to compute: what joints feel follows from the instant."""
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Back to the beginning of the reference."""
         self._steps = 0
-        self.forward()
 
     def close(self) -> None:
         """Nothing to release."""
@@ -160,6 +163,11 @@ class TwinSimulation(Simulation):
             self.model = self._compile(spec)
         self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in names])
         self._stands_alone = torch.zeros(self.model.nv, dtype=torch.bool).index_put((self._columns,), alone)
+
+    def _interval(self) -> tuple[int, int]:
+        """The present control step, and which physics step of it begins; both stay where the reference ends."""
+        k, part = divmod(self._steps, self._steps_per_interval)
+        return (k, part) if k < self._intervals else (self._intervals - 1, self._steps_per_interval - 1)
 
     def _feel(self, k: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Inertia and torque in an interval, (candidates or 1, recordings, n)."""
@@ -184,3 +192,29 @@ class TwinSimulation(Simulation):
             field.copy_(value.view(field.shape))
         else:
             field[:, self._columns] = value.view(len(field), -1)
+
+
+def _between(at_instants: torch.Tensor, part: float) -> torch.Tensor:
+    """Values (T, …) at a part of each interval, (T - 1, …)."""
+    return torch.lerp(at_instants[:-1], at_instants[1:], part)
+
+
+def _at_instants(in_intervals: torch.Tensor) -> torch.Tensor:
+    """Values in the middle of intervals (T - 1, …) at their ends, (T, …)."""
+    inner = 0.5 * (in_intervals[:-1] + in_intervals[1:])
+    first, last = (1.5 * in_intervals[a] - 0.5 * in_intervals[b] for a, b in ((0, 1), (-1, -2)))
+    return torch.cat([first[None], inner, last[None]])
+
+
+def _with_friction(speed: torch.Tensor, pushed: torch.Tensor, stop: torch.Tensor) -> torch.Tensor:
+    """Speed after a step under a constant push and Coulomb friction, which turns where the speed passes zero.
+
+    Args:
+        speed: Before the step.
+        pushed: What the push alone adds to it.
+        stop: What friction alone can take from it.
+    """
+    onward = speed + pushed - torch.copysign(stop, speed)
+    from_rest = pushed - torch.clamp(pushed, -stop, stop)
+    left = (onward / (onward - speed)).nan_to_num_(nan=1.0)  # part of the step after the speed has passed zero
+    return torch.where(onward * speed > 0, onward, left * from_rest)

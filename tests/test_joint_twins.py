@@ -1,0 +1,49 @@
+"""Joints simulated alone along a reference: friction at reversals, and the load that drives are told of."""
+
+import pytest
+import torch
+from problems import ANYMAL, env_cfg, legs_chirp, make_problem, record
+
+from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.joint_twins.simulation import _with_friction
+
+TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.0, "delay": 2.0}
+
+
+def test_friction_turns_where_the_speed_passes_zero():
+    """As a thousand small steps under the same push, each with friction against the speed that it ends with."""
+    generator = torch.Generator().manual_seed(0)
+    speed, pushed = torch.randn(2, 5000, dtype=torch.float64, generator=generator)
+    stop = torch.rand(5000, dtype=torch.float64, generator=generator)
+    speed[:200] = 0.0
+    stop[100:300] = 0.0
+    expected, parts = speed.clone(), 1000
+    for _ in range(parts):
+        free = expected + pushed / parts
+        expected = free - torch.clamp(free, -stop / parts, stop / parts)
+    assert float((_with_friction(speed, pushed, stop) - expected).abs().max()) < 4 / parts
+    at_once = speed + pushed - torch.clamp(speed + pushed, -stop, stop)
+    assert float((at_once - expected).abs().max()) > 0.5  # friction of the new sign all along
+
+
+def test_a_joint_without_speed_push_and_friction_stays():
+    zero = torch.zeros(1, dtype=torch.float64)
+    assert _with_friction(zero, zero, zero).tolist() == [0.0]
+    assert _with_friction(zero, zero + 0.5, zero + 0.5).tolist() == [0.0]
+    assert _with_friction(zero - 1.0, zero + 1.0, zero).tolist() == [0.0]
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.3])
+def test_friction_under_load_is_what_it_is_on_the_robot(payload):
+    """Its drives are told of weight, and not of what their neighbours' accelerations do."""
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.5), TRUTH, cfg=cfg), cfg=cfg)
+    whole = problem.with_effects(["load_dependent_friction", "payload"]).with_physics_dt(0.00025)
+    values = {**TRUTH, "load_dependent_friction.coefficient": 0.1, "payload.ratio": payload}
+    physical = whole.space.from_dict(values)
+    path = reference_path(whole, physical, ["payload"])
+    twins = twin_problem(whole, path).with_physics_dt(0.00125)
+    rollout = twins.evaluator().rollout(1)
+    rollout.start(physical[None], twins.dataset.sampled)
+    moved = torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
+    assert float((moved - path.position).abs().max()) < 3e-4
