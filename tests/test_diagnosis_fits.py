@@ -9,7 +9,7 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import descent, search
+from pace_optim.diagnosis import descent, own_motion, search
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import check_data
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
@@ -149,6 +149,28 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     assert float(fitted.score.sqrt()) < 1e-4 and fitted.jacobian is not None
     again, same = follow(along, fitted)
     assert again is along and same is fitted  # it has not moved
+
+
+@pytest.mark.parametrize(
+    ("scores", "times"),
+    [
+        ([[1.0, 1.0]] * 4, 2),  # the second motion gains nothing
+        ([[4.0, 1.0], [1.0, 1.0], [0.9, 0.95], [0.1, 0.1]], 3),
+        ([[8.0, 1.0], [4.0, 1.0], [2.0, 1.0], [1.0, 1.0], [0.5, 1.0]], 4),  # at most
+        ([[0.2, 0.2]] * 4, 1),  # near the floor at once
+    ],
+)
+def test_the_motion_is_renewed_as_long_as_that_pays(monkeypatch, scores, times):
+    paths, left = [], iter(scores)
+    monkeypatch.setattr(OwnMotion, "_path", lambda *_: paths.append(None))
+    monkeypatch.setattr(own_motion, "twin_problem", lambda *_: None)
+    monkeypatch.setattr(
+        own_motion, "fit_side_by_side", lambda *_, **__: [SimpleNamespace(score=torch.tensor(next(left)))]
+    )
+    robot = SimpleNamespace(trees=[["hip", "knee"]])
+    follow = OwnMotion(problem=robot, candidates=[], enough=torch.tensor([0.5, 0.5])).follow
+    follow(None, SimpleNamespace(score=torch.tensor([40.0, 40.0])))
+    assert len(paths) == times
 
 
 def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench):
