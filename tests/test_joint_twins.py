@@ -47,3 +47,12 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     rollout.start(physical[None], twins.dataset.sampled)
     moved = torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
     assert float((moved - path.position).abs().max()) < 3e-4
+
+
+def test_a_joint_s_own_payload_is_that_of_its_link_alone():
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.05), TRUTH, cfg=cfg), cfg=cfg)
+    path = reference_path(problem, problem.space.from_dict(TRUTH), ["payload"])
+    twice, whole = path.model_effects["payload", "ratio"].inertia, path.feel.inertia
+    assert torch.allclose(twice[..., 2], whole[..., 2])  # the shank is all that the knee moves
+    assert bool((twice[..., 0] < 0.5 * whole[..., 0]).all())  # the hip moves thigh and shank too

@@ -84,6 +84,15 @@ def test_they_move_as_they_do_among_all(legs, training):
     assert torch.equal(alone, whole[..., list(CHOSEN)])
 
 
+def test_their_bounds_are_their_own():
+    cfg = legs_cfg().sim2real
+    cfg.bounds_params = torch.arange(2.0 * (4 * N + 1)).view(-1, 2)
+    part = cfg.on_joints([cfg.joint_order[8], cfg.joint_order[1]])
+    assert part.joint_order == (cfg.joint_order[1], cfg.joint_order[8])
+    rows = [group * N + joint for group in range(4) for joint in (1, 8)]
+    assert torch.equal(part.bounds_params, cfg.bounds_params[[*rows, 4 * N]])
+
+
 def test_all_joints_are_the_problem_itself(legs):
     part, now = SomeJoints(these(*range(N))), with_effects(JointModel.base(legs.problem), legs.values)
     assert part.of_problem(legs.twins) is legs.twins and part.of_fit(now) is now

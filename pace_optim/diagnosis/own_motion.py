@@ -22,7 +22,7 @@ _TIMES = 4
 """At most: what was fitted along the motion of a wrong model gives a better one, and so on."""
 _ITERATIONS = 6
 """Of the fit along each."""
-_GAIN = 0.8
+_GAIN = 0.9
 """The motion is renewed again where it lowered the squared error to less than this part."""
 
 

@@ -67,7 +67,6 @@ class SomeJoints:
         for effect in own.model.effects:
             model = model.with_effect(effect, torch.zeros_like(self.which))
         has, lower, upper = model.has.clone(), model.lower.clone(), model.upper.clone()
-        has[:, self.which] = False
         x = torch.cat([now.x, torch.zeros(len(now.x), model.size - now.model.size, dtype=now.x.dtype)], dim=1)
         places = list(range(len(BASE)))
         for row, effect in enumerate(own.model.effects):
