@@ -85,7 +85,8 @@ def found(monkeypatch, *joints, follow=stays):
     )
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING]
-    outcome = search.add_effects(SimpleNamespace(), base, candidates, 5 * floor, floor, 3, follow=follow)
+    problem = SimpleNamespace(on_joints=lambda _: SimpleNamespace())
+    outcome = search.add_effects(problem, base, candidates, 5 * floor, floor, 3, follow=follow)
     assert outcome.final_errors.mse.sqrt().tolist() == pytest.approx(
         [world.rmse(j, effects) for j, effects in enumerate(world.effects_of(outcome.final))]
     )
@@ -137,3 +138,10 @@ def test_nothing_is_looked_for_where_an_effect_explains_what_is_missing(monkeypa
     table = mrad({(MOUNT,): 0.25, (ELASTICITY,): 0.3, (ELASTICITY, GAIN): 0.1})
     effects, rounds = found(monkeypatch, table)
     assert effects == [{"mount_compliance"}] and rounds == 2
+
+
+def test_beside_a_joint_far_from_the_floor_nothing_is_sought_on_one_near_it(monkeypatch):
+    far = mrad({(MOUNT,): 20.0, (ELASTICITY,): 0.1, (GAIN,): 39.0, (SPRING,): 20.0})
+    near = mrad({(): 0.12, (MOUNT,): 0.12, (ELASTICITY,): 0.12, (GAIN,): 0.09, (SPRING,): 0.12})
+    assert found(monkeypatch, far, near)[0] == [{"joint_elasticity"}, set()]
+    assert found(monkeypatch, near)[0] == [{"torque_gain"}]

@@ -23,7 +23,6 @@ from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.shares import DOMINANT, shares
 from pace_optim.diagnosis.sharing import share
 from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, stand_ins, varying
-from pace_optim.diagnosis.trials import NEXT_FLOOR
 from pace_optim.diagnosis.verdict import explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
@@ -162,7 +161,7 @@ def search_effects(
     base.model = replace(base.model, barred=absorbed)
 
     floor = FLOOR_MARGIN * data.floor
-    follow = OwnMotion(problem=problem, candidates=candidates, enough=NEXT_FLOOR * floor, say=say).follow
+    follow = OwnMotion(problem=problem, candidates=candidates, enough=floor, say=say).follow
     outcome = add_effects(twins, base, candidates, effort, floor, max_effects, say, follow)
     share(outcome)
     decision, explained = verdict(outcome, data.floor)
