@@ -155,7 +155,7 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     ("scores", "times"),
     [
         ([[1.0, 1.0]] * 4, 2),  # the second motion gains nothing
-        ([[4.0, 1.0], [1.0, 1.0], [0.9, 0.95], [0.1, 0.1]], 3),
+        ([[4.0, 1.0], [1.0, 1.0], [0.95, 0.97], [0.1, 0.1]], 3),
         ([[8.0, 1.0], [4.0, 1.0], [2.0, 1.0], [1.0, 1.0], [0.5, 1.0]], 4),  # at most
         ([[0.2, 0.2]] * 4, 1),  # near the floor at once
     ],
