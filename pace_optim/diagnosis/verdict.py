@@ -93,16 +93,13 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
     return result
 
 
-def ranking(
-    outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
-) -> list[dict[str, Any]]:
+def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effect") -> list[dict[str, Any]]:
     """Every effect that was refitted, those that were added first, then round by round by what they explain.
 
     Args:
         outcome: Where the search ended.
         joint_names: The joints.
         decision: The verdict; unless it is ``effect``, nothing counts as added.
-        order: Which of those added comes first; none keeps that of the rounds.
     """
     entries: list[dict[str, Any]] = []
     for depth, this in enumerate(outcome.rounds):
@@ -141,12 +138,10 @@ def ranking(
                     "values": {joint_names[t.joint]: t.values for t in shown},
                 }
             )
-    names = [effect.name for effect in order]
     return sorted(
         entries,
         key=lambda e: (
             not e["added"],
-            names.index(e["effect"]) if e["added"] and names else 0,
             e["round"],
             -e["validation_rmse_before"] / max(e["validation_rmse_after"], 1e-12),
         ),
