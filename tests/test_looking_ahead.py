@@ -26,7 +26,8 @@ class World:
         self.joints, self.rounds = joints, 0
 
     def rmse(self, joint, effects):
-        return 1e-3 * self.joints[joint].get(frozenset(effects), 40.0 / (1 + len(effects)))
+        table = self.joints[joint]() if callable(self.joints[joint]) else self.joints[joint]
+        return 1e-3 * table.get(frozenset(effects), 40.0 / (1 + len(effects)))
 
     def effects_of(self, now):
         model = now.model
@@ -39,8 +40,9 @@ class World:
             result.append(BlockErrors(square=torch.tensor([squares]).double(), weight=torch.ones(1).double()))
         return result
 
-    def try_effects(self, _, now, errors, effects, effort, floor, say, rough):
+    def try_effects(self, problem, now, errors, effects, effort, floor, say, rough):
         self.rounds += 1
+        joints = getattr(problem, "joints", range(len(self.joints)))
         trials, models = [], {}
         for effect in effects:
             values = torch.zeros(now.model.num_joints, len(effect.parameters)).double()
@@ -51,7 +53,7 @@ class World:
         for j, has in enumerate(self.effects_of(now)):
             before = float(errors.mse[j].sqrt())
             own = [e for e in effects if now.model.may_get(e)[j]]
-            after = {e: self.rmse(j, [*has, e]) for e in own}
+            after = {e: self.rmse(joints[j], [*has, e]) for e in own}
             trials.append([make_trial(e, j, after[e], after[e] * 1.2 < before) for e in sorted(own, key=after.get)])
         chosen = [next((t.effect for t in each if t.significant), None) for each in trials]
         return Round(trials=trials, chosen=chosen, rivals=[[] for _ in trials], models=models)
@@ -85,7 +87,7 @@ def found(monkeypatch, *joints, follow=stays):
     )
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING]
-    problem = SimpleNamespace(on_joints=lambda _: SimpleNamespace())
+    problem = SimpleNamespace(on_joints=lambda joints: SimpleNamespace(joints=joints))
     outcome = search.add_effects(problem, base, candidates, 5 * floor, floor, 3, follow=follow)
     assert outcome.final_errors.mse.sqrt().tolist() == pytest.approx(
         [world.rmse(j, effects) for j, effects in enumerate(world.effects_of(outcome.final))]
@@ -145,3 +147,32 @@ def test_beside_a_joint_far_from_the_floor_nothing_is_sought_on_one_near_it(monk
     near = mrad({(): 0.12, (MOUNT,): 0.12, (ELASTICITY,): 0.12, (GAIN,): 0.09, (SPRING,): 0.12})
     assert found(monkeypatch, far, near)[0] == [{"joint_elasticity"}, set()]
     assert found(monkeypatch, near)[0] == [{"torque_gain"}]
+
+
+def beside_a_neighbour(monkeypatch, before, after):
+    """A joint beside one that needs an elasticity, with its own table before and after the neighbour has it."""
+    has_moved = []
+
+    def follow(problem, now):
+        has_moved.append(True)
+        return stays(problem, now)
+
+    neighbour = mrad({(MOUNT,): 20.0, (ELASTICITY,): 0.1, (GAIN,): 39.0, (SPRING,): 20.0})
+    return found(monkeypatch, neighbour, lambda: mrad(after if has_moved else before), follow=follow)
+
+
+def test_what_a_neighbour_hid_is_found_once_the_neighbour_is_explained(monkeypatch):
+    nothing_helps = {(): 1.7, **{(effect,): 1.7 for effect in (MOUNT, ELASTICITY, GAIN, SPRING)}}
+    effects, rounds = beside_a_neighbour(monkeypatch, nothing_helps, {**nothing_helps, (GAIN,): 0.1})
+    assert effects == [{"joint_elasticity"}, {"torque_gain"}] and rounds == 2
+
+
+def test_a_joint_that_nothing_explains_is_tried_no_more_than_twice(monkeypatch):
+    nothing_helps = {(): 1.7, **{(effect,): 1.7 for effect in (MOUNT, ELASTICITY, GAIN, SPRING)}}
+    assert beside_a_neighbour(monkeypatch, nothing_helps, nothing_helps) == ([{"joint_elasticity"}, set()], 2)
+
+
+def test_near_the_floor_nothing_is_sought_a_second_time(monkeypatch):
+    near = {(): 0.25, **{(effect,): 0.25 for effect in (MOUNT, ELASTICITY, GAIN, SPRING)}}
+    effects, rounds = beside_a_neighbour(monkeypatch, near, {**near, (GAIN,): 0.1})
+    assert effects == [{"joint_elasticity"}, set()] and rounds == 1

@@ -102,9 +102,12 @@ class _Search:
     def tried(self, branch: _Branch) -> Round | None:
         """What could come next; ``None`` if there is nothing to try."""
         depth = len(branch.rounds)
-        found_so_far = [[r.chosen[j] is not None for r in branch.rounds] for j in range(len(self.floor))]
-        open_joints = torch.tensor([all(each) for each in found_so_far])
+        missed = torch.zeros(len(self.floor))
+        for each in branch.rounds:
+            missed += torch.tensor([chosen is None for chosen in each.chosen])
         above = branch.errors.mse.sqrt() / self.floor
+        # how the neighbours moved may have hidden what is missing: once they are explained, a second try
+        open_joints = missed <= (above > LOOK_AHEAD)
         # beside a joint that is far from the floor, another's last tenths may come from how that one moves
         alike = depth == 0 and bool((above <= LOOK_AHEAD).all())
         open_joints &= above > (1.0 if alike else NEXT_FLOOR)
