@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
 from pace_optim.assessment import assess
-from pace_optim.jacobian import colour
+from pace_optim.jacobian import colour, jacobian, perturbed
 from pace_optim.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.parameter_space import ParameterSpace
 from pace_optim.problem import Problem
@@ -21,9 +21,12 @@ DISAGREEMENT = 4.0
 """Recordings disagree on a parameter that differs by this many standard deviations of the difference."""
 _SMALLEST_PART = 0.01
 """Differences below this part of the bound range are not worth a sentence."""
+_GAINS = ("stiffness", "damping")
 _GAIN_RANGE = 0.6
 _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
+_GAIN_REFITS = 2
+"""Recordings refitted with gains of their own."""
 _REFINE = LeastSquaresCfg(max_iteration=12)
 
 
@@ -148,15 +151,13 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
         Sentences, and the simulated steps that it took.
     """
     best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
-    steps = 0
-    for r in range(problem.dataset.num_recordings):
-        extra = [_gain_parameter(problem, r, name) for name in ("stiffness", "damping")]
-        space = ParameterSpace((*problem.space.parameters, *extra))
-        start = torch.cat([x, torch.zeros(len(extra), dtype=torch.float64)])
-        fit = _fit_from(replace(problem, space=space), start)
+    promising, steps = _by_promise(problem, x)
+    for r in promising[:_GAIN_REFITS]:
+        wrong, start = _with_gains(problem, x, [r])
+        fit = _fit_from(wrong, start)
         steps += fit.simulated_steps
-        physical = space.to_physical(fit.x)
-        found = {p.name: (float(physical[space[p.name]]), float(fit.uncertainty.std[space[p.name]][0])) for p in extra}
+        space, physical = wrong.space, wrong.space.to_physical(fit.x)
+        found = {name: (float(physical[space[name]]), float(fit.uncertainty.std[space[name]][0])) for name in _GAINS}
         if best is None or fit.score < best[0]:
             best = (fit.score, r, found)
     if best is None or score < _GAIN_PAYS**2 * best[0]:
@@ -164,8 +165,7 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
     _, r, found = best
     name = problem.dataset.recordings[r].name
     sentences = []
-    for key, (value, error) in found.items():
-        field_name = key.split(":")[0]
+    for field_name, (value, error) in found.items():
         if abs(value) > _GAIN_SMALLEST and abs(value) > DISAGREEMENT * error:  # false where error is NaN: at its bound
             nominal = float(np.mean(_nominal_gain(problem, r, field_name).numpy()))
             direction = "higher" if value > 0 else "lower"
@@ -190,15 +190,50 @@ def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     return result
 
 
-def _gain_parameter(problem: Problem, r: int, field_name: str) -> Parameter:
-    """A relative error of one recording's gain, common to all joints."""
-    nominal, count = _nominal_gain(problem, r, field_name), problem.dataset.num_recordings
+def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
+    """Recordings in the order of what other gains would explain of them, by the derivatives at x.
+
+    With J the derivatives of the residuals r by all parameters and by one recording's gains, a Gauss–Newton step would
+    lower the score by rᵀJ (JᵀJ)⁻¹ Jᵀr. The gains of all recordings are perturbed at once, as each moves its own only.
+
+    Returns:
+        Indices of the recordings, and the simulated steps that it took.
+    """
+    problem, x = _with_gains(problem, x, range(problem.dataset.num_recordings))
+    evaluator = problem.training_evaluator()
+    colouring = colour(problem.space, problem.trees, problem.joint_names)
+    neighbours, step = perturbed(x, colouring)
+    residuals = evaluator.residuals(problem.space.to_physical(torch.cat([x[None], neighbours])))
+    there = jacobian(residuals, step, colouring)
+    gains = {problem.space.slices[name].start for name in _GAINS}
+    rows = [c for c, entries in enumerate(colouring.colours) if gains & set(entries)]
+    falls = []
+    for r in range(problem.dataset.num_recordings):
+        columns = there.columns.clone()
+        columns[rows] = 0.0
+        columns[rows, :, r] = there.columns[rows, :, r]
+        hessian, gradient = replace(there, columns=columns).normal_equations()
+        falls.append(gradient @ torch.linalg.pinv(hessian, hermitian=True) @ gradient)
+    return torch.stack(falls).argsort(descending=True).tolist(), evaluator.simulated_steps
+
+
+def _with_gains(problem: Problem, x: torch.Tensor, which: Sequence[int]) -> tuple[Problem, torch.Tensor]:
+    """The problem with relative errors of some recordings' gains, common to all joints, and x with none yet."""
+    extra = [_gain_parameter(problem, which, name) for name in _GAINS]
+    space = ParameterSpace((*problem.space.parameters, *extra))
+    return replace(problem, space=space), torch.cat([x, torch.zeros(len(extra), dtype=torch.float64)])
+
+
+def _gain_parameter(problem: Problem, which: Sequence[int], field_name: str) -> Parameter:
+    """A relative error of a gain in some recordings."""
+    nominal, count = {r: _nominal_gain(problem, r, field_name) for r in which}, problem.dataset.num_recordings
 
     def apply(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-        rows = slice(r, None, count)
         for actuator in env.scene["robot"].actuators.values():
-            getattr(actuator, field_name)[rows] = nominal[actuator.joint_indices] * (1 + values[rows])
+            for r, gain in nominal.items():
+                rows = slice(r, None, count)
+                getattr(actuator, field_name)[rows] = gain[actuator.joint_indices] * (1 + values[rows])
 
     return Parameter(
-        name=f"{field_name}:{r}", unit="1", lower=(-_GAIN_RANGE,), upper=(_GAIN_RANGE,), apply=apply, keys=(GLOBAL,)
+        name=field_name, unit="1", lower=(-_GAIN_RANGE,), upper=(_GAIN_RANGE,), apply=apply, keys=(GLOBAL,)
     )

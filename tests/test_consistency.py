@@ -8,6 +8,7 @@ import torch
 from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
+from pace_optim import consistency
 from pace_optim.consistency import check_consistency
 from pace_optim.jacobian import colour
 from pace_optim.least_squares import least_squares
@@ -50,6 +51,17 @@ def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording
     gain = [s for s in sentences if "behaves as if" in s]
     assert len(gain) == 1
     assert gain[0].startswith("wrong behaves as if its damping were 30% higher than stated (4 instead of 3.08")
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_the_recording_to_refit_is_known_beforehand(recordings, place, monkeypatch):
+    monkeypatch.setattr(consistency, "_GAIN_REFITS", 1)
+    kp, kd = list(GAINS.values())[place]
+    drive = Drive(stiffness=np.array([kp * 1.25]), damping=np.array([kd]))
+    wrong = [*recordings]
+    wrong[place] = dataclasses.replace(recordings[place], drive=drive, name="wrong")
+    gain = [s for s in checked(wrong).sentences if "behaves as if" in s]
+    assert len(gain) == 1 and gain[0].startswith("wrong behaves as if its stiffness were 20% lower than stated")
 
 
 def test_one_recording_has_nothing_to_disagree_with(recordings):
