@@ -35,7 +35,8 @@ def main() -> None:
     for entry in diagnosis.ranking[:8]:
         before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
         mark = "added" if entry["added"] else ("pays" if entry["significant"] else "does not pay")
-        print(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} mrad  {mark}")
+        where = f"on {len(entry['joints'])} of {len(diagnosis.joints)} joints" if len(diagnosis.joints) > 1 else ""
+        print(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} mrad  {mark:13s}  {where}".rstrip())
     for sentence in (*diagnosis.data, *diagnosis.advice):
         print(f"- {sentence}")
     for run in diagnosis.runs:

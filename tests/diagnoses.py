@@ -73,7 +73,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
             }
             for name in JOINTS
         },
-        "data": ["Measurement noise: 0.1 to 0.1 mrad by joint."],
+        "data": ["Measurement noise: 0.1 mrad."],
         "advice": [
             "These recordings cannot tell stribeck_friction from presliding_friction. Record: "
             "scripts/data_collection.py --task Pace-Leg-v0 --excitation ramp"

@@ -62,7 +62,7 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResul
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
     numerical = step_error(problem, whole_vector(problem, base.model.to_physical(base.x)), data.validation)
     sentences = [
-        f"Measurement noise: {1e3 * float(noise.min()):.2g} to {1e3 * float(noise.max()):.2g} mrad by joint; halving "
+        f"Measurement noise: {_span(1e3 * noise)}; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
         f"{1e3 * float(numerical.max()):.2g} mrad.",
     ]
@@ -96,6 +96,12 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResul
         loads=len(loads),
         gains=len(gains),
     )
+
+
+def _span(values: torch.Tensor) -> str:
+    """Values of all joints [mrad], or the only one."""
+    lowest, highest = f"{float(values.min()):.2g}", f"{float(values.max()):.2g}"
+    return f"{lowest} mrad" if lowest == highest else f"{lowest} to {highest} mrad by joint"
 
 
 def _key(*values: object) -> str:
