@@ -19,6 +19,8 @@ from pace_optim.uncertainty import Uncertainty
 
 DISAGREEMENT = 4.0
 """Recordings disagree on a parameter that differs by this many standard deviations of the difference."""
+_SHOWN = 3
+"""Joints of which a sentence gives the values."""
 _SMALLEST_PART = 0.01
 """Differences below this part of the bound range are not worth a sentence."""
 _GAINS = ("stiffness", "damping")
@@ -116,9 +118,14 @@ def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.nda
             found.setdefault((name, names[r]), []).append(text if key == GLOBAL else f"{key} {text}")
     return [
         f"{name.replace('_', ' ')} [{space.units[name]}] is another in {recording} than in the other recordings: "
-        f"{'; '.join(places)}."
+        f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}."
         for (name, recording), places in found.items()
     ]
+
+
+def _more(joints: int) -> str:
+    """How many joints are not shown."""
+    return "" if joints < 1 else f"; and {joints} more joint{'' if joints == 1 else 's'}"
 
 
 def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[int, float, float] | None:

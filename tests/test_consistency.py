@@ -8,10 +8,12 @@ import torch
 from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
+from pace_envs.tasks.pace import Parameter
 from pace_optim import consistency
 from pace_optim.consistency import check_consistency
 from pace_optim.jacobian import colour
 from pace_optim.least_squares import least_squares
+from pace_optim.parameter_space import ParameterSpace
 from pace_optim.problem import load_problem
 from pace_optim.recording import Drive
 
@@ -62,6 +64,21 @@ def test_the_recording_to_refit_is_known_beforehand(recordings, place, monkeypat
     wrong[place] = dataclasses.replace(recordings[place], drive=drive, name="wrong")
     gain = [s for s in checked(wrong).sentences if "behaves as if" in s]
     assert len(gain) == 1 and gain[0].startswith("wrong behaves as if its stiffness were 20% lower than stated")
+
+
+def test_of_many_joints_the_first_are_shown_and_the_others_counted():
+    keys = tuple(f"joint_{i}" for i in range(5))
+    parameter = Parameter(name="friction", unit="N m", lower=(0.0,) * 5, upper=(1.0,) * 5, apply=print, keys=keys)
+    space, std = ParameterSpace([parameter]), np.full((3, 5), 0.01)
+    values = np.array([[0.1] * 5, [0.1] * 5, [0.5] * 5])
+
+    def sentence(joints):
+        values[2, joints:] = 0.1
+        return consistency._disagreements(space, ("a", "b", "c"), values, std)[0]
+
+    assert sentence(5).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007; and 2 more joints.")
+    assert sentence(4).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007; and 1 more joint.")
+    assert sentence(3).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007.")
 
 
 def test_one_recording_has_nothing_to_disagree_with(recordings):
