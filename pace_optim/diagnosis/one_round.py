@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors, judge
+from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
@@ -76,21 +76,14 @@ def try_effects(
     keep: dict[type[Effect], Fitted] = {}
     for effect, chosen, after in zip(listed, fitted, blocks, strict=True):
         for j in now.model.may_get(effect).nonzero()[:, 0].tolist():
-            verdict = judge(errors, after, j, tried, first)
             values = chosen.model.to_physical(chosen.x)[j, chosen.model.columns(effect)].tolist()
-            trials[j].append(
-                Trial(
-                    effect=effect,
-                    joint=j,
-                    screen_score=max(float(p.score[j]) for p in probes if p.effect is effect),
-                    mse_before=float(errors.mse[j]),
-                    mse_after=float(after.mse[j]),
-                    ratio=verdict.ratio,
-                    t=verdict.t,
-                    significant=verdict.significant,
-                    values=dict(zip([p.name for p in effect.parameters], values, strict=True)),
-                )
+            trial = Trial(
+                effect=effect,
+                joint=j,
+                screen_score=max(float(p.score[j]) for p in probes if p.effect is effect),
+                values=dict(zip([p.name for p in effect.parameters], values, strict=True)),
             )
+            trials[j].append(trial.judged(errors, after, tried, first))
         keep[effect] = chosen
     chosen_effects, rivals = _choose(trials)
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)

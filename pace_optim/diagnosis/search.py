@@ -15,7 +15,7 @@ from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import swapped
-from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
+from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -74,8 +74,14 @@ def add_effects(
     errors = validation_errors(problem, [base])[0]
     branch = _Branch(problem=problem, now=base, errors=errors, rounds=[])
     found = search.tried(branch)
-    while found is not None and any(effect is not None for effect in found.chosen):
-        branch, found = search.led_on(branch, found)
+    while found is not None:
+        spread = search.spread(branch, found)
+        if spread is not None:
+            branch, found = spread, search.tried(spread)
+        elif any(effect is not None for effect in found.chosen):
+            branch, found = search.led_on(branch, found)
+        else:
+            break
     rounds = [*branch.rounds, *([] if found is None else [found])]
     return Outcome(
         problem=branch.problem,
@@ -157,6 +163,32 @@ class _Search:
             self.say("trying to do without what was found earlier")
         now, errors = pruned(problem, now, errors, found.chosen)
         return _Branch(problem=problem, now=now, errors=errors, rounds=rounds)
+
+    def spread(self, branch: _Branch, found: Round) -> _Branch | None:
+        """The branch with an effect of other joints on those far from the floor; ``None`` if it does not pay on each.
+
+        Neighbours that all lack the same hide it from each other: while one joint is tried, the others move wrongly. So
+        they are judged together, along the motion that the robot then has.
+        """
+        far = branch.errors.mse.sqrt() > LOOK_AHEAD * self.floor
+        lacking = [j for j in far.nonzero()[:, 0].tolist() if found.chosen[j] is None]
+        for effect in [e for e in branch.now.model.effects if e in found.models and not e.shared]:
+            joints = [j for j in lacking if any(t.effect is effect for t in found.trials[j])]
+            while joints:
+                self.say(f"trying {effect.name} on {len(joints)} more joint{'' if len(joints) == 1 else 's'} at once")
+                chosen = [effect if j in joints else old for j, old in enumerate(found.chosen)]
+                grown = self.grown(branch, replace(found, chosen=chosen))
+                trials = {j: self._judged_again(found.trials[j], effect, branch, grown) for j in joints}
+                if all(trial.significant for trial in trials.values()):
+                    return replace(grown, rounds=[*grown.rounds[:-1], grown.rounds[-1].with_trials(trials)])
+                joints = [j for j, trial in trials.items() if trial.significant]
+        return None
+
+    def _judged_again(self, trials: Sequence[Trial], effect: type[Effect], before: _Branch, after: _Branch) -> Trial:
+        """A joint's trial of an effect by what two branches leave of that joint."""
+        trial = next(t for t in trials if t.effect is effect)
+        tried = len(self.effects) * len(self.floor)
+        return trial.judged(before.errors, after.errors, tried, first=False)
 
     def led_on(self, branch: _Branch, found: Round) -> tuple[_Branch, Round | None]:
         """The branch with the effects that lead furthest, and what could come next.

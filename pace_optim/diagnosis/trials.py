@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from pace_actuators.effects import Effect
+from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.descent import Fitted
 
 RIVAL = 1.10
@@ -23,14 +24,26 @@ class Trial:
     effect: type[Effect]
     joint: int
     screen_score: float
-    mse_before: float
-    """On validation [rad²]."""
-    mse_after: float
-    ratio: float
-    """RMSE before / after."""
-    t: float
-    significant: bool
     values: dict[str, float]
+    mse_before: float = 0.0
+    """On validation [rad²]."""
+    mse_after: float = 0.0
+    ratio: float = 1.0
+    """RMSE before / after."""
+    t: float = 0.0
+    significant: bool = False
+
+    def judged(self, before: BlockErrors, after: BlockErrors, tried: int, first: bool) -> Trial:
+        """The trial with what the effect has brought its joint; arguments as for :func:`judge`."""
+        verdict = judge(before, after, self.joint, tried, first)
+        return replace(
+            self,
+            mse_before=float(before.mse[self.joint]),
+            mse_after=float(after.mse[self.joint]),
+            ratio=verdict.ratio,
+            t=verdict.t,
+            significant=verdict.significant,
+        )
 
 
 @dataclass(kw_only=True, eq=False)
@@ -47,6 +60,14 @@ class Round:
     def copy(self) -> Round:
         """The same, whose choices can change by themselves."""
         return replace(self, chosen=list(self.chosen), rivals=[list(each) for each in self.rivals])
+
+    def with_trials(self, judged: Mapping[int, Trial]) -> Round:
+        """The same with a joint's trial of an effect in place of what it was, best first."""
+        trials = [list(each) for each in self.trials]
+        for j, trial in judged.items():
+            others = [t for t in trials[j] if t.effect is not trial.effect]
+            trials[j] = sorted([trial, *others], key=lambda t: t.mse_after)
+        return replace(self, trials=trials)
 
 
 def near_trials(trials: Sequence[Trial], chosen: type[Effect]) -> list[Trial]:
