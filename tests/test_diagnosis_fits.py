@@ -16,7 +16,7 @@ from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
-from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.side_by_side import SideBySide, Slot, _merged
 from pace_optim.joint_twins import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -54,6 +54,35 @@ def test_an_effect_in_one_slot_changes_no_other(bench):
     assert torch.equal(on[[0, 1, 3]], off[[0, 1, 3]])
     assert float((on[2] - off[2]).abs().max()) > 1e-3
     assert float(off[0].square().mean().sqrt()) < 5e-5  # the twins move as the robot
+
+
+def test_models_that_share_no_effects_move_side_by_side_as_each_alone(bench):
+    base, here = JointModel.base(bench.problem), torch.tensor([True])
+    start = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64)
+    own = {STRIBECK: [0.8, 0.1], QUADRATIC: [0.3], GAIN: [-0.2]}
+
+    def slot(*effects):
+        model, physical = base, start
+        for effect in effects:
+            values = torch.tensor([own[effect]], dtype=torch.float64)
+            model, physical = model.extended(physical, effect, here, values)
+        return model, physical
+
+    def errors(*models):
+        batch = SideBySide(bench.twins, [Slot(model=model, rows=1) for model, _ in models], training=True)
+        return batch.simulate([physical[None] for _, physical in models], batch.dataset.train)
+
+    a, b, c = own
+    models = [slot(b, c), slot(a, c), slot(a, b), slot(), slot(a, b, c), slot(c)]
+    together = errors(*models)
+    for row, model in zip(together, models, strict=True):
+        assert torch.equal(row, errors(model)[0])
+    assert len({float(row.square().sum()) for row in together}) == len(models)
+
+
+def test_side_by_side_each_model_keeps_the_order_of_its_effects():
+    assert _merged([("b", "c"), ("a", "c"), ("a", "b"), ()]) == ["a", "b", "c"]
+    assert _merged([("a",), ("a", "x"), ("a", "y"), ("a", "b", "x")]) == ["a", "b", "y", "x"]
 
 
 def test_the_descent_finds_the_base_parameters(bench):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,7 +25,7 @@ class Slot:
 class SideBySide:
     """Simulates several parameter sets of several models on all recordings of a problem at once.
 
-    An effect that is tried costs only in the environments of its slot.
+    An effect costs only in the environments of the slots that have it.
     """
 
     def __init__(self, problem: TwinProblem, slots: Sequence[Slot], training: bool):
@@ -32,13 +33,11 @@ class SideBySide:
 
         Args:
             problem: The joints simulated alone; its own effects are not used.
-            slots: The models; each may have one effect that is not common to all.
+            slots: The models.
             training: Whether only recordings that are trained on are simulated.
         """
         self.slots = list(slots)
-        first = slots[0].model.effects
-        self._common = tuple(e for e in first if all(e in slot.model.effects for slot in slots))
-        self._own = [next((e for e in slot.model.effects if e not in self._common), None) for slot in slots]
+        self._runs = _runs([slot.model.effects for slot in slots])
         evaluator_problem = problem.with_effects(self._cfgs(problem, training))
         evaluator = evaluator_problem.training_evaluator() if training else evaluator_problem.evaluator()
         self.dataset = evaluator.dataset
@@ -79,27 +78,16 @@ class SideBySide:
         """The parts of something with one row per candidate, slot by slot."""
         return list(values.split([slot.rows for slot in self.slots]))
 
-    def _groups(self) -> list[list[int]]:
-        """Indices of neighbouring slots whose own effect is the same: one effect acts for all of them."""
-        groups: list[list[int]] = []
-        for i, own in enumerate(self._own):
-            if groups and own is not None and self._own[groups[-1][0]] is own:
-                groups[-1].append(i)
-            else:
-                groups.append([i])
-        return groups
-
     def _cfgs(self, problem: TwinProblem, training: bool) -> list[EffectCfg]:
         count = len(problem.dataset.trained()) if training else problem.dataset.num_recordings
-        cfgs = [EffectCfg(effect=effect.name) for effect in self._common]
-        start = 0
-        for group in self._groups():
-            end = start + sum(self.slots[i].rows for i in group) * count
-            own = self._own[group[0]]
-            if own is not None:
-                cfgs.append(EffectCfg(effect=own.name, env_rows=slice(start, end)))
-            start = end
-        return cfgs
+        return [EffectCfg(effect=run.effect.name, env_rows=self._env_rows(run, count)) for run in self._runs]
+
+    def _env_rows(self, run: _Run, count: int) -> slice | None:
+        """The environments of a run of slots, ``count`` for each parameter set; ``None`` if those are all."""
+        if run.begin == 0 and run.end == len(self.slots):
+            return None
+        begin, end = (count * sum(slot.rows for slot in self.slots[:at]) for at in (run.begin, run.end))
+        return slice(begin, end)
 
     def _write_base(self, base: torch.Tensor) -> None:
         robot = self.rollout.robot
@@ -119,23 +107,50 @@ class SideBySide:
                 continue
             ids = actuator.joint_indices
             by_place = {(effect.name, effect.rows.start, effect.rows.stop): effect for effect in stack.effects}
-            for common in self._common:
-                values = torch.cat(
-                    [_of_effect(slot.model, common, v) for slot, v in zip(self.slots, physical, strict=True)]
-                )
+            for run in self._runs:
+                rows = self._env_rows(run, count) or slice(None)
+                own = zip(self.slots[run.begin : run.end], physical[run.begin : run.end], strict=True)
+                values = torch.cat([_of_effect(slot.model, run.effect, v) for slot, v in own])
                 robot.write_effect_to_sim(
-                    actuator, by_place[common.name, None, None], values.repeat_interleave(count, dim=0)[:, ids]
+                    actuator,
+                    by_place[run.effect.name, rows.start, rows.stop],
+                    values.repeat_interleave(count, dim=0)[:, ids],
                 )
-            for group in self._groups():
-                own = self._own[group[0]]
-                if own is None:
-                    continue
-                begin = sum(slot.rows for slot in self.slots[: group[0]]) * count
-                end = begin + sum(self.slots[i].rows for i in group) * count
-                values = torch.cat([_of_effect(self.slots[i].model, own, physical[i]) for i in group])
-                robot.write_effect_to_sim(
-                    actuator, by_place[own.name, begin, end], values.repeat_interleave(count, dim=0)[:, ids]
-                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """Neighbouring slots that all have an effect: one instance of it acts for all of them."""
+
+    effect: type[Effect]
+    begin: int
+    end: int
+    """One after the last."""
+
+
+def _runs(effects: Sequence[tuple[type[Effect], ...]]) -> list[_Run]:
+    """The runs of each effect, in an order in which every slot has its effects in its own model's order."""
+    runs = []
+    for effect in _merged(effects):
+        begin = 0
+        for has, own in itertools.groupby(effect in each for each in effects):
+            end = begin + len(list(own))
+            if has:
+                runs.append(_Run(effect=effect, begin=begin, end=end))
+            begin = end
+    return runs
+
+
+def _merged(effects: Sequence[tuple[type[Effect], ...]]) -> list[type[Effect]]:
+    """All effects of several models, each after the one that it follows in the first model that has it."""
+    result: list[type[Effect]] = []
+    for each in effects:
+        place = 0
+        for effect in each:
+            if effect not in result:
+                result.insert(place, effect)
+            place = result.index(effect) + 1
+    return result
 
 
 def _of_effect(model: JointModel, effect: type[Effect], physical: torch.Tensor) -> torch.Tensor:
