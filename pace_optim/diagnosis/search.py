@@ -75,9 +75,9 @@ def add_effects(
     branch = _Branch(problem=problem, now=base, errors=errors, rounds=[])
     found = search.tried(branch)
     while found is not None:
-        spread = search.spread(branch, found)
-        if spread is not None:
-            branch, found = spread, search.tried(spread)
+        together = search.at_once(branch, found)
+        if together is not None:
+            branch, found = together, search.tried(together)
         elif any(effect is not None for effect in found.chosen):
             branch, found = search.led_on(branch, found)
         else:
@@ -164,7 +164,7 @@ class _Search:
         now, errors = pruned(problem, now, errors, found.chosen)
         return _Branch(problem=problem, now=now, errors=errors, rounds=rounds)
 
-    def spread(self, branch: _Branch, found: Round) -> _Branch | None:
+    def at_once(self, branch: _Branch, found: Round) -> _Branch | None:
         """The branch with an effect of other joints on those far from the floor; ``None`` if it does not pay on each.
 
         Neighbours that all lack the same hide it from each other: while one joint is tried, the others move wrongly. So
