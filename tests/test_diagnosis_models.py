@@ -103,6 +103,43 @@ def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench, monkeyp
         assert ("stribeck_friction.effort" in whole_values(left.model, left.x, ["servo"])) is kept[0]
 
 
+def left_at_last(bench, monkeypatch, rmse):
+    """The effects that a joint with three keeps, where its RMSE without some of them stands in a table, or is 9."""
+    model, values, yes = JointModel.base(bench.problem), bench.truth_values, torch.tensor([True])
+    for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1]), (GAIN, [0.1])):
+        model, values = model.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
+
+    def errors(_, models):
+        lacking = [
+            frozenset(e for e, has in zip(m.model.effects, m.model.has[:, 0], strict=True) if not has) for m in models
+        ]
+        squares = [1e-6 * rmse.get(each, 9.0) ** 2 * torch.tensor([1.1, 1.0, 1.0, 0.9]).double() for each in lacking]
+        return [BlockErrors(square=each[:, None], weight=torch.ones(4).double()) for each in squares]
+
+    for module, name in ((some_joints, "fit_coarse_to_fine"), (pruning, "fit_side_by_side")):
+        monkeypatch.setattr(module, name, lambda _, starts, **kwargs: starts)
+    for module in (some_joints, pruning):
+        monkeypatch.setattr(module, "validation_errors", errors)
+    now = Fitted.start(model, values)
+    final, after = pruning.pruned_at_last(bench.twins, now, errors(None, [now])[0], tried=30)
+    assert torch.equal(after.square, errors(None, [final])[0].square)
+    return {e for e, has in zip(final.model.effects, final.model.has[:, 0], strict=True) if has}
+
+
+@pytest.mark.parametrize(
+    ("without", "kept"),
+    [
+        # of two that stand in for each other the one goes without which less is lost; the other one pays then
+        ({(): 1.0, (QUADRATIC,): 1.1, (GAIN,): 1.15}, {STRIBECK, GAIN}),
+        ({(): 1.0, (STRIBECK,): 2.0, (QUADRATIC,): 3.0, (GAIN,): 1.5}, {STRIBECK, QUADRATIC, GAIN}),
+        # whether the last one pays is the verdict's
+        ({(): 1.0, (STRIBECK,): 1.1, (STRIBECK, QUADRATIC): 1.2, (STRIBECK, QUADRATIC, GAIN): 1.25}, {GAIN}),
+    ],
+)
+def test_effects_that_no_longer_pay_go_one_after_another(bench, monkeypatch, without, kept):
+    assert left_at_last(bench, monkeypatch, {frozenset(each): rmse for each, rmse in without.items()}) == kept
+
+
 def test_every_structure_that_an_effect_can_have_starts_a_fit():
     elasticity = get_effect("joint_elasticity")
     probes = [

@@ -174,8 +174,9 @@ def two_joints(bench):
     return replace(one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1))
 
 
+@pytest.mark.parametrize("stood_out", [True, False])  # beside neighbours that moved wrongly
 @pytest.mark.parametrize(("rmse", "agree"), [(1.05e-4, True), (1.3e-4, False)])
-def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, no_fits, rmse, agree):
+def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, no_fits, rmse, agree, stood_out):
     base, values = two_joints(bench), bench.truth_values.repeat(2, 1)
     now = with_effects(base, values, (GAIN, [True, False], [-0.2]), (STRIBECK, [False, True], [1.0, 0.1]))
     models = {
@@ -184,7 +185,7 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
     }
     trials = [
         [make_trial(GAIN, 0, 1e-4), make_trial(STRIBECK, 0, 2e-4)],
-        [make_trial(STRIBECK, 1, 1e-4), make_trial(GAIN, 1, 2e-4)],
+        [make_trial(STRIBECK, 1, 1e-4), make_trial(GAIN, 1, 2e-4, stood_out)],
     ]
     this = Round(trials=trials, chosen=[GAIN, STRIBECK], rivals=[[], []], models=models)
     no_fits({STRIBECK: errors_of(2e-4, 1e-4), GAIN: errors_of(1e-4, rmse)})
@@ -222,7 +223,10 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
     assert physical[result.model.columns(QUADRATIC)].tolist() == pytest.approx([0.2])
     assert physical[result.model.columns(GAIN)].tolist() == pytest.approx([-0.1])
     assert first.chosen == [GAIN] and first.rivals == [[]] and second.chosen == [QUADRATIC]
+    # what did not stand out, and no joint has, is not tried
+    first.chosen, first.trials[0][1].significant = [STRIBECK], False
+    assert swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor) is None
+    first.trials[0][1].significant = True
     # a lone effect was the best of its round: nothing is tried in its place
     lone = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]))
-    first.chosen = [STRIBECK]
     assert swapping.swapped(bench.twins, lone, errors_of(3e-4), [first], floor) is None

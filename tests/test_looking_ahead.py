@@ -78,6 +78,7 @@ def searched(monkeypatch, *joints, follow=stays):
     monkeypatch.setattr(search, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
+    monkeypatch.setattr(search, "pruned_at_last", lambda _, now, errors, tried: (now, errors))
     bounds = torch.ones(n, len(BASE)).double()
     model = JointModel(
         effects=(),

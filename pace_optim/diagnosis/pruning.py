@@ -1,13 +1,13 @@
-"""Dropping what a newer effect makes superfluous."""
+"""Dropping effects that the others make superfluous."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.validation import validation_errors
@@ -28,29 +28,89 @@ def pruned(
         errors: Its errors.
         newest: Each joint's newest effect, which stays.
     """
-    model, n = now.model, now.model.num_joints
     latest = torch.tensor([e is not None for e in newest])
-    older = []
-    for effect, has in zip(model.effects, model.has, strict=True):
-        joints = has & latest & torch.tensor([e is not effect for e in newest])
-        if bool(joints.any()):
-            older.append((effect, joints))
-    if not older:
-        return now, errors
-    starts = [Fitted.start(model.without_effect(e, joints), model.to_physical(now.x), tried=e) for e, joints in older]
-    which = torch.stack([joints for _, joints in older]).any(dim=0)
-    fitted, after = SomeJoints(which).refitted(problem, starts, errors)
-    dropped, x = model, now.x.clone()
-    for j in range(n):
-        without = [k for k, (_, joints) in enumerate(older) if bool(joints[j])]
-        if not without:
-            continue
-        best = min(without, key=lambda k: float(after[k].mse[j]))
-        if float(after[best].mse[j]) <= SUPERFLUOUS**2 * float(errors.mse[j]):
-            dropped = dropped.without_effect(older[best][0], torch.arange(n) == j)
-            x[j] = fitted[best].x[j]
-    if dropped is model:
-        return now, errors
-    left = Fitted.start(dropped, dropped.to_physical(x))
-    now = fit_side_by_side(problem, [left], max_iteration=4, keep_jacobian=True)[0]
-    return now, validation_errors(problem, [now])[0]
+    older = {
+        effect: has & latest & torch.tensor([e is not effect for e in newest])
+        for effect, has in zip(now.model.effects, now.model.has, strict=True)
+    }
+    without = _Without(problem, now, errors, older)
+    dropped = {}
+    for j, effects in without.tried.items():
+        best = min(effects, key=lambda effect: without.mse(effect, j))
+        if without.mse(best, j) <= SUPERFLUOUS**2 * float(errors.mse[j]):
+            dropped[j] = best
+    return without.dropping(dropped)
+
+
+def pruned_at_last(problem: TwinProblem, now: Fitted, errors: BlockErrors, tried: int) -> tuple[Fitted, BlockErrors]:
+    """Drop, one after another, effects that would not be added to the others of their joint now.
+
+    When they were found, others were missing, and neighbours moved wrongly.
+
+    Args:
+        problem: The joints simulated alone.
+        now: The model at the end of the search.
+        errors: Its errors.
+        tried: How many candidates were tried, over all joints.
+    """
+    while True:
+        several = now.model.has.sum(dim=0) > 1
+        own = zip(now.model.effects, now.model.has, strict=True)
+        without = _Without(problem, now, errors, {e: has & several for e, has in own if not e.shared})
+        dropped = {}
+        for j, effects in without.tried.items():
+            least = min(effects, key=lambda effect: without.mse(effect, j))
+            if not judge(without.errors[least], errors, j, tried, first=False).significant:
+                dropped[j] = least
+        if not dropped:
+            return now, errors
+        now, errors = without.dropping(dropped)
+
+
+class _Without:
+    """A model without each of its effects in turn, the rest refitted."""
+
+    def __init__(
+        self, problem: TwinProblem, now: Fitted, errors: BlockErrors, effects: Mapping[type[Effect], torch.Tensor]
+    ):
+        """Refit.
+
+        Args:
+            problem: The joints simulated alone.
+            now: The model.
+            errors: Its errors.
+            effects: What is left out, and of which joints, (n,) bool.
+        """
+        self._problem, self._now, self._now_errors = problem, now, errors
+        model, physical = now.model, now.model.to_physical(now.x)
+        effects = {effect: joints for effect, joints in effects.items() if bool(joints.any())}
+        self.tried: dict[int, list[type[Effect]]] = {}
+        """Joint -> effects left out of it."""
+        for effect, joints in effects.items():
+            for j in joints.nonzero()[:, 0].tolist():
+                self.tried.setdefault(j, []).append(effect)
+        self.errors: dict[type[Effect], BlockErrors] = {}
+        """Effect -> errors without it."""
+        self._fitted: dict[type[Effect], Fitted] = {}
+        if effects:
+            starts = [Fitted.start(model.without_effect(e, joints), physical, tried=e) for e, joints in effects.items()]
+            part = SomeJoints(torch.stack(list(effects.values())).any(dim=0))
+            fitted, after = part.refitted(problem, starts, errors)
+            self.errors = dict(zip(effects, after, strict=True))
+            self._fitted = dict(zip(effects, fitted, strict=True))
+
+    def mse(self, effect: type[Effect], joint: int) -> float:
+        """Of a joint without an effect [rad²]."""
+        return float(self.errors[effect].mse[joint])
+
+    def dropping(self, effects: Mapping[int, type[Effect]]) -> tuple[Fitted, BlockErrors]:
+        """The model without an effect on some joints, {joint: effect}, fitted, and its errors."""
+        if not effects:
+            return self._now, self._now_errors
+        model, x = self._now.model, self._now.x.clone()
+        for j, effect in effects.items():
+            model = model.without_effect(effect, torch.arange(model.num_joints) == j)
+            x[j] = self._fitted[effect].x[j]
+        left = Fitted.start(model, model.to_physical(x))
+        now = fit_side_by_side(self._problem, [left], max_iteration=4, keep_jacobian=True)[0]
+        return now, validation_errors(self._problem, [now])[0]

@@ -12,7 +12,7 @@ from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
 from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.one_round import try_effects
-from pace_optim.diagnosis.pruning import pruned
+from pace_optim.diagnosis.pruning import pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial, near_trials
@@ -83,13 +83,14 @@ def add_effects(
         else:
             break
     rounds = [*branch.rounds, *([] if found is None else [found])]
+    final, final_errors = pruned_at_last(branch.problem, branch.now, branch.errors, len(effects) * len(floor))
     return Outcome(
         problem=branch.problem,
         base=base,
         base_errors=errors,
-        final=branch.now,
-        final_errors=branch.errors,
-        unevenness=unevenness(branch.now),
+        final=final,
+        final_errors=final_errors,
+        unevenness=unevenness(final),
         rounds=rounds,
     )
 
@@ -241,8 +242,9 @@ def _next_choice(found: Round, unexplained: torch.Tensor) -> Round | None:
     """The round with the effect that came nearest to the best, on unexplained joints that have one."""
     chosen = list(found.chosen)
     for j in unexplained.nonzero()[:, 0].tolist():
-        if (best := found.chosen[j]) is not None and (near := near_trials(found.trials[j], best)):
-            chosen[j] = near[0].effect
+        if (best := found.chosen[j]) is not None:
+            near = [trial.effect for trial in near_trials(found.trials[j], best) if trial.significant]
+            chosen[j] = near[0] if near else best
     return None if chosen == found.chosen else replace(found, chosen=chosen)
 
 

@@ -71,7 +71,9 @@ def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) 
             several = int(model.has[:, j].sum()) > 1 and bool(unexplained[j])
             without = model.without_effect(old, torch.arange(model.num_joints) == j)
             near = [t for t in near_trials(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
-            wanted = [t.effect for k, t in enumerate(near) if t.effect in in_use or (several and k < _PER_JOINT)]
+            own = [t.effect for t in near if t.significant][: _PER_JOINT if several else 0]
+            # what other joints have need not have stood out here
+            wanted = [t.effect for t in near if t.effect in in_use or t.effect in own]
             for effect in wanted:
                 result.setdefault(effect, {}).setdefault(j, old)
     return result

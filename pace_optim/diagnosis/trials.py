@@ -71,6 +71,6 @@ class Round:
 
 
 def near_trials(trials: Sequence[Trial], chosen: type[Effect]) -> list[Trial]:
-    """Significant trials of a joint that came near to the chosen effect, best first."""
+    """Trials of a joint that came near to the chosen effect, best first."""
     most = next(t.mse_after for t in trials if t.effect is chosen) * _BEHIND**2
-    return [t for t in trials if t.effect is not chosen and t.significant and t.mse_after <= most]
+    return [t for t in trials if t.effect is not chosen and t.mse_after <= most]
