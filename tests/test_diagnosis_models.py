@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnoses import joint_alone
+from diagnoses import errors_of, joint_alone
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis import pruning, sharing, some_joints
@@ -113,8 +113,7 @@ def left_at_last(bench, monkeypatch, rmse):
         lacking = [
             frozenset(e for e, has in zip(m.model.effects, m.model.has[:, 0], strict=True) if not has) for m in models
         ]
-        squares = [1e-6 * rmse.get(each, 9.0) ** 2 * torch.tensor([1.1, 1.0, 1.0, 0.9]).double() for each in lacking]
-        return [BlockErrors(square=each[:, None], weight=torch.ones(4).double()) for each in squares]
+        return [errors_of(1e-3 * rmse.get(each, 9.0)) for each in lacking]
 
     for module, name in ((some_joints, "fit_coarse_to_fine"), (pruning, "fit_side_by_side")):
         monkeypatch.setattr(module, name, lambda _, starts, **kwargs: starts)

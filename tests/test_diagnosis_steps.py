@@ -162,6 +162,8 @@ def no_fits(monkeypatch):
     for module, name in ((some_joints, "fit_coarse_to_fine"), (swapping, "fit_side_by_side")):
         monkeypatch.setattr(module, name, lambda _, starts, *args, **kwargs: starts)
 
+    monkeypatch.setattr(swapping, "validation_errors", lambda *_: ["judged again"])
+
     def say(errors_of):
         monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [errors_of[m.tried] for m in models])
 
@@ -197,6 +199,32 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
     gains = result.model.to_physical(result.x)[:, result.model.columns(GAIN)]
     assert gains[:, 0].tolist() == pytest.approx([-0.2, -0.21])
     assert this.chosen == [GAIN, GAIN] and this.rivals == [[], [STRIBECK]]
+
+
+@pytest.mark.parametrize(
+    ("alone", "agree"),
+    [
+        ((1.1e-4, 1.1e-4), ["torque_gain"]),
+        ((1.1e-4, 3e-4), ["stribeck_friction@knee", "quadratic_friction@knee", "torque_gain@hip"]),
+        ((3e-4, 3e-4), None),
+    ],
+)
+def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, no_fits, alone, agree):
+    base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
+    now = with_effects(base, values, (STRIBECK, both, [1.0, 0.1]), (QUADRATIC, both, [0.2]))
+    models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [-0.1]))}
+    trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4, significant=False)] for j in range(2)]
+    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []], models=models)
+    no_fits({GAIN: errors_of(*alone)})
+    final, errors = swapping.one_for_several(bench.twins, now, errors_of(1e-4, 1e-4), [this], tried=30)
+    if agree is None:
+        assert final is now and this.chosen == [STRIBECK, STRIBECK]
+        return
+    assert labels(final.model, ["hip", "knee"]) == agree and this.chosen[0] is GAIN
+    physical = final.model.to_physical(final.x)[0]
+    assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
+    assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([-0.1])
+    assert errors == "judged again"
 
 
 def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench, no_fits):

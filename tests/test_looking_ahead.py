@@ -3,11 +3,10 @@
 from types import SimpleNamespace
 
 import torch
-from diagnoses import make_trial
+from diagnoses import errors_of, make_trial
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import search
-from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.trials import Round
@@ -36,9 +35,7 @@ class World:
         result = []
         for now in models:
             self.everyone = self.effects_of(now)
-            squares = [self.rmse(j, effects) ** 2 for j, effects in enumerate(self.everyone)]
-            scatter = torch.tensor([1.1, 1.0, 1.0, 0.9])[:, None]
-            result.append(BlockErrors(square=scatter * torch.tensor([squares]).double(), weight=torch.ones(4)))
+            result.append(errors_of(*(self.rmse(j, effects) for j, effects in enumerate(self.everyone))))
         return result
 
     def try_effects(self, problem, now, errors, effects, effort, floor, say, rough):
@@ -79,6 +76,7 @@ def searched(monkeypatch, *joints, follow=stays):
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
     monkeypatch.setattr(search, "pruned_at_last", lambda _, now, errors, tried: (now, errors))
+    monkeypatch.setattr(search, "one_for_several", lambda _, now, errors, rounds, tried: (now, errors))
     bounds = torch.ones(n, len(BASE)).double()
     model = JointModel(
         effects=(),
@@ -202,3 +200,34 @@ def test_only_joints_that_gain_keep_what_they_were_given_with_others(monkeypatch
 def test_joints_are_not_given_what_no_other_joint_has(monkeypatch):
     effects, _ = found(monkeypatch, NEIGHBOUR, together(1, 2, effect=SPRING), together(1, 2, effect=SPRING))
     assert effects == [{"joint_elasticity"}, set(), set()]
+
+
+def test_joints_agree_once_more_where_one_effect_took_the_place_of_several(monkeypatch):
+    calls = []
+
+    def step(name, result):
+        monkeypatch.setattr(search, name, lambda *args: calls.append((name, args[1])) or result)
+
+    settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
+    whole = search._Search(effects=(GAIN, SPRING), floor=torch.ones(3), **settings)
+    branch = search._Branch(problem=None, now="several", errors="e", rounds=[])
+    step("validation_errors", ["f"])
+    step("pruned_at_last", "end")
+    for replaced, agreed, expected in (
+        ("several", None, [("one_for_several", "several"), ("pruned_at_last", "several")]),
+        ("one", None, [("one_for_several", "several"), ("swapped", "one"), ("pruned_at_last", "one")]),
+        (
+            "one",
+            "agreed",
+            [
+                ("one_for_several", "several"),
+                ("swapped", "one"),
+                ("validation_errors", ["agreed"]),
+                ("pruned_at_last", "agreed"),
+            ],
+        ),
+    ):
+        calls.clear()
+        step("one_for_several", (branch.now if replaced == "several" else replaced, "e"))
+        step("swapped", agreed)
+        assert whole.simplified(branch) == "end" and calls == expected

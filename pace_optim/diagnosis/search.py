@@ -14,7 +14,7 @@ from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
-from pace_optim.diagnosis.swapping import swapped
+from pace_optim.diagnosis.swapping import one_for_several, swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
@@ -83,7 +83,7 @@ def add_effects(
         else:
             break
     rounds = [*branch.rounds, *([] if found is None else [found])]
-    final, final_errors = pruned_at_last(branch.problem, branch.now, branch.errors, len(effects) * len(floor))
+    final, final_errors = search.simplified(branch)
     return Outcome(
         problem=branch.problem,
         base=base,
@@ -105,6 +105,10 @@ class _Search:
     max_effects: int
     say: Callable[[str], None]
     follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]]
+
+    @property
+    def _tried_over_joints(self) -> int:
+        return len(self.effects) * len(self.floor)
 
     def tried(self, branch: _Branch) -> Round | None:
         """What could come next; ``None`` if there is nothing to try."""
@@ -188,8 +192,7 @@ class _Search:
     def _judged_again(self, trials: Sequence[Trial], effect: type[Effect], before: _Branch, after: _Branch) -> Trial:
         """A joint's trial of an effect by what two branches leave of that joint."""
         trial = next(t for t in trials if t.effect is effect)
-        tried = len(self.effects) * len(self.floor)
-        return trial.judged(before.errors, after.errors, tried, first=False)
+        return trial.judged(before.errors, after.errors, self._tried_over_joints, first=False)
 
     def led_on(self, branch: _Branch, found: Round) -> tuple[_Branch, Round | None]:
         """The branch with the effects that lead furthest, and what could come next.
@@ -215,6 +218,14 @@ class _Search:
         chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
         taken = self.grown(branch, replace(found, chosen=chosen))
         return taken, beyond if _is_same(taken, way) else self.tried(taken)
+
+    def simplified(self, branch: _Branch) -> tuple[Fitted, BlockErrors]:
+        """A branch's model with no more effects than pay, and its errors."""
+        problem, rounds, tried = branch.problem, branch.rounds, self._tried_over_joints
+        now, errors = one_for_several(problem, branch.now, branch.errors, rounds, tried)
+        if now is not branch.now and (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
+            now, errors = exchanged, validation_errors(problem, [exchanged])[0]
+        return pruned_at_last(problem, now, errors, tried)
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials
+from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
 _PER_JOINT = 3
@@ -57,6 +58,70 @@ def swapped(
         physical[j, : now.model.size] = values[j, : now.model.size]
         _note(rounds, j, old, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+
+
+def one_for_several(
+    problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequence[Round], tried: int
+) -> tuple[Fitted, BlockErrors]:
+    """Put one effect in place of several of a joint, where the several do not pay beside it.
+
+    A wrong gain of the torque is one of the position and one of the speed: beside neighbours that moved wrongly, the
+    two parts of it may have been found one after another.
+
+    Args:
+        problem: The joints simulated alone, along the motion of the model.
+        now: The model at the end of the search.
+        errors: Its errors.
+        rounds: What was tried; the choices of the first one are updated.
+        tried: How many candidates were tried, over all joints.
+    """
+    several = (now.model.has.sum(dim=0) > 1).nonzero()[:, 0].tolist()
+    options: dict[type[Effect], list[int]] = {}
+    for j in several:
+        near = near_trials(rounds[0].trials[j], rounds[0].chosen[j]) if rounds[0].chosen[j] is not None else []
+        for effect in [t.effect for t in near][:_PER_JOINT]:
+            options.setdefault(effect, []).append(j)
+    if not options:
+        return now, errors
+    starts = [_alone(now, effect, joints, rounds[0]) for effect, joints in options.items()]
+    which = torch.zeros(now.model.num_joints, dtype=torch.bool)
+    which[several] = True
+    fitted, blocks = SomeJoints(which).refitted(problem, starts, errors)
+    after, models = dict(zip(options, blocks, strict=True)), dict(zip(options, fitted, strict=True))
+    enough = {
+        effect: [j for j in joints if not judge(after[effect], errors, j, tried, first=False).significant]
+        for effect, joints in options.items()
+    }
+    model, physical = now.model, now.model.to_physical(now.x)
+    for j in several:
+        best = max((e for e in enough if j in enough[e]), key=lambda e: len(enough[e]), default=None)
+        if best is None:
+            continue
+        here, source = torch.arange(model.num_joints) == j, models[best]
+        values = source.model.to_physical(source.x)
+        for old in model.effects:
+            model = model.without_effect(old, here)
+        model, physical = model.extended(physical, best, here, values[:, source.model.columns(best)])
+        physical[j, : len(BASE)] = values[j, : len(BASE)]
+        rounds[0].chosen[j], rounds[0].rivals[j] = best, []
+    if model is now.model:
+        return now, errors
+    now = fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+    return now, validation_errors(problem, [now])[0]
+
+
+def _alone(now: Fitted, effect: type[Effect], joints: Sequence[int], this: Round) -> Fitted:
+    """The present model with an effect, as it was fitted in its round, in place of all others of some joints."""
+    model, physical = now.model, now.model.to_physical(now.x)
+    here = torch.zeros(model.num_joints, dtype=torch.bool)
+    here[list(joints)] = True
+    source = this.models[effect]
+    values = source.model.to_physical(source.x)
+    for old in model.effects:
+        model = model.without_effect(old, here)
+    model, physical = model.extended(physical, effect, here, values[:, source.model.columns(effect)])
+    physical[here, : len(BASE)] = values[here, : len(BASE)]
+    return Fitted.start(model, physical, tried=effect)
 
 
 def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) -> dict[type[Effect], _Exchange]:
