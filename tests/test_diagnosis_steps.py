@@ -10,7 +10,7 @@ from diagnoses import errors_of, hidden_run, joint_alone, make_trial, outcome_of
 from problems import DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import next_experiment, one_round, search, some_joints, swapping
+from pace_optim.diagnosis import next_experiment, one_for_several, one_round, search, some_joints, swapping
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
@@ -23,6 +23,7 @@ from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+CLOCK, ELASTICITY = get_effect("clock_skew"), get_effect("joint_elasticity")
 
 
 @pytest.fixture(scope="module")
@@ -159,10 +160,9 @@ def test_an_error_map_names_the_variable_that_friction_depends_on(tmp_path):
 @pytest.fixture
 def no_fits(monkeypatch):
     """Models stay where they start; returns how to say which errors they have, by the effect that is tried."""
-    for module, name in ((some_joints, "fit_coarse_to_fine"), (swapping, "fit_side_by_side")):
-        monkeypatch.setattr(module, name, lambda _, starts, *args, **kwargs: starts)
-
-    monkeypatch.setattr(swapping, "validation_errors", lambda *_: ["judged again"])
+    for module in (swapping, one_for_several):
+        monkeypatch.setattr(module, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+    monkeypatch.setattr(some_joints, "fit_coarse_to_fine", lambda _, starts, *args, **kwargs: starts)
 
     def say(errors_of):
         monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [errors_of[m.tried] for m in models])
@@ -215,16 +215,42 @@ def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, 
     models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [-0.1]))}
     trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4, significant=False)] for j in range(2)]
     this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []], models=models)
-    no_fits({GAIN: errors_of(*alone)})
-    final, errors = swapping.one_for_several(bench.twins, now, errors_of(1e-4, 1e-4), [this], tried=30)
+    later = Round(trials=[[], []], chosen=[QUADRATIC, QUADRATIC], rivals=[[STRIBECK], []])
+    no_fits({GAIN: errors_of(*alone, roll=1)})
+    final = one_for_several.one_for_several(bench.twins, now, errors_of(1e-4, 1e-4), [this, later], tried=30)
     if agree is None:
-        assert final is now and this.chosen == [STRIBECK, STRIBECK]
+        assert final is None and this.chosen == [STRIBECK, STRIBECK] and later.chosen == [QUADRATIC, QUADRATIC]
         return
     assert labels(final.model, ["hip", "knee"]) == agree and this.chosen[0] is GAIN
     physical = final.model.to_physical(final.x)[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
     assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([-0.1])
-    assert errors == "judged again"
+    assert later.chosen[0] is None and later.rivals[0] == []
+
+
+def test_an_effect_of_the_whole_robot_is_not_replaced_on_one_joint(bench):
+    base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
+    now = with_effects(base, values, (CLOCK, both, [1e-3]), (STRIBECK, both, [1.0, 0.1]))
+    trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4)] for j in range(2)]
+    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []])
+    assert one_for_several._options(now, [this]) == {}
+    now = with_effects(base, values, (GAIN, both, [0.1]), (STRIBECK, both, [1.0, 0.1]))
+    this.trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(CLOCK, j, 6e-4)] for j in range(2)]
+    assert one_for_several._options(now, [this]) == {}
+
+
+def test_where_an_encoder_sits_is_held_in_exchanges(bench):
+    base, here = JointModel.base(bench.problem), torch.tensor([True])
+    sides = []
+    for side in (0.0, 1.0):
+        elasticity = with_effects(base, bench.truth_values, (ELASTICITY, [True], [300.0, 1.0, side]))
+        physical = elasticity.model.to_physical(elasticity.x)
+        model, physical = swapping.exchanged(base, bench.truth_values, here, [], elasticity, ELASTICITY, len(BASE))
+        column = model.columns(ELASTICITY).stop - 1
+        assert not bool(model.free[0, column]) and float(physical[0, column]) == side
+        sides.append((model, elasticity))
+    model, physical = swapping.exchanged(sides[0][0], physical, here, [ELASTICITY], sides[1][1], ELASTICITY, len(BASE))
+    assert float(model.to_physical(model.to_normalised(physical))[0, column]) == 1.0  # and not where it was held before
 
 
 def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench, no_fits):

@@ -35,7 +35,8 @@ class World:
         result = []
         for now in models:
             self.everyone = self.effects_of(now)
-            result.append(errors_of(*(self.rmse(j, effects) for j, effects in enumerate(self.everyone))))
+            rmse = [self.rmse(j, effects) for j, effects in enumerate(self.everyone)]
+            result.append(errors_of(*rmse, roll=int(now.model.has.sum())))
         return result
 
     def try_effects(self, problem, now, errors, effects, effort, floor, say, rough):
@@ -65,6 +66,16 @@ def moves(problem, now):
     return SimpleNamespace(), now
 
 
+def without(world, _, now, errors, effects):
+    """Errors without each of some effects, along the motion with them."""
+    world.everyone = world.effects_of(now)
+    result = {}
+    for effect, joints in effects.items():
+        own = [[e for e in has if e is not effect or not joints[j]] for j, has in enumerate(world.everyone)]
+        result[effect] = errors_of(*(world.rmse(j, has) for j, has in enumerate(own)), roll=2)
+    return result
+
+
 def searched(monkeypatch, *joints, follow=stays):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
@@ -76,7 +87,8 @@ def searched(monkeypatch, *joints, follow=stays):
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
     monkeypatch.setattr(search, "pruned_at_last", lambda _, now, errors, tried: (now, errors))
-    monkeypatch.setattr(search, "one_for_several", lambda _, now, errors, rounds, tried: (now, errors))
+    monkeypatch.setattr(search, "one_for_several", lambda *_: None)
+    monkeypatch.setattr(search, "Without", lambda *args: SimpleNamespace(errors=without(world, *args)))
     bounds = torch.ones(n, len(BASE)).double()
     model = JointModel(
         effects=(),
@@ -181,7 +193,8 @@ def test_near_the_floor_nothing_is_sought_a_second_time(monkeypatch):
 
 def together(*joints, effect=ELASTICITY):
     """A table by which an effect helps only where all of some joints have it."""
-    return lambda everyone: mrad({(effect,): 0.1}) if all(effect in everyone[j] for j in joints) else constant(1.7)
+    helps = {**constant(1.7), **mrad({(effect,): 0.1})}
+    return lambda everyone: helps if all(effect in everyone[j] for j in joints) else constant(1.7)
 
 
 def test_joints_that_hide_the_same_from_each_other_are_given_it_at_once(monkeypatch):
@@ -197,37 +210,37 @@ def test_only_joints_that_gain_keep_what_they_were_given_with_others(monkeypatch
     assert effects == [{"joint_elasticity"}] * 3 + [set()]
 
 
+def test_a_joint_that_only_its_neighbours_kept_from_the_floor_keeps_nothing(monkeypatch):
+    def fine_beside_the_others(everyone):
+        return constant(0.1 if all(ELASTICITY in everyone[j] for j in (1, 2)) else 1.7)
+
+    effects, _ = found(monkeypatch, NEIGHBOUR, together(1, 2), together(1, 2), fine_beside_the_others)
+    assert effects == [{"joint_elasticity"}] * 3 + [set()]
+
+
 def test_joints_are_not_given_what_no_other_joint_has(monkeypatch):
     effects, _ = found(monkeypatch, NEIGHBOUR, together(1, 2, effect=SPRING), together(1, 2, effect=SPRING))
     assert effects == [{"joint_elasticity"}, set(), set()]
 
 
-def test_joints_agree_once_more_where_one_effect_took_the_place_of_several(monkeypatch):
-    calls = []
+def test_what_is_simplified_moves_along_its_own_motion(monkeypatch):
+    moved = []
 
-    def step(name, result):
-        monkeypatch.setattr(search, name, lambda *args: calls.append((name, args[1])) or result)
+    def follow(problem, now):
+        moved.append(now)
+        return f"motion of {now}", now
 
-    settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
-    whole = search._Search(effects=(GAIN, SPRING), floor=torch.ones(3), **settings)
-    branch = search._Branch(problem=None, now="several", errors="e", rounds=[])
-    step("validation_errors", ["f"])
-    step("pruned_at_last", "end")
-    for replaced, agreed, expected in (
-        ("several", None, [("one_for_several", "several"), ("pruned_at_last", "several")]),
-        ("one", None, [("one_for_several", "several"), ("swapped", "one"), ("pruned_at_last", "one")]),
-        (
-            "one",
-            "agreed",
-            [
-                ("one_for_several", "several"),
-                ("swapped", "one"),
-                ("validation_errors", ["agreed"]),
-                ("pruned_at_last", "agreed"),
-            ],
-        ),
-    ):
-        calls.clear()
-        step("one_for_several", (branch.now if replaced == "several" else replaced, "e"))
-        step("swapped", agreed)
-        assert whole.simplified(branch) == "end" and calls == expected
+    settings = dict.fromkeys(("effort", "max_effects", "say"))
+    whole = search._Search(effects=(GAIN, SPRING), floor=torch.ones(3), follow=follow, **settings)
+    branch = search._Branch(problem="old motion", now="several", errors=None, rounds=[])
+    monkeypatch.setattr(search, "validation_errors", lambda problem, models: [f"errors of {models[0]} in {problem}"])
+    monkeypatch.setattr(search, "one_for_several", lambda *_: None)
+    monkeypatch.setattr(search, "swapped", lambda *_: None)
+    monkeypatch.setattr(search, "pruned_at_last", lambda problem, now, errors, tried: (now, errors))
+    assert whole.simplified(branch).problem == "old motion" and moved == []  # nothing has changed
+    for name in ("one_for_several", "swapped"):
+        monkeypatch.setattr(search, name, lambda problem, *_, name=name: name)
+    monkeypatch.setattr(search, "pruned_at_last", lambda problem, now, errors, tried: (f"pruned {now}", None))
+    end = whole.simplified(branch)
+    assert moved == ["one_for_several", "swapped", "pruned swapped"]
+    assert end.problem == "motion of pruned swapped" and end.errors == f"errors of {end.now} in {end.problem}"

@@ -151,7 +151,7 @@ def test_they_come_back_and_leave_the_others_as_they_were(legs):
     assert whole[[1, 3], back.model.columns(FRICTION)].flatten().tolist() == pytest.approx([0.1, 0.2])
     assert whole[[0, 1], back.model.columns(ELASTICITY)].flatten().tolist() == pytest.approx([300.0, 1.0, 1.0] * 2)
     assert back.score[which].tolist() == [1.0, 2.0, 3.0]
-    square = part._errors_of_all(after, errors_of(*[1.0] * N)).square[0]
+    square = part._errors_of_all(after, errors_of(*[1.0] * N)).square[1]
     assert square.tolist() == [25.0 if j == 3 else 16.0 if j == 1 else 36.0 if j == 8 else 1.0 for j in range(N)]
 
 

@@ -134,9 +134,13 @@ class JointModel:
         model = self.with_effect(effect, joints)
         if effect not in self.effects:
             return model, torch.cat([physical, values], dim=1)
-        physical = physical.clone()
-        physical[joints, self.columns(effect)] = values[joints]
-        return model, physical
+        physical, lower, upper = physical.clone(), model.lower.clone(), model.upper.clone()
+        columns = self.columns(effect)
+        physical[joints, columns] = values[joints]
+        # what was held for a joint's old values is not held for its new ones
+        lower[joints, columns] = torch.tensor([p.lower for p in effect.parameters], dtype=torch.float64)
+        upper[joints, columns] = torch.tensor([p.upper for p in effect.parameters], dtype=torch.float64)
+        return replace(model, lower=lower, upper=upper), physical
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
         """The same with an effect's structural parameter held where it is: a choice between things is no way to walk.

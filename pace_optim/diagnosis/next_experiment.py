@@ -124,13 +124,14 @@ def _range(values: Sequence[float], form: str) -> str:
 
 
 def rivals_of(outcome: Outcome) -> list[Rivals]:
-    """Pairs of a chosen effect and one that does as well, with the joints where that is so."""
+    """Pairs of a chosen effect and one that does as well, with the joints where that is so and it stayed."""
     result = []
+    has = dict(zip(outcome.final.model.effects, outcome.final.model.has.tolist(), strict=True))
     for this in outcome.rounds:
         found: dict[tuple[type[Effect], type[Effect]], list[int]] = {}
         for j, (chosen, rivals) in enumerate(zip(this.chosen, this.rivals, strict=True)):
             for rival in rivals:
-                if chosen is not None:
+                if chosen is not None and chosen in has and has[chosen][j]:
                     found.setdefault((chosen, rival), []).append(j)
         result += [
             Rivals(chosen=a, rival=b, models=(this.models[a], this.models[b]), joints=joints)

@@ -33,7 +33,7 @@ def pruned(
         effect: has & latest & torch.tensor([e is not effect for e in newest])
         for effect, has in zip(now.model.effects, now.model.has, strict=True)
     }
-    without = _Without(problem, now, errors, older)
+    without = Without(problem, now, errors, older)
     dropped = {}
     for j, effects in without.tried.items():
         best = min(effects, key=lambda effect: without.mse(effect, j))
@@ -53,10 +53,11 @@ def pruned_at_last(problem: TwinProblem, now: Fitted, errors: BlockErrors, tried
         errors: Its errors.
         tried: How many candidates were tried, over all joints.
     """
+    open_joints = torch.ones(now.model.num_joints, dtype=torch.bool)
     while True:
-        several = now.model.has.sum(dim=0) > 1
+        several = open_joints & (now.model.has.sum(dim=0) > 1)
         own = zip(now.model.effects, now.model.has, strict=True)
-        without = _Without(problem, now, errors, {e: has & several for e, has in own if not e.shared})
+        without = Without(problem, now, errors, {e: has & several for e, has in own if not e.shared})
         dropped = {}
         for j, effects in without.tried.items():
             least = min(effects, key=lambda effect: without.mse(effect, j))
@@ -65,9 +66,10 @@ def pruned_at_last(problem: TwinProblem, now: Fitted, errors: BlockErrors, tried
         if not dropped:
             return now, errors
         now, errors = without.dropping(dropped)
+        open_joints = torch.tensor([j in dropped for j in range(now.model.num_joints)])
 
 
-class _Without:
+class Without:
     """A model without each of its effects in turn, the rest refitted."""
 
     def __init__(

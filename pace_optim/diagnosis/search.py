@@ -11,10 +11,11 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
 from pace_optim.diagnosis.evenness import unevenness
+from pace_optim.diagnosis.one_for_several import one_for_several
 from pace_optim.diagnosis.one_round import try_effects
-from pace_optim.diagnosis.pruning import pruned, pruned_at_last
+from pace_optim.diagnosis.pruning import Without, pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
-from pace_optim.diagnosis.swapping import one_for_several, swapped
+from pace_optim.diagnosis.swapping import swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
@@ -82,16 +83,15 @@ def add_effects(
             branch, found = search.led_on(branch, found)
         else:
             break
-    rounds = [*branch.rounds, *([] if found is None else [found])]
-    final, final_errors = search.simplified(branch)
+    branch = search.simplified(branch)
     return Outcome(
         problem=branch.problem,
         base=base,
         base_errors=errors,
-        final=final,
-        final_errors=final_errors,
-        unevenness=unevenness(final),
-        rounds=rounds,
+        final=branch.now,
+        final_errors=branch.errors,
+        unevenness=unevenness(branch.now),
+        rounds=[*branch.rounds, *([] if found is None else [found])],
     )
 
 
@@ -177,22 +177,33 @@ class _Search:
         """
         far = branch.errors.mse.sqrt() > LOOK_AHEAD * self.floor
         lacking = [j for j in far.nonzero()[:, 0].tolist() if found.chosen[j] is None]
-        for effect in [e for e in branch.now.model.effects if e in found.models and not e.shared]:
+        in_use = [e for e, has in zip(branch.now.model.effects, branch.now.model.has, strict=True) if bool(has.any())]
+        for effect in [e for e in in_use if e in found.models and not e.shared]:
             joints = [j for j in lacking if any(t.effect is effect for t in found.trials[j])]
             while joints:
                 self.say(f"trying {effect.name} on {len(joints)} more joint{'' if len(joints) == 1 else 's'} at once")
                 chosen = [effect if j in joints else old for j, old in enumerate(found.chosen)]
                 grown = self.grown(branch, replace(found, chosen=chosen))
-                trials = {j: self._judged_again(found.trials[j], effect, branch, grown) for j in joints}
+                trials = self._judged_again(effect, joints, found, grown)
                 if all(trial.significant for trial in trials.values()):
                     return replace(grown, rounds=[*grown.rounds[:-1], grown.rounds[-1].with_trials(trials)])
                 joints = [j for j, trial in trials.items() if trial.significant]
         return None
 
-    def _judged_again(self, trials: Sequence[Trial], effect: type[Effect], before: _Branch, after: _Branch) -> Trial:
-        """A joint's trial of an effect by what two branches leave of that joint."""
-        trial = next(t for t in trials if t.effect is effect)
-        return trial.judged(before.errors, after.errors, self._tried_over_joints, first=False)
+    def _judged_again(
+        self, effect: type[Effect], joints: Sequence[int], found: Round, grown: _Branch
+    ) -> dict[int, Trial]:
+        """What an effect brings each of several joints, held against them without it along the same motion."""
+        model = grown.now.model
+        here = torch.zeros(model.num_joints, dtype=torch.bool)
+        here[list(joints)] = True
+        has = model.has[model.effects.index(effect)]
+        without = Without(grown.problem, grown.now, grown.errors, {effect: here & has}).errors
+        before = without.get(effect, grown.errors)  # nothing is gained where it is not there any more
+        trials = {j: next(t for t in found.trials[j] if t.effect is effect) for j in joints}
+        return {
+            j: trial.judged(before, grown.errors, self._tried_over_joints, first=False) for j, trial in trials.items()
+        }
 
     def led_on(self, branch: _Branch, found: Round) -> tuple[_Branch, Round | None]:
         """The branch with the effects that lead furthest, and what could come next.
@@ -219,13 +230,21 @@ class _Search:
         taken = self.grown(branch, replace(found, chosen=chosen))
         return taken, beyond if _is_same(taken, way) else self.tried(taken)
 
-    def simplified(self, branch: _Branch) -> tuple[Fitted, BlockErrors]:
-        """A branch's model with no more effects than pay, and its errors."""
-        problem, rounds, tried = branch.problem, branch.rounds, self._tried_over_joints
-        now, errors = one_for_several(problem, branch.now, branch.errors, rounds, tried)
-        if now is not branch.now and (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
-            now, errors = exchanged, validation_errors(problem, [exchanged])[0]
-        return pruned_at_last(problem, now, errors, tried)
+    def simplified(self, branch: _Branch) -> _Branch:
+        """The branch with no more effects than pay, along the motion that follows."""
+        rounds = [each.copy() for each in branch.rounds]
+        problem, now, errors = branch.problem, branch.now, branch.errors
+        if (one := one_for_several(problem, now, errors, rounds, self._tried_over_joints)) is not None:
+            problem, now = self.follow(problem, one)
+            errors = validation_errors(problem, [now])[0]
+            if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
+                problem, now = self.follow(problem, exchanged)
+                errors = validation_errors(problem, [now])[0]
+        left, left_errors = pruned_at_last(problem, now, errors, self._tried_over_joints)
+        if left is not now:
+            problem, left = self.follow(problem, left)
+            left_errors = validation_errors(problem, [left])[0]
+        return _Branch(problem=problem, now=left, errors=left_errors, rounds=rounds)
 
 
 def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
@@ -240,6 +259,7 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
         values = source.model.to_physical(source.x)
         model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
         physical[has, :size] = values[has, :size]
+        model = model.structure_held(effect, physical)
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=1, keep_jacobian=True)[0]
 
 

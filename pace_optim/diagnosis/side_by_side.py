@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import graphlib
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -142,15 +143,12 @@ def _runs(effects: Sequence[tuple[type[Effect], ...]]) -> list[_Run]:
 
 
 def _merged(effects: Sequence[tuple[type[Effect], ...]]) -> list[type[Effect]]:
-    """All effects of several models, each after the one that it follows in the first model that has it."""
-    result: list[type[Effect]] = []
+    """All effects of several models in an order that agrees with each model's own."""
+    after = graphlib.TopologicalSorter[type[Effect]]()
     for each in effects:
-        place = 0
-        for effect in each:
-            if effect not in result:
-                result.insert(place, effect)
-            place = result.index(effect) + 1
-    return result
+        for before, effect in zip((None, *each), each, strict=False):
+            after.add(effect, *([] if before is None else [before]))
+    return list(after.static_order())
 
 
 def _of_effect(model: JointModel, effect: type[Effect], physical: torch.Tensor) -> torch.Tensor:
