@@ -76,7 +76,7 @@ def without(world, _, now, errors, effects):
     return result
 
 
-def searched(monkeypatch, *joints, follow=stays):
+def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
     monkeypatch.setattr(search, "validation_errors", world.errors)
@@ -100,7 +100,7 @@ def searched(monkeypatch, *joints, follow=stays):
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING]
     problem = SimpleNamespace(on_joints=lambda joints: SimpleNamespace(joints=joints))
-    outcome = search.add_effects(problem, base, candidates, 5 * floor, floor, 3, follow=follow)
+    outcome = search.add_effects(problem, base, candidates, 5 * floor, floor, 3, say, follow)
     assert torch.equal(outcome.final_errors.mse, world.errors(None, [outcome.final])[0].mse)
     return outcome, world
 
@@ -208,6 +208,14 @@ def test_joints_that_hide_the_same_from_each_other_are_given_it_at_once(monkeypa
 def test_only_joints_that_gain_keep_what_they_were_given_with_others(monkeypatch):
     effects, _ = found(monkeypatch, NEIGHBOUR, together(1, 2), together(1, 2), constant(1.7))
     assert effects == [{"joint_elasticity"}] * 3 + [set()]
+
+
+def test_what_brought_other_joints_most_is_given_first(monkeypatch):
+    little = mrad({(): 1.0, (MOUNT,): 0.99, (ELASTICITY,): 0.99, (GAIN,): 0.99, (SPRING,): 0.8})
+    said = []
+    wants_gain = {**constant(39.0), **mrad({(GAIN,): 0.1})}
+    searched(monkeypatch, little, wants_gain, together(2, 3, effect=GAIN), together(2, 3, effect=GAIN), say=said.append)
+    assert next(text for text in said if "at once" in text).startswith("trying torque_gain")
 
 
 def test_a_joint_that_only_its_neighbours_kept_from_the_floor_keeps_nothing(monkeypatch):

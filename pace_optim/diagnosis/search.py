@@ -48,6 +48,11 @@ class _Branch:
     errors: BlockErrors
     rounds: list[Round]
 
+    def fall_with(self, effect: type[Effect]) -> float:
+        """By how much an effect lowered the squared error of the joints that chose it [rad²]."""
+        trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
+        return sum(trial.mse_before - trial.mse_after for trial in trials if trial.effect is effect)
+
 
 def add_effects(
     problem: TwinProblem,
@@ -178,6 +183,7 @@ class _Search:
         far = branch.errors.mse.sqrt() > LOOK_AHEAD * self.floor
         lacking = [j for j in far.nonzero()[:, 0].tolist() if found.chosen[j] is None]
         in_use = [e for e, has in zip(branch.now.model.effects, branch.now.model.has, strict=True) if bool(has.any())]
+        in_use.sort(key=branch.fall_with, reverse=True)
         for effect in [e for e in in_use if e in found.models and not e.shared]:
             joints = [j for j in lacking if any(t.effect is effect for t in found.trials[j])]
             while joints:
