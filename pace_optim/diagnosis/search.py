@@ -15,7 +15,7 @@ from pace_optim.diagnosis.one_for_several import one_for_several
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import Without, pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
-from pace_optim.diagnosis.swapping import swapped
+from pace_optim.diagnosis.swapping import exchanged, swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
@@ -166,8 +166,8 @@ class _Search:
         problem, now = self.follow(branch.problem, _combined(branch.problem, branch.now, found))
         now, errors = self._settled(problem, now)
         self.say("trying others in place of what was found")
-        if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
-            problem, now = self.follow(problem, exchanged)
+        if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
+            problem, now = self.follow(problem, other)
             errors = validation_errors(problem, [now])[0]
         if branch.rounds:
             self.say("trying to do without what was found earlier")
@@ -243,8 +243,8 @@ class _Search:
         if (one := one_for_several(problem, now, errors, rounds, self._tried_over_joints)) is not None:
             problem, now = self.follow(problem, one)
             errors = validation_errors(problem, [now])[0]
-            if (exchanged := swapped(problem, now, errors, rounds, self.floor)) is not None:
-                problem, now = self.follow(problem, exchanged)
+            if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
+                problem, now = self.follow(problem, other)
                 errors = validation_errors(problem, [now])[0]
         left, left_errors = pruned_at_last(problem, now, errors, self._tried_over_joints)
         if left is not now:
@@ -261,11 +261,7 @@ def _combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
     model, physical, size = now.model, now.model.to_physical(now.x), now.model.size
     for effect in dict.fromkeys(e for e in found.chosen if e is not None):
         has = torch.tensor([e is effect for e in found.chosen])
-        source = found.models[effect]
-        values = source.model.to_physical(source.x)
-        model, physical = model.extended(physical, effect, has, values[:, source.model.columns(effect)])
-        physical[has, :size] = values[has, :size]
-        model = model.structure_held(effect, physical)
+        model, physical = exchanged(model, physical, has, [], found.models[effect], effect, size)
     return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=1, keep_jacobian=True)[0]
 
 
