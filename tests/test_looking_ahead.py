@@ -6,7 +6,7 @@ import torch
 from diagnoses import errors_of, make_trial
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import search
+from pace_optim.diagnosis import search, steps
 from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.trials import Round
@@ -79,15 +79,16 @@ def without(world, _, now, errors, effects):
 def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
-    monkeypatch.setattr(search, "validation_errors", world.errors)
-    monkeypatch.setattr(search, "try_effects", world.try_effects)
-    monkeypatch.setattr(search, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
-    monkeypatch.setattr(search, "fit_over_wide_steps", lambda _, now: now)
-    monkeypatch.setattr(search, "swapped", lambda *_: None)
+    for module in (search, steps):
+        monkeypatch.setattr(module, "validation_errors", world.errors)
+    monkeypatch.setattr(steps, "try_effects", world.try_effects)
+    monkeypatch.setattr(steps, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
+    monkeypatch.setattr(steps, "fit_over_wide_steps", lambda _, now: now)
+    monkeypatch.setattr(steps, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
-    monkeypatch.setattr(search, "pruned", lambda _, now, errors, newest: (now, errors))
-    monkeypatch.setattr(search, "pruned_at_last", lambda _, now, errors, tried: (now, errors))
-    monkeypatch.setattr(search, "one_for_several", lambda *_: None)
+    monkeypatch.setattr(steps, "pruned", lambda _, now, errors, newest: (now, errors))
+    monkeypatch.setattr(steps, "pruned_at_last", lambda _, now, errors, tried: (now, errors))
+    monkeypatch.setattr(steps, "one_for_several", lambda *_: None)
     monkeypatch.setattr(search, "Without", lambda *args: SimpleNamespace(errors=without(world, *args)))
     bounds = torch.ones(n, len(BASE)).double()
     model = JointModel(
@@ -239,16 +240,16 @@ def test_what_is_simplified_moves_along_its_own_motion(monkeypatch):
         return f"motion of {now}", now
 
     settings = dict.fromkeys(("effort", "max_effects", "say"))
-    whole = search._Search(effects=(GAIN, SPRING), floor=torch.ones(3), follow=follow, **settings)
-    branch = search._Branch(problem="old motion", now="several", errors=None, rounds=[])
-    monkeypatch.setattr(search, "validation_errors", lambda problem, models: [f"errors of {models[0]} in {problem}"])
-    monkeypatch.setattr(search, "one_for_several", lambda *_: None)
-    monkeypatch.setattr(search, "swapped", lambda *_: None)
-    monkeypatch.setattr(search, "pruned_at_last", lambda problem, now, errors, tried: (now, errors))
+    whole = steps.Steps(effects=(GAIN, SPRING), floor=torch.ones(3), follow=follow, **settings)
+    branch = steps.Branch(problem="old motion", now="several", errors=None, rounds=[])
+    monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [f"errors of {models[0]} in {problem}"])
+    monkeypatch.setattr(steps, "one_for_several", lambda *_: None)
+    monkeypatch.setattr(steps, "swapped", lambda *_: None)
+    monkeypatch.setattr(steps, "pruned_at_last", lambda problem, now, errors, tried: (now, errors))
     assert whole.simplified(branch).problem == "old motion" and moved == []  # nothing has changed
     for name in ("one_for_several", "swapped"):
-        monkeypatch.setattr(search, name, lambda problem, *_, name=name: name)
-    monkeypatch.setattr(search, "pruned_at_last", lambda problem, now, errors, tried: (f"pruned {now}", None))
+        monkeypatch.setattr(steps, name, lambda problem, *_, name=name: name)
+    monkeypatch.setattr(steps, "pruned_at_last", lambda problem, now, errors, tried: (f"pruned {now}", None))
     end = whole.simplified(branch)
     assert moved == ["one_for_several", "swapped", "pruned swapped"]
     assert end.problem == "motion of pruned swapped" and end.errors == f"errors of {end.now} in {end.problem}"

@@ -1,0 +1,149 @@
+"""The steps of the search: trying what could come next, growing a model by it, and making it simple in the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
+from pace_optim.diagnosis.one_for_several import one_for_several
+from pace_optim.diagnosis.one_round import try_effects
+from pace_optim.diagnosis.pruning import pruned, pruned_at_last
+from pace_optim.diagnosis.some_joints import SomeJoints
+from pace_optim.diagnosis.swapping import exchanged, swapped
+from pace_optim.diagnosis.trials import NEXT_FLOOR, Round
+from pace_optim.diagnosis.validation import validation_errors
+from pace_optim.joint_twins.problem import TwinProblem
+
+LOOK_AHEAD = 3.0
+"""A joint is far from the floor above this many times it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Branch:
+    """A model on the way, and the rounds that led to it."""
+
+    problem: TwinProblem
+    now: Fitted
+    errors: BlockErrors
+    rounds: list[Round]
+
+    def fall_with(self, effect: type[Effect]) -> float:
+        """By how much an effect lowered the squared error of the joints that chose it [rad²]."""
+        trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
+        return sum(trial.mse_before - trial.mse_after for trial in trials if trial.effect is effect)
+
+    def reach(self, found: Round | None) -> torch.Tensor:
+        """Squared validation error of each joint with the best of what could come next, (n,) [rad²]."""
+        reach = self.errors.mse.clone()
+        for j, trials in enumerate([] if found is None else found.trials):
+            reach[j] = min([float(reach[j]), *(t.mse_after for t in trials if t.significant)])
+        return reach
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Steps:
+    """One step at a time, on whatever branch; fields as in :func:`pace_optim.diagnosis.search.add_effects`."""
+
+    effects: Sequence[type[Effect]]
+    effort: torch.Tensor
+    floor: torch.Tensor
+    max_effects: int
+    say: Callable[[str], None]
+    follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]]
+
+    @property
+    def tried_over_joints(self) -> int:
+        """How many candidates were tried, over all joints."""
+        return len(self.effects) * len(self.floor)
+
+    def tried(self, branch: Branch) -> Round | None:
+        """What could come next; ``None`` if there is nothing to try."""
+        depth = len(branch.rounds)
+        missed = torch.zeros(len(self.floor))
+        for each in branch.rounds:
+            missed += torch.tensor([chosen is None for chosen in each.chosen])
+        above = branch.errors.mse.sqrt() / self.floor
+        # how the neighbours moved may have hidden what is missing: once they are explained, a second try
+        open_joints = missed <= (above > LOOK_AHEAD)
+        # beside a joint that is far from the floor, another's last tenths may come from how that one moves
+        alike = depth == 0 and bool((above <= LOOK_AHEAD).all())
+        open_joints &= above > (1.0 if alike else NEXT_FLOOR)
+        untried = [e for e in self.effects if bool((branch.now.model.may_get(e) & open_joints).any())]
+        if depth == self.max_effects or not bool(open_joints.any()) or not untried:
+            return None
+        self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
+        part = SomeJoints(open_joints)
+        now, errors = part.of_fit(branch.now), part.of_errors(branch.errors)
+        found = try_effects(
+            part.of_problem(branch.problem),
+            now,
+            errors,
+            untried,
+            self.effort[open_joints],
+            self.floor[open_joints],
+            self.say,
+            rough=self._is_rough(branch.now, branch.errors),
+        )
+        return None if found is None else part.round_of_all(found, branch.now)
+
+    def _is_rough(self, now: Fitted, errors: BlockErrors) -> bool:
+        """Whether contacts or springs of joints far from the floor may keep narrow derivatives from leading on."""
+        far = errors.mse.sqrt() > LOOK_AHEAD * self.floor
+        return any(
+            e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
+        )
+
+    def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
+        """A model and its errors, fitted over wide steps where narrow ones may have led no further."""
+        errors = validation_errors(problem, [now])[0]
+        if not self._is_rough(now, errors):
+            return now, errors
+        now = fit_over_wide_steps(problem, now)
+        return now, validation_errors(problem, [now])[0]
+
+    def grown(self, branch: Branch, found: Round) -> Branch:
+        """The branch with each joint's chosen effect, and what that changes of the older ones."""
+        rounds = [each.copy() for each in [*branch.rounds, found]]
+        problem, now = self.follow(branch.problem, combined(branch.problem, branch.now, found))
+        now, errors = self.settled(problem, now)
+        self.say("trying others in place of what was found")
+        if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
+            problem, now = self.follow(problem, other)
+            errors = validation_errors(problem, [now])[0]
+        if branch.rounds:
+            self.say("trying to do without what was found earlier")
+        now, errors = pruned(problem, now, errors, found.chosen)
+        return Branch(problem=problem, now=now, errors=errors, rounds=rounds)
+
+    def simplified(self, branch: Branch) -> Branch:
+        """The branch with no more effects than pay, along the motion that follows."""
+        rounds = [each.copy() for each in branch.rounds]
+        problem, now, errors = branch.problem, branch.now, branch.errors
+        if (one := one_for_several(problem, now, errors, rounds, self.tried_over_joints)) is not None:
+            problem, now = self.follow(problem, one)
+            errors = validation_errors(problem, [now])[0]
+            if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
+                problem, now = self.follow(problem, other)
+                errors = validation_errors(problem, [now])[0]
+        left, left_errors = pruned_at_last(problem, now, errors, self.tried_over_joints)
+        if left is not now:
+            problem, left = self.follow(problem, left)
+            left_errors = validation_errors(problem, [left])[0]
+        return Branch(problem=problem, now=left, errors=left_errors, rounds=rounds)
+
+
+def combined(problem: TwinProblem, now: Fitted, found: Round) -> Fitted:
+    """The present model with each joint's chosen effect, refitted unless all joints chose the same."""
+    one = found.models[found.chosen[0]] if len(set(found.chosen)) == 1 and found.chosen[0] is not None else None
+    if one is not None and one.jacobian is not None:
+        return replace(one, tried=None)
+    model, physical, size = now.model, now.model.to_physical(now.x), now.model.size
+    for effect in dict.fromkeys(e for e in found.chosen if e is not None):
+        has = torch.tensor([e is effect for e in found.chosen])
+        model, physical = exchanged(model, physical, has, [], found.models[effect], effect, size)
+    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=1, keep_jacobian=True)[0]
