@@ -253,7 +253,38 @@ def test_a_model_goes_on_that_is_near_the_best_on_any_joint():
     def model(*scores):
         return SimpleNamespace(score=torch.tensor(scores))
 
-    best, elsewhere, behind = model(1.0, 1.0), model(9.0, 0.5), model(9.0, 9.0)
-    fitted = []
-    descent._near_ones([best, elsewhere, behind], lambda near: fitted.append(near) or near)
-    assert fitted == [[best, elsewhere]]
+    assert descent._near([model(1.0, 1.0), model(9.0, 0.5), model(9.0, 9.0)]) == [True, True, False]
+
+
+def test_a_descent_says_whether_it_was_still_falling_at_its_last_iteration(bench):
+    model = JointModel.base(bench.problem)
+
+    def falls(*gains):
+        way, _ = gaining(model, bench.truth_values, [[gain] for gain in gains])
+        return way.result().falls
+
+    assert falls(0.5, 0.5, 0.5) and falls(0.03, 0.03, 0.03)
+    assert not falls(0.5, 0.005, 0.005, 0.005)  # crawls
+    assert not falls(0.5, 0.001, 0.001)  # has converged
+    assert not falls()
+
+
+def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best(monkeypatch):
+    scores = {"slow": [1.5, 1.0, 0.3], "far": [50.0, 0.0], "done": [0.6], "best": [0.5, 0.4, 0.3, 0.2]}  # run by run
+    asked = []
+
+    def fit(problem, starts, *_, **__):
+        names = [start.name for start in starts]
+        asked.append((problem, names))
+        left = [scores[name] for name in names]
+        own = [each.pop(0) if each else 0.0 for each in left]
+        return [
+            SimpleNamespace(name=name, score=torch.tensor([score]), falls=bool(more))
+            for name, score, more in zip(names, own, left, strict=True)
+        ]
+
+    monkeypatch.setattr(descent, "fit_side_by_side", fit)
+    problem = SimpleNamespace(control_dt=0.0025, with_physics_dt=lambda dt: "coarse")
+    fit_coarse_to_fine(problem, [SimpleNamespace(name=name) for name in scores])
+    assert asked[:3] == [("coarse", list(scores)), ("coarse", ["slow", "best"]), ("coarse", ["slow", "best"])]
+    assert asked[3:] == [(problem, ["slow", "done", "best"])]  # then the finer step

@@ -30,6 +30,10 @@ _BEHIND = 2.0
 """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
 _COARSE, _FINE = 8, 3
 """Iterations at the control step and at the problem's physics step."""
+_LONGER = 3
+"""How many times as many at the control step, at most, for a model that still falls."""
+_FALLS, _FALLS_OVER = 0.05, 3
+"""A model still falls whose squared error over all joints has fallen by more than this part over so many steps."""
 _STRIDE = 2
 """Only every so many control steps count in a fit."""
 
@@ -49,6 +53,8 @@ class Fitted:
     """Derivatives of the errors at x (P, K, R, n) float32, where wanted."""
     error: torch.Tensor | None = None
     """At x, (K, R, n) float32, where wanted."""
+    falls: bool = False
+    """Whether its error was still falling when its iterations were over."""
 
     @classmethod
     def start(cls, model: JointModel, physical: torch.Tensor, tried: type[Effect] | None = None) -> Fitted:
@@ -79,9 +85,14 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
     """
     at_control_step = problem.with_physics_dt(problem.control_dt)
     result = fit_side_by_side(at_control_step, starts, _COARSE)
+    for _ in range(_LONGER - 1):
+        falling = [near and each.falls for near, each in zip(_near(result), result, strict=True)]
+        result = _again(result, falling, lambda those: fit_side_by_side(at_control_step, those, _COARSE))
     if rough:
-        result = _near_ones(result, lambda near: fit_side_by_side(at_control_step, near, _COARSE, rough=True))
-    return _near_ones(result, lambda near: fit_side_by_side(problem, near, _FINE, keep_jacobian=True))
+        result = _again(
+            result, _near(result), lambda those: fit_side_by_side(at_control_step, those, _COARSE, rough=True)
+        )
+    return _again(result, _near(result), lambda those: fit_side_by_side(problem, those, _FINE, keep_jacobian=True))
 
 
 def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
@@ -91,12 +102,20 @@ def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
     return fit_side_by_side(problem, coarse, _FINE, keep_jacobian=True)[0]
 
 
-def _near_ones(models: Sequence[Fitted], fit: Callable[[list[Fitted]], list[Fitted]]) -> list[Fitted]:
-    """All models, fitted again those that are near the best one on some joint."""
+def _near(models: Sequence[Fitted]) -> list[bool]:
+    """Which models are near the best one on some joint."""
     scores = torch.stack([each.score for each in models])
-    near = (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
-    again = iter(fit([each for each, yes in zip(models, near, strict=True) if yes]))
-    return [next(again) if yes else each for each, yes in zip(models, near, strict=True)]
+    return (scores <= _BEHIND**2 * scores.amin(dim=0)).any(dim=1).tolist()
+
+
+def _again(
+    models: Sequence[Fitted], which: Sequence[bool], fit: Callable[[list[Fitted]], list[Fitted]]
+) -> list[Fitted]:
+    """All models, some of them fitted again."""
+    if not any(which):
+        return list(models)
+    fitted = iter(fit([each for each, yes in zip(models, which, strict=True) if yes]))
+    return [next(fitted) if yes else each for each, yes in zip(models, which, strict=True)]
 
 
 def fit_side_by_side(
@@ -168,6 +187,7 @@ class _Way:
         self._free = start.model.free
         self._jacobian: torch.Tensor | None = None
         self._error: torch.Tensor | None = None
+        self._scores: list[float] = []
 
     @property
     def finished(self) -> bool:
@@ -213,6 +233,7 @@ class _Way:
         moved = better & ~fresh
         self.x = torch.where(moved[:, None], chosen, self.x)
         self.score = torch.where(better, lowest, self.score)
+        self._scores.append(float(self.score.sum()))
         factor = torch.tensor(_TRIALS, dtype=torch.float64)[best]
         lowered = (self._damping * factor / 10).clamp(min=1e-9)
         self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * 1e3))
@@ -243,4 +264,10 @@ class _Way:
             tried=self.tried,
             jacobian=self._jacobian,
             error=self._error,
+            falls=self._falls(),
         )
+
+    def _falls(self) -> bool:
+        """Whether the last steps have lowered the error."""
+        last = self._scores[-1 - _FALLS_OVER :]
+        return not self.finished and len(last) > 1 and last[-1] < (1 - _FALLS) * last[0]
