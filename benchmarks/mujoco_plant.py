@@ -126,7 +126,8 @@ def record(folder: Path, effect: str, seed: int, friction_time_constant: float) 
     rng = np.random.default_rng([seed, list(EFFECTS).index(effect)])
     base = drawn_base(rng)
     sizes = EFFECTS[effect](rng)
-    print(f"{effect}, seed {seed}: { ({**base, **sizes}) }".replace("np.float64", ""), flush=True)
+    told = ", ".join(f"{name} {value:.4g}" for name, value in {**base, **sizes}.items())
+    print(f"{effect}, seed {seed}: {told}", flush=True)
     for name, command in commands(rng).items():
         kp = 130.0 if name == "stiff" else 85.0
         seen = simulate(command, kp, base, sizes, friction_time_constant)
