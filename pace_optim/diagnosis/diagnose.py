@@ -15,6 +15,7 @@ from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import whole_values
+from pace_optim.diagnosis.one_delay import hold_late_joints
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.screening import absorbed_effects
@@ -157,6 +158,8 @@ def search_effects(
     torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base, run)
+    base, sentences = hold_late_joints(twins, base)
+    data.sentences += sentences
     absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
     base.model = replace(base.model, barred=absorbed)
 

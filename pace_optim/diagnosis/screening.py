@@ -96,7 +96,7 @@ def absorbed_effects(
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
-    result = {effect: torch.ones(now.model.num_joints, dtype=torch.bool) for effect in suspects}
+    result = {effect: now.model.free[:, BASE.index(effect.absorbed_by)].clone() for effect in suspects}
     for (effect, _), change in zip(probes, changes[len(takers) :], strict=True):
         for j in range(now.model.num_joints):
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
