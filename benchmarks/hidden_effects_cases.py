@@ -19,7 +19,7 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
+from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_to_whole
 from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.validation import validation_errors
@@ -119,7 +119,7 @@ def run_case(job: Job) -> dict[str, Any]:
         if not same:
             follow = OwnMotion(problem=problem, candidates=candidate_effects(), enough=found.data.floor).follow
             twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
-            with_truth = _rms(validation_errors(twins, [final])[0])
+            with_truth = _rms(validation_errors(twins, [fit_to_whole(twins, final)])[0])
         else:
             with_truth = _rms(outcome.final_errors)
     fitted = time.perf_counter()

@@ -36,6 +36,10 @@ class Dataset:
     """For each recording, whether none of it is trained on."""
     session_start: torch.Tensor
     """When each recording began, as if they had been made one after another in this order, (R,) [s]."""
+    start_time: torch.Tensor
+    """When its first sample was taken, since the recording began, (R,) [s]; not zero of a window."""
+    start_vel: torch.Tensor
+    """Speed at the first sample, (R, n) [rad/s]; zero where speeds were not recorded."""
 
     @property
     def num_recordings(self) -> int:
@@ -60,6 +64,8 @@ class Dataset:
             torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
             validation_only=tuple(self.validation_only[r] for r in chosen),
             session_start=self.session_start[chosen],
+            start_time=self.start_time[chosen],
+            start_vel=self.start_vel[chosen],
         )
 
     def on_joints(self, joints: Sequence[int]) -> Dataset:
@@ -72,6 +78,7 @@ class Dataset:
             command=self.command[..., chosen],
             measured=self.measured[..., chosen],
             measured_vel=self.measured_vel[..., chosen],
+            start_vel=self.start_vel[..., chosen],
         )
 
     def trained(self) -> list[int]:
@@ -146,6 +153,8 @@ def make_dataset(
         torque_enable=None if bool(enable.all()) else enable,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
         session_start=torch.tensor([0.0, *(r.duration for r in every[:-1])], dtype=torch.float64).cumsum(0),
+        start_time=torch.zeros(len(every), dtype=torch.float64),
+        start_vel=torch.stack([v * (r.dof_vel is not None) for v, r in zip(measured_vel[0], every, strict=True)]),
     )
 
 

@@ -140,13 +140,13 @@ class Rollout:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
         dt = self.env.step_dt
         total = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        start = self._rows(self.dataset.start_time[:, None])
         found = False
         for actuator in self.robot.actuators.values():
             if actuator.effects is not None and actuator.effects.lags:
                 found = True
                 for row, at in enumerate((0.0, (steps - 1) * dt)):
-                    time = torch.full((self.env.num_envs, actuator.num_joints), at, dtype=torch.float64)
-                    lag = actuator.effects.observation_lag(time)
+                    lag = actuator.effects.observation_lag((start + at).expand(-1, actuator.num_joints))
                     if lag is not None:
                         total[row][:, actuator.joint_indices] = lag / dt
         return total if found else None
@@ -193,8 +193,7 @@ class Rollout:
             ids = actuator.joint_indices
             shown[:, ids] += actuator.encoder_bias
             actuator.set_session_time(self._session_start[:, ids])
-        measured = [recording.dof_vel is not None for recording in self.dataset.recordings]
-        speed = self._rows(self.dataset.measured_vel[0] * torch.tensor(measured, dtype=torch.float64)[:, None])
+        speed = self._rows(self.dataset.start_vel)
         needs_load = any(actuator.needs_load for actuator in self.robot.actuators.values())
         for _ in range(_LOAD_STEPS if needs_load else 1):  # the load bends what an encoder on the motor shows
             self.robot.write_joint_state_to_sim(self.robot.joint_pos_that_shows(shown) + offset, speed)

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 from diagnoses import errors_of, make_trial
 
@@ -83,7 +84,7 @@ def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
         monkeypatch.setattr(module, "validation_errors", world.errors)
     monkeypatch.setattr(steps, "try_effects", world.try_effects)
     monkeypatch.setattr(steps, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
-    monkeypatch.setattr(steps, "fit_over_wide_steps", lambda _, now: now)
+    monkeypatch.setattr(steps, "fit_to_whole", lambda _, now, rough: now)
     monkeypatch.setattr(steps, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(steps, "pruned", lambda _, now, errors, newest: (now, errors))
@@ -242,7 +243,9 @@ def test_what_is_simplified_moves_along_its_own_motion(monkeypatch):
     settings = dict.fromkeys(("effort", "max_effects", "say"))
     whole = steps.Steps(effects=(GAIN, SPRING), floor=torch.ones(3), follow=follow, **settings)
     branch = steps.Branch(problem="old motion", now="several", errors=None, rounds=[])
-    monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [f"errors of {models[0]} in {problem}"])
+    monkeypatch.setattr(
+        steps.Steps, "settled", lambda _, problem, now: (f"settled {now}", f"errors of {now} in {problem}")
+    )
     monkeypatch.setattr(steps, "one_for_several", lambda *_: None)
     monkeypatch.setattr(steps, "swapped", lambda *_: None)
     monkeypatch.setattr(steps, "pruned_at_last", lambda problem, now, errors, tried: (now, errors))
@@ -251,5 +254,30 @@ def test_what_is_simplified_moves_along_its_own_motion(monkeypatch):
         monkeypatch.setattr(steps, name, lambda problem, *_, name=name: name)
     monkeypatch.setattr(steps, "pruned_at_last", lambda problem, now, errors, tried: (f"pruned {now}", None))
     end = whole.simplified(branch)
-    assert moved == ["one_for_several", "swapped", "pruned swapped"]
-    assert end.problem == "motion of pruned swapped" and end.errors == f"errors of {end.now} in {end.problem}"
+    assert moved == ["one_for_several", "swapped", "pruned settled swapped"]
+    assert end.now == f"settled {moved[-1]}" and end.problem == f"motion of {moved[-1]}"
+    assert end.errors == f"errors of {moved[-1]} in {end.problem}"
+
+
+@pytest.mark.parametrize(
+    ("effect", "score", "jacobian", "fitted"),
+    [
+        (ELASTICITY, 9.0, True, "over wide steps"),
+        (ELASTICITY, 0.9, True, None),  # near the floor
+        (GAIN, 9.0, True, None),
+        (GAIN, 9.0, None, "as it is"),  # was fitted in windows
+        (ELASTICITY, 9.0, None, "over wide steps"),
+    ],
+)
+def test_what_is_settled_was_fitted_to_whole_recordings(monkeypatch, effect, score, jacobian, fitted):
+    done = []
+    monkeypatch.setattr(
+        steps, "fit_to_whole", lambda _, now, rough: done.append("over wide steps" if rough else "as it is") or "whole"
+    )
+    monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [f"errors of {models[0]}"])
+    settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
+    model = SimpleNamespace(effects=(effect,), has=torch.tensor([[True]]))
+    now = SimpleNamespace(model=model, score=torch.tensor([(score * steps.LOOK_AHEAD) ** 2]), jacobian=jacobian)
+    settled, errors = steps.Steps(effects=(effect,), floor=torch.ones(1), **settings).settled("problem", now)
+    assert done == ([] if fitted is None else [fitted])
+    assert errors == f"errors of {settled}" and settled == (now if fitted is None else "whole")

@@ -16,8 +16,6 @@ from pace_optim.problem import Problem
 _FAR = 0.02
 """Where a normalised parameter has moved further than this the reference is simulated again."""
 _ROUNDS = 3
-_PART = 0.4
-"""Of the recordings; the last fit has all of them."""
 
 
 def fit_base(
@@ -41,11 +39,12 @@ def fit_base(
     model = JointModel.base(problem)
     names = [effect.name for effect in effects if effect.overrides("write_model")]
     fitted = Fitted.start(model, joint_vectors(problem, physical))
+    at_control_step = problem.with_physics_dt(problem.control_dt)
     for i in range(_ROUNDS):
         say(f"base model, round {i + 1}")
-        path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)))
-        coarse = twin_problem(problem, path).with_physics_dt(problem.control_dt)
-        before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6, part=_PART)[0]
+        path = reference_path(at_control_step, whole_vector(problem, model.to_physical(fitted.x)))
+        coarse = twin_problem(at_control_step, path).in_windows()
+        before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6)[0]
         if float((fitted.x - before.x).abs().max()) < _FAR:
             break
     path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)), names)

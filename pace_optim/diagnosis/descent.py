@@ -74,7 +74,7 @@ class Fitted:
 
 
 def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
-    """Go most of the way at the control step, which costs half, and the rest at the problem's physics step.
+    """Go most of the way in windows at the control step, and the rest on whole recordings at the problem's own.
 
     Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
@@ -83,23 +83,20 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
         starts: Models and where they start.
         rough: Whether to go on over wide steps where narrow ones have led.
     """
-    at_control_step = problem.with_physics_dt(problem.control_dt)
-    result = fit_side_by_side(at_control_step, starts, _COARSE)
+    coarse = problem.coarse()
+    result = fit_side_by_side(coarse, starts, _COARSE)
     for _ in range(_LONGER - 1):
         falling = [near and each.falls for near, each in zip(_near(result), result, strict=True)]
-        result = _again(result, falling, lambda those: fit_side_by_side(at_control_step, those, _COARSE))
+        result = _again(result, falling, lambda those: fit_side_by_side(coarse, those, _COARSE))
     if rough:
-        result = _again(
-            result, _near(result), lambda those: fit_side_by_side(at_control_step, those, _COARSE, rough=True)
-        )
+        result = _again(result, _near(result), lambda those: fit_side_by_side(coarse, those, _COARSE, rough=True))
     return _again(result, _near(result), lambda those: fit_side_by_side(problem, those, _FINE, keep_jacobian=True))
 
 
-def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
-    """Go on from a model over wide steps at the control step, and the rest at the problem's physics step."""
-    at_control_step = problem.with_physics_dt(problem.control_dt)
-    coarse = fit_side_by_side(at_control_step, [now], _COARSE, rough=True)
-    return fit_side_by_side(problem, coarse, _FINE, keep_jacobian=True)[0]
+def fit_to_whole(problem: TwinProblem, now: Fitted, rough: bool = False) -> Fitted:
+    """The last iterations of a model, on whole recordings; ``rough``: after some over wide steps in windows."""
+    start = fit_side_by_side(problem.coarse(), [now], _COARSE, rough=True) if rough else [now]
+    return fit_side_by_side(problem, start, _FINE, keep_jacobian=True)[0]
 
 
 def _near(models: Sequence[Fitted]) -> list[bool]:

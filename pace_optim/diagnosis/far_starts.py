@@ -17,17 +17,18 @@ _LEVELS = (-0.9, -0.5)
 """Normalised friction and viscous friction to begin with, beside those of the base model."""
 _MOST = 12
 """Effects with more probes than this are looked at at some of them."""
-_PART = 0.4
+_PART = 0.6
+"""Of each window."""
 _STRIDE = 2
 
 
 def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
-    Each point is simulated once, on the beginning of the training recordings.
+    Each point is simulated once, on the beginning of each window of the training recordings.
 
     Args:
-        problem: The joints simulated alone, at a coarse step.
+        problem: The joints simulated alone, coarsely.
         now: The present model.
         effects: What is tried.
     """

@@ -62,7 +62,7 @@ def one_for_several(
             this.chosen[j], this.rivals[j] = (best if this is rounds[0] else None), []
     if model is now.model:
         return None
-    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+    return fit_side_by_side(problem.in_windows(), [Fitted.start(model, physical)], max_iteration=6)[0]
 
 
 def _options(now: Fitted, rounds: Sequence[Round]) -> dict[type[Effect], list[int]]:

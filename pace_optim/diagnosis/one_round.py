@@ -25,6 +25,8 @@ PER_JOINT = 4
 """How many of them."""
 FROM_SCREENING = 2
 """How many of the best screened go on in any case, where refits began with all effects."""
+_PART = 0.6
+"""Of each window, where refits begin."""
 FAR_FROM_FLOOR = 50.0
 """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
 do for the first one."""
@@ -44,7 +46,7 @@ def try_effects(
 
     Args:
         problem: The joints simulated alone.
-        now: The present model, with its Jacobian.
+        now: The present model.
         errors: Its errors.
         effects: Candidates.
         effort: Typical torque of each joint, (n,) [N m].
@@ -52,7 +54,10 @@ def try_effects(
         say: Shows how far it is.
         rough: Whether refits go on over wide steps.
     """
-    probes = screen(problem.with_physics_dt(problem.control_dt), now, effects, effort)
+    start = Fitted.start(now.model, now.model.to_physical(now.x))
+    # one iteration stays where it is, and sees the errors and their derivatives in windows
+    seen = fit_side_by_side(problem.in_windows(), [start], max_iteration=1, keep_jacobian=True)[0]
+    probes = screen(problem.coarse(), seen, effects, effort)
     excess = (errors.mse - floor**2).clamp(min=0.0)
     listed = _short_list(_promising(probes, excess), excess)
     first = not now.model.effects
@@ -120,7 +125,7 @@ def _begun(
     Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
     goes on, joint by joint. Far from the floor the best of many points is another start.
     """
-    coarse = problem.with_physics_dt(problem.control_dt)
+    coarse = problem.coarse()
     starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
     for effect in effects:
         own = [probe for probe in probes if probe.effect is effect]
@@ -129,7 +134,7 @@ def _begun(
     if far:
         starts = _neighbours_together([*starts, *far_starts(coarse, now, effects)])
     result: dict[type[Effect] | None, Fitted] = {}
-    for each in fit_side_by_side(coarse, starts, max_iteration=4, part=0.4):
+    for each in fit_side_by_side(coarse, starts, max_iteration=4, part=_PART):
         best = result.setdefault(each.tried, each)
         best.take(each, each.score < best.score)
     return result

@@ -40,7 +40,7 @@ class OwnMotion:
     """Shows how far it is."""
 
     def follow(self, twins: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted]:
-        """The joints along the motion of the whole robot with a model, and the model fitted there.
+        """The joints along the motion of the whole robot with a model, and the model fitted there in windows.
 
         Args:
             twins: The joints along the present reference.
@@ -55,7 +55,7 @@ class OwnMotion:
             elif time == 0:
                 return twins, now
             before = now.score
-            now = fit_side_by_side(twins, [now], max_iteration=_ITERATIONS, keep_jacobian=True)[0]
+            now = fit_side_by_side(twins.in_windows(), [now], max_iteration=_ITERATIONS)[0]
             if bool(((now.score <= self.enough**2) | (now.score > _GAIN * before)).all()):
                 break
         return twins, now

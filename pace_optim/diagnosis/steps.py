@@ -9,7 +9,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side, fit_to_whole
 from pace_optim.diagnosis.one_for_several import one_for_several
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last
@@ -87,34 +87,36 @@ class Steps:
             self.effort[open_joints],
             self.floor[open_joints],
             self.say,
-            rough=self._is_rough(branch.now, branch.errors),
+            rough=self._is_rough(branch.now, branch.errors.mse),
         )
         return None if found is None else part.round_of_all(found, branch.now)
 
-    def _is_rough(self, now: Fitted, errors: BlockErrors) -> bool:
+    def _is_rough(self, now: Fitted, mse: torch.Tensor) -> bool:
         """Whether contacts or springs of joints far from the floor may keep narrow derivatives from leading on."""
-        far = errors.mse.sqrt() > LOOK_AHEAD * self.floor
+        far = mse.sqrt() > LOOK_AHEAD * self.floor
         return any(
             e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
         )
 
     def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
-        """A model and its errors, fitted over wide steps where narrow ones may have led no further."""
-        errors = validation_errors(problem, [now])[0]
-        if not self._is_rough(now, errors):
-            return now, errors
-        now = fit_over_wide_steps(problem, now)
+        """A model fitted to whole recordings, over wide steps where narrow ones may have led no further; its errors."""
+        rough = self._is_rough(now, now.score)
+        if rough or now.jacobian is None:  # it was fitted in windows
+            now = fit_to_whole(problem, now, rough)
         return now, validation_errors(problem, [now])[0]
+
+    def along_own_motion(self, problem: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted, BlockErrors]:
+        """The joints along the motion of the robot with a model, the model fitted there, and its errors."""
+        problem, now = self.follow(problem, now)
+        return problem, *self.settled(problem, now)
 
     def grown(self, branch: Branch, found: Round) -> Branch:
         """The branch with each joint's chosen effect, and what that changes of the older ones."""
         rounds = [each.copy() for each in [*branch.rounds, found]]
-        problem, now = self.follow(branch.problem, combined(branch.problem, branch.now, found))
-        now, errors = self.settled(problem, now)
+        problem, now, errors = self.along_own_motion(branch.problem, combined(branch.problem, branch.now, found))
         self.say("trying others in place of what was found")
         if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
-            problem, now = self.follow(problem, other)
-            errors = validation_errors(problem, [now])[0]
+            problem, now, errors = self.along_own_motion(problem, other)
         if branch.rounds:
             self.say("trying to do without what was found earlier")
         now, errors = pruned(problem, now, errors, found.chosen)
@@ -125,15 +127,12 @@ class Steps:
         rounds = [each.copy() for each in branch.rounds]
         problem, now, errors = branch.problem, branch.now, branch.errors
         if (one := one_for_several(problem, now, errors, rounds, self.tried_over_joints)) is not None:
-            problem, now = self.follow(problem, one)
-            errors = validation_errors(problem, [now])[0]
+            problem, now, errors = self.along_own_motion(problem, one)
             if (other := swapped(problem, now, errors, rounds, self.floor)) is not None:
-                problem, now = self.follow(problem, other)
-                errors = validation_errors(problem, [now])[0]
+                problem, now, errors = self.along_own_motion(problem, other)
         left, left_errors = pruned_at_last(problem, now, errors, self.tried_over_joints)
         if left is not now:
-            problem, left = self.follow(problem, left)
-            left_errors = validation_errors(problem, [left])[0]
+            problem, left, left_errors = self.along_own_motion(problem, left)
         return Branch(problem=problem, now=left, errors=left_errors, rounds=rounds)
 
 

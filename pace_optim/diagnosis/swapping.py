@@ -53,7 +53,7 @@ def swapped(
         (old, this), here = exchanges[effect][j], torch.arange(model.num_joints) == j
         model, physical = exchanged(model, physical, here, [old], models[effect], effect, now.model.size)
         _note(this, j, old, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
-    return fit_side_by_side(problem, [Fitted.start(model, physical)], max_iteration=6, keep_jacobian=True)[0]
+    return fit_side_by_side(problem.in_windows(), [Fitted.start(model, physical)], max_iteration=6)[0]
 
 
 def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) -> dict[type[Effect], _Exchange]:

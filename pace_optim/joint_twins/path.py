@@ -84,6 +84,21 @@ class ReferencePath:
         """Some of the recordings, by index."""
         return self._part((slice(None), list(recordings)))
 
+    def at(self, step: torch.Tensor, recording: torch.Tensor) -> ReferencePath:
+        """Parts of the recordings: of each (W,) those control steps (T', W); where there are none, the last one."""
+
+        def of(values: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
+            return values[steps.clamp(max=len(values) - 1), recording]
+
+        intervals = step[:-1]
+        return replace(
+            self,
+            position=of(self.position, step),
+            feel=self.feel.map(lambda each: of(each, intervals)),
+            stiffness=of(self.stiffness, intervals),
+            model_effects={key: feel.map(lambda each: of(each, intervals)) for key, feel in self.model_effects.items()},
+        )
+
     def _part(self, index: tuple, **changes: Any) -> ReferencePath:
         return replace(
             self,

@@ -12,6 +12,7 @@ from pace_optim.dataset import Dataset
 from pace_optim.evaluator import Evaluator
 from pace_optim.joint_twins.path import ReferencePath
 from pace_optim.joint_twins.simulation import TwinSimulation
+from pace_optim.joint_twins.windows import in_windows
 from pace_optim.problem import Problem
 
 
@@ -45,6 +46,15 @@ class TwinProblem(Problem):
     def with_physics_dt(self, physics_dt: float) -> TwinProblem:
         """The same with another physics step [s]."""
         return _with_path(super().with_physics_dt(physics_dt), self.path)
+
+    def in_windows(self) -> TwinProblem:
+        """The same with recordings cut into windows: some times as fast, to lead a fit, not to judge by."""
+        dataset, path = in_windows(self.dataset, self.path, self.control_dt)
+        return replace(self, dataset=dataset, path=path)
+
+    def coarse(self) -> TwinProblem:
+        """The same in windows, and at the control step."""
+        return self.in_windows().with_physics_dt(self.control_dt)
 
     def _evaluator(self, dataset: Dataset, path: ReferencePath) -> Evaluator:
         def make_env(num_envs: int) -> ManagerBasedRLEnv:

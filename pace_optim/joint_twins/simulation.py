@@ -61,10 +61,12 @@ class TwinSimulation(Simulation):
         load = _at_instants(path.feel.load)
         self._load = [_between(load, part).unbind() for part in parts]
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
+        self._felt: tuple[int, torch.Tensor, torch.Tensor] | None = None
+        """Of an interval, what joints carry in it: it is asked for several times."""
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Take over the parameters of an effect on the model, of joints with these degrees of freedom."""
-        place = self._place(columns)
+        place, self._felt = self._place(columns), None
         for parameter in effect.parameters:
             key = effect.name, parameter.name
             values = self._model_values.setdefault(
@@ -134,13 +136,16 @@ class TwinSimulation(Simulation):
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as :meth:`Simulation.felt_link`."""
         k, _ = self._interval()
-        rows = (self.num_envs // self._shape[1], -1, -1)
-        inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)
-        stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)
+        if self._felt is None or self._felt[0] != k:
+            rows = (self.num_envs // self._shape[1], -1, -1)
+            inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)
+            stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)
+            self._felt = k, inertia, stiffness.neg()
+        _, inertia, pull = self._felt
         if not torch.equal(columns, self._columns):
             place = self._place(columns)
-            inertia, stiffness = inertia.index_select(1, place), stiffness.index_select(1, place)
-        return inertia, -stiffness, inertia * self._stands_alone[columns]
+            inertia, pull = inertia.index_select(1, place), pull.index_select(1, place)
+        return inertia, pull, inertia * self._stands_alone[columns]
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Nothing to compute: what joints feel follows from the instant."""

@@ -1,0 +1,113 @@
+"""Recordings cut into windows: the same samples, and the same motion once a window's beginning is forgotten."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
+
+from pace_actuators.effects import get_effect
+from pace_envs import set_physics_dt
+from pace_optim.diagnosis.base_fit import joint_vectors
+from pace_optim.diagnosis.model import JointModel
+from pace_optim.diagnosis.side_by_side import SideBySide, Slot
+from pace_optim.joint_twins import reference_path, twin_problem
+
+DURATION = 6.5
+EFFECTS = {
+    "clock_skew": [0.003],  # both depend on when a window begins
+    "friction_drift": [0.8, 5.0],
+    "joint_elasticity": [300.0, 1.0, 0.0],
+}
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A long and a short recording, the latter with measured speeds and half as many samples, and one to validate."""
+    fine = env_cfg()
+    set_physics_dt(fine, DT / 10)
+    long, short, other = (record(chirp(t, amplitude=0.4), CALM, cfg=fine) for t in (DURATION, 3.2, 1.0))
+    speed = torch.as_tensor(short.dof_pos)[:, 0].diff(prepend=torch.zeros(1, dtype=torch.float64)) / DT
+    half = slice(None, None, 2)
+    short = replace(short, time=short.time[half], dof_pos=short.dof_pos[half], dof_vel=speed[half, None].numpy())
+    problem = make_problem([long, short], validation=[other]).with_physics_dt(DT / 2)
+    truth = physical(problem, CALM)
+    return SimpleNamespace(
+        problem=problem,
+        twins=twin_problem(problem, reference_path(problem, truth)),
+        values=joint_vectors(problem, truth),
+    )
+
+
+def windows_of(dataset, recording):
+    """Indices of a recording's windows."""
+    return [i for i, each in enumerate(dataset.recordings) if each is recording]
+
+
+def test_every_sample_is_in_one_window(bench):
+    whole, cut = bench.twins.dataset, bench.twins.in_windows().dataset
+    assert [len(windows_of(cut, recording)) for recording in whole.recordings] == [3, 2, 1]
+    for r, recording in enumerate(whole.recordings):
+        own = windows_of(cut, recording)
+        first = (cut.start_time[own] / DT).round().long()
+        for name in ("train", "validation"):
+            steps = [start + getattr(cut, name)[:, w].nonzero()[:, 0] for w, start in zip(own, first, strict=True)]
+            assert torch.equal(torch.cat(steps), getattr(whole, name)[:, r].nonzero()[:, 0])
+        for w, start in zip(own, first.tolist(), strict=True):
+            at = cut.sampled[:, w].nonzero()[:, 0]
+            assert torch.equal(cut.measured[at, w], whole.measured[at + start, r])
+            assert torch.equal(cut.command[at, w], whole.command[at + start, r])
+            assert torch.equal(cut.measured[0, w], whole.measured[start, r])
+            assert bool(whole.sampled[start, r])
+    assert torch.allclose(cut.session_start - cut.start_time, whole.session_start[[0, 0, 0, 1, 1, 2]])
+    assert len(cut.command) < 0.45 * len(whole.command)
+
+
+def test_a_window_has_its_own_part_of_the_reference(bench):
+    windows, whole = bench.twins.in_windows(), bench.twins.path
+    for r, recording in enumerate(bench.twins.dataset.recordings):
+        for w in windows_of(windows.dataset, recording):
+            start = round(float(windows.dataset.start_time[w]) / DT)
+            at = torch.arange(int(windows.dataset.sampled[:, w].nonzero()[-1]))
+            assert torch.equal(windows.path.position[at, w], whole.position[at + start, r])
+            assert torch.equal(windows.path.feel.torque[at, w], whole.feel.torque[at + start, r])
+            assert torch.equal(windows.path.stiffness[at, w], whole.stiffness[at + start, r])
+
+
+def test_a_window_begins_at_the_measured_speed(bench):
+    cut, (long, short) = bench.twins.in_windows().dataset, bench.twins.dataset.recordings[:2]
+    first, *later = windows_of(cut, long)
+    assert float(cut.start_vel[first].abs().max()) == 0.0  # at rest, and not recorded
+    for w in later:
+        at = round(float(cut.start_time[w]) / DT)
+        speed = (long.dof_pos[at + 1] - long.dof_pos[at - 1]) / (2 * DT)
+        assert cut.start_vel[w].tolist() == pytest.approx(speed.tolist(), abs=0.1)
+        assert abs(speed[0]) > 0.5
+    for w in windows_of(cut, short):
+        sample = round(float(cut.start_time[w]) / DT / 2)
+        assert cut.start_vel[w].tolist() == short.dof_vel[sample].tolist()
+
+
+@pytest.mark.parametrize("effect", [None, *EFFECTS])
+def test_once_its_beginning_is_forgotten_a_window_moves_as_the_whole(bench, effect):
+    model, values = JointModel.base(bench.problem), bench.values
+    if effect is not None:
+        own = torch.tensor([EFFECTS[effect]], dtype=torch.float64)
+        model, values = model.extended(values, get_effect(effect), torch.tensor([True]), own)
+
+    def errors(problem):
+        batch = SideBySide(problem, [Slot(model=model, rows=1)], training=True)
+        return batch.dataset, batch.simulate([values[None]], batch.dataset.train)[0]
+
+    whole, error = errors(bench.twins)
+    cut, of_windows = errors(bench.twins.in_windows())
+    _, *later = windows_of(cut, whole.recordings[0])
+    for w in later:
+        at = cut.train[:, w].nonzero()[:, 0]
+        start = round(float(cut.start_time[w]) / DT)
+        difference = of_windows[at, w] - error[at + start, 0]
+        assert float(difference.abs().max()) < 1e-3
+        assert float(difference.square().mean().sqrt()) < 2e-4
+    if effect is not None:
+        assert float(error.abs().max()) > 5e-3  # it is there
