@@ -17,7 +17,7 @@ _LEVELS = (-0.9, -0.5)
 """Normalised friction and viscous friction to begin with, beside those of the base model."""
 _MOST = 12
 """Effects with more probes than this are looked at at some of them."""
-_PART = 0.6
+_PART = 0.7
 """Of each window."""
 _STRIDE = 2
 

@@ -25,8 +25,8 @@ PER_JOINT = 4
 """How many of them."""
 FROM_SCREENING = 2
 """How many of the best screened go on in any case, where refits began with all effects."""
-_PART = 0.6
-"""Of each window, where refits begin."""
+_PART, _ITERATIONS = 0.7, 6
+"""Of each window, and how far, where refits begin: after four, what needs another derivative gain too is far behind."""
 FAR_FROM_FLOOR = 50.0
 """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
 do for the first one."""
@@ -134,7 +134,7 @@ def _begun(
     if far:
         starts = _neighbours_together([*starts, *far_starts(coarse, now, effects)])
     result: dict[type[Effect] | None, Fitted] = {}
-    for each in fit_side_by_side(coarse, starts, max_iteration=4, part=_PART):
+    for each in fit_side_by_side(coarse, starts, max_iteration=_ITERATIONS, part=_PART):
         best = result.setdefault(each.tried, each)
         best.take(each, each.score < best.score)
     return result

@@ -17,7 +17,7 @@ from pace_optim.joint_twins.path import ReferencePath
 
 _LENGTH = 2.0
 """Of a window's own samples [s]."""
-_BEFORE = 0.5
+_BEFORE = 1.0
 """Time before them [s]."""
 _SLOPE = 3
 """The speed at the beginning is the slope over so many samples to either side."""
