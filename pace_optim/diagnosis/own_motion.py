@@ -47,14 +47,12 @@ class OwnMotion:
             now: The model, fitted along it.
         """
         self.say("motion of the robot with what was found")
-        for time in range(_TIMES):
-            path = self._path(now)
-            alone = max(len(tree) for tree in self.problem.trees) == 1
-            if not alone or float((path.position - twins.path.position).abs().max()) >= _FAR:
-                twins = twin_problem(self.problem, path)
-            elif time == 0:
-                return twins, now
-            before = now.score
+        alone = max(len(tree) for tree in self.problem.trees) == 1
+        for _ in range(_TIMES):
+            path, before = self._path(now), now.score
+            if alone and float((path.position - twins.path.position).abs().max()) < _FAR:
+                break
+            twins = twin_problem(self.problem, path)
             now = fit_side_by_side(twins.in_windows(), [now], max_iteration=_ITERATIONS)[0]
             if bool(((now.score <= self.enough**2) | (now.score > _GAIN * before)).all()):
                 break
