@@ -284,7 +284,8 @@ def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best(monkeypatch)
         ]
 
     monkeypatch.setattr(descent, "fit_side_by_side", fit)
-    problem = SimpleNamespace(coarse=lambda: "coarse")
+    problem = SimpleNamespace(coarse=lambda: "coarse", in_windows=lambda: "windows")
     fit_coarse_to_fine(problem, [SimpleNamespace(name=name) for name in scores])
     assert asked[:3] == [("coarse", list(scores)), ("coarse", ["slow", "best"]), ("coarse", ["slow", "best"])]
-    assert asked[3:] == [(problem, ["slow", "done", "best"])]  # then whole recordings at the finer step
+    near = ["slow", "done", "best"]
+    assert asked[3:] == [("windows", near), (problem, near)]  # then the finer step, at last on whole recordings

@@ -84,7 +84,8 @@ def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
         monkeypatch.setattr(module, "validation_errors", world.errors)
     monkeypatch.setattr(steps, "try_effects", world.try_effects)
     monkeypatch.setattr(steps, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
-    monkeypatch.setattr(steps, "fit_to_whole", lambda _, now, rough: now)
+    monkeypatch.setattr(steps, "fit_over_wide_steps", lambda _, now: now)
+    monkeypatch.setattr(steps, "fit_to_whole", lambda _, starts: starts)
     monkeypatch.setattr(steps, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
     monkeypatch.setattr(steps, "pruned", lambda _, now, errors, newest: (now, errors))
@@ -262,22 +263,30 @@ def test_what_is_simplified_moves_along_its_own_motion(monkeypatch):
 @pytest.mark.parametrize(
     ("effect", "score", "jacobian", "fitted"),
     [
-        (ELASTICITY, 9.0, True, "over wide steps"),
-        (ELASTICITY, 0.9, True, None),  # near the floor
-        (GAIN, 9.0, True, None),
-        (GAIN, 9.0, None, "as it is"),  # was fitted in windows
-        (ELASTICITY, 9.0, None, "over wide steps"),
+        (ELASTICITY, 1.4, True, ["over wide steps", "to the whole"]),
+        (ELASTICITY, 1.2, True, []),  # at the floor
+        (GAIN, 9.0, True, []),
+        (GAIN, 9.0, None, ["to the whole"]),  # was fitted in windows
+        (ELASTICITY, 9.0, None, ["over wide steps", "to the whole"]),
     ],
 )
 def test_what_is_settled_was_fitted_to_whole_recordings(monkeypatch, effect, score, jacobian, fitted):
     done = []
-    monkeypatch.setattr(
-        steps, "fit_to_whole", lambda _, now, rough: done.append("over wide steps" if rough else "as it is") or "whole"
-    )
+
+    def in_windows(problem, now):
+        done.append("over wide steps")
+        return SimpleNamespace(**vars(now) | {"jacobian": None})
+
+    def to_whole(problem, starts):
+        done.append("to the whole")
+        return ["whole"]
+
+    monkeypatch.setattr(steps, "fit_over_wide_steps", in_windows)
+    monkeypatch.setattr(steps, "fit_to_whole", to_whole)
     monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [f"errors of {models[0]}"])
     settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
     model = SimpleNamespace(effects=(effect,), has=torch.tensor([[True]]))
-    now = SimpleNamespace(model=model, score=torch.tensor([(score * steps.LOOK_AHEAD) ** 2]), jacobian=jacobian)
+    now = SimpleNamespace(model=model, score=torch.tensor([score**2]), jacobian=jacobian)
     settled, errors = steps.Steps(effects=(effect,), floor=torch.ones(1), **settings).settled("problem", now)
-    assert done == ([] if fitted is None else [fitted])
-    assert errors == f"errors of {settled}" and settled == (now if fitted is None else "whole")
+    assert done == fitted
+    assert errors == f"errors of {settled}" and settled == ("whole" if fitted else now)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import Fitted, fit_side_by_side, fit_to_whole
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.joint_twins.problem import TwinProblem
@@ -49,7 +49,7 @@ def fit_base(
             break
     path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)), names)
     twins = twin_problem(problem, path)
-    fitted = fit_side_by_side(twins, [fitted], max_iteration=5, keep_jacobian=True)[0]
+    fitted = fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
     x = fitted.x
     return twins, fitted, path.typical_effort(model.to_physical(x)[:, BASE.index("armature")])
 

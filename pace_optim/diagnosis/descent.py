@@ -28,8 +28,8 @@ _STILL = 2
 """Steps in a row that gain less than that, after which a joint has converged."""
 _BEHIND = 2.0
 """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
-_COARSE, _FINE = 8, 3
-"""Iterations at the control step and at the problem's physics step."""
+_COARSE, _FINE, _WHOLE = 8, 3, 2
+"""Iterations at the control step, then at the problem's physics step in windows, then on whole recordings."""
 _LONGER = 3
 """How many times as many at the control step, at most, for a model that still falls."""
 _FALLS, _FALLS_OVER = 0.05, 3
@@ -74,7 +74,7 @@ class Fitted:
 
 
 def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
-    """Go most of the way in windows at the control step, and the rest on whole recordings at the problem's own.
+    """Go most of the way in windows at the control step, on at the problem's own, and the rest on whole recordings.
 
     Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
@@ -90,13 +90,18 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
         result = _again(result, falling, lambda those: fit_side_by_side(coarse, those, _COARSE))
     if rough:
         result = _again(result, _near(result), lambda those: fit_side_by_side(coarse, those, _COARSE, rough=True))
-    return _again(result, _near(result), lambda those: fit_side_by_side(problem, those, _FINE, keep_jacobian=True))
+    result = _again(result, _near(result), lambda those: fit_side_by_side(problem.in_windows(), those, _FINE))
+    return _again(result, _near(result), lambda those: fit_to_whole(problem, those))
 
 
-def fit_to_whole(problem: TwinProblem, now: Fitted, rough: bool = False) -> Fitted:
-    """The last iterations of a model, on whole recordings; ``rough``: after some over wide steps in windows."""
-    start = fit_side_by_side(problem.coarse(), [now], _COARSE, rough=True) if rough else [now]
-    return fit_side_by_side(problem, start, _FINE, keep_jacobian=True)[0]
+def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
+    """A model fitted in windows, over wide steps where narrow ones may lead no further."""
+    return fit_side_by_side(problem.in_windows(), [now], _COARSE, rough=True)[0]
+
+
+def fit_to_whole(problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
+    """The last iterations of models that windows have led, on whole recordings."""
+    return fit_side_by_side(problem, starts, _WHOLE, keep_jacobian=True)
 
 
 def _near(models: Sequence[Fitted]) -> list[bool]:

@@ -9,7 +9,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side, fit_to_whole
 from pace_optim.diagnosis.one_for_several import one_for_several
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last
@@ -87,22 +87,23 @@ class Steps:
             self.effort[open_joints],
             self.floor[open_joints],
             self.say,
-            rough=self._is_rough(branch.now, branch.errors.mse),
+            rough=self._is_rough(branch.now, branch.errors.mse, LOOK_AHEAD),
         )
         return None if found is None else part.round_of_all(found, branch.now)
 
-    def _is_rough(self, now: Fitted, mse: torch.Tensor) -> bool:
-        """Whether contacts or springs of joints far from the floor may keep narrow derivatives from leading on."""
-        far = mse.sqrt() > LOOK_AHEAD * self.floor
+    def _is_rough(self, now: Fitted, mse: torch.Tensor, times: float) -> bool:
+        """Whether contacts or springs of joints above so many times the floor may keep narrow derivatives back."""
+        far = mse.sqrt() > times * self.floor
         return any(
             e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
         )
 
     def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
         """A model fitted to whole recordings, over wide steps where narrow ones may have led no further; its errors."""
-        rough = self._is_rough(now, now.score)
-        if rough or now.jacobian is None:  # it was fitted in windows
-            now = fit_to_whole(problem, now, rough)
+        if self._is_rough(now, now.score, NEXT_FLOOR):  # or another effect would be sought beside it
+            now = fit_over_wide_steps(problem, now)
+        if now.jacobian is None:  # it was fitted in windows
+            now = fit_to_whole(problem, [now])[0]
         return now, validation_errors(problem, [now])[0]
 
     def along_own_motion(self, problem: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted, BlockErrors]:
