@@ -119,7 +119,7 @@ def run_case(job: Job) -> dict[str, Any]:
         if not same:
             follow = OwnMotion(problem=problem, candidates=candidate_effects(), enough=found.data.floor).follow
             twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
-            with_truth = _rms(validation_errors(twins, [fit_to_whole(twins, final)])[0])
+            with_truth = _rms(validation_errors(twins, fit_to_whole(twins, [final]))[0])
         else:
             with_truth = _rms(outcome.final_errors)
     fitted = time.perf_counter()
