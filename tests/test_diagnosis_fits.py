@@ -9,7 +9,7 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import descent, own_motion, search
+from pace_optim.diagnosis import descent, search
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import check_data
 from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
@@ -181,32 +181,10 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     assert again is along and same is fitted  # it has not moved
 
 
-@pytest.mark.parametrize(
-    ("scores", "times"),
-    [
-        ([[1.0, 1.0]] * 4, 2),  # the second motion gains nothing
-        ([[4.0, 1.0], [1.0, 1.0], [0.95, 0.97], [0.1, 0.1]], 3),
-        ([[8.0, 1.0], [4.0, 1.0], [2.0, 1.0], [1.0, 1.0], [0.5, 1.0]], 4),  # at most
-        ([[0.2, 0.2]] * 4, 1),  # near the floor at once
-    ],
-)
-def test_the_motion_is_renewed_as_long_as_that_pays(monkeypatch, scores, times):
-    paths, left = [], iter(scores)
-    monkeypatch.setattr(OwnMotion, "_path", lambda *_: paths.append(None))
-    monkeypatch.setattr(own_motion, "twin_problem", lambda *_: SimpleNamespace(in_windows=lambda: None))
-    monkeypatch.setattr(
-        own_motion, "fit_side_by_side", lambda *_, **__: [SimpleNamespace(score=torch.tensor(next(left)))]
-    )
-    robot = SimpleNamespace(trees=[["hip", "knee"]])
-    follow = OwnMotion(problem=robot, candidates=[], enough=torch.tensor([0.5, 0.5])).follow
-    follow(None, SimpleNamespace(score=torch.tensor([40.0, 40.0])))
-    assert len(paths) == times
-
-
 def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench):
     """After such a step derivatives are new, which is no gain and no failure."""
     model = JointModel.base(bench.problem)
-    way = descent._Way(Fitted.start(model, bench.truth_values), samples=1.0, keep=False, rough=False)
+    way = descent._Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=False)
     lowest, last = 1.0, model.size + 2
     asked = 0
     while not way.finished and asked < 10:
@@ -224,7 +202,7 @@ def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench
 
 def gaining(model, truth, gains):
     """A descent whose favoured steps lower the error by these parts, (asks, joints); how often it had to be asked."""
-    way = descent._Way(Fitted.start(model, truth), samples=1.0, keep=False, rough=False)
+    way = descent._Way(Fitted.start(model, truth), samples=torch.ones(1), keep=False, rough=False)
     lowest, asked = torch.ones(model.num_joints), 0
     for gain in [torch.zeros(model.num_joints), *(torch.tensor(each) for each in gains)]:  # derivatives come first
         if way.finished:

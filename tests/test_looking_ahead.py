@@ -85,6 +85,7 @@ def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
     monkeypatch.setattr(steps, "try_effects", world.try_effects)
     monkeypatch.setattr(steps, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
     monkeypatch.setattr(steps, "fit_over_wide_steps", lambda _, now: now)
+    monkeypatch.setattr(steps, "fit_trimmed", lambda _, now, joints: None)
     monkeypatch.setattr(steps, "fit_to_whole", lambda _, starts: starts)
     monkeypatch.setattr(steps, "swapped", lambda *_: None)
     monkeypatch.setattr(search, "unevenness", lambda now: torch.zeros(now.model.has.shape))
@@ -279,14 +280,49 @@ def test_what_is_settled_was_fitted_to_whole_recordings(monkeypatch, effect, sco
 
     def to_whole(problem, starts):
         done.append("to the whole")
-        return ["whole"]
+        return [SimpleNamespace(**vars(starts[0]) | {"jacobian": True, "score": torch.zeros(1)})]
 
     monkeypatch.setattr(steps, "fit_over_wide_steps", in_windows)
     monkeypatch.setattr(steps, "fit_to_whole", to_whole)
-    monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [f"errors of {models[0]}"])
+    monkeypatch.setattr(steps, "validation_errors", lambda problem, models: [("errors of", models[0])])
     settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
     model = SimpleNamespace(effects=(effect,), has=torch.tensor([[True]]))
     now = SimpleNamespace(model=model, score=torch.tensor([score**2]), jacobian=jacobian)
     settled, errors = steps.Steps(effects=(effect,), floor=torch.ones(1), **settings).settled("problem", now)
     assert done == fitted
-    assert errors == f"errors of {settled}" and settled == ("whole" if fitted else now)
+    assert errors == ("errors of", settled) and (settled is now) == (not fitted)
+
+
+@pytest.mark.parametrize(
+    ("after", "taken"), [([2.0, 2.0], [True, True]), ([2.0, 9.0], [True, False]), ([9.0, 9.0], [False, False])]
+)
+def test_joints_take_over_a_trimmed_fit_where_it_is_better_on_validation_recordings(monkeypatch, after, taken):
+    """Two joints at an RMSE of 5; fitted without the windows in which they are far worse than elsewhere."""
+
+    def fit(score, value):
+        bounds = torch.ones(2, len(BASE) + len(ELASTICITY.parameters)).double()
+        model = JointModel(
+            effects=(ELASTICITY,),
+            has=torch.ones(1, 2, dtype=torch.bool),
+            lower=-bounds,
+            upper=bounds,
+            log=torch.zeros(bounds.shape[1], dtype=torch.bool),
+        )
+        jacobian, error = (torch.full(shape, value) for shape in ((bounds.shape[1], 3, 1, 2), (3, 1, 2)))
+        return Fitted(model=model, x=value * bounds, score=score, jacobian=jacobian, error=error)
+
+    now, other = fit(torch.tensor([25.0, 25.0]), 0.0), fit(torch.tensor([24.0, 24.0]), 1.0)
+    own, asked = {now: errors_of(5.0, 5.0), other: errors_of(*after)}, []
+    monkeypatch.setattr(steps, "fit_over_wide_steps", lambda _, now: now)
+    monkeypatch.setattr(steps, "fit_trimmed", lambda _, now, joints: asked.append(joints.tolist()) or "trimmed")
+    monkeypatch.setattr(steps, "fit_to_whole", lambda _, starts: [other] if starts == ["trimmed"] else starts)
+    monkeypatch.setattr(steps, "validation_errors", lambda _, models: [own[model] for model in models])
+    settings = dict.fromkeys(("effort", "max_effects", "say", "follow"))
+    floor = torch.tensor([1.0, 3.0])
+    settled, errors = steps.Steps(effects=(ELASTICITY,), floor=floor, **settings).settled("problem", now)
+    assert asked == [[True, True]]
+    expected = [two if yes else 5.0 for two, yes in zip(after, taken, strict=True)]
+    assert errors.mse.sqrt().tolist() == pytest.approx(expected, rel=0.02)
+    for values in (settled.x[:, 0], settled.jacobian[0, 0, 0], settled.error[0, 0]):
+        assert values.bool().tolist() == taken
+    assert settled.score.tolist() == [24.0 if yes else 25.0 for yes in taken]

@@ -63,7 +63,7 @@ class Fitted:
         return cls(model=model, x=model.to_normalised(physical), score=unknown, tried=tried)
 
     def take(self, other: Fitted, joints: torch.Tensor) -> None:
-        """Take over another fit of the same effects on some joints, (n,) bool: values, bounds and score."""
+        """Take over another fit of the same effects on some joints, (n,) bool, and what is known of it there."""
         lower, upper = (
             torch.where(joints[:, None], getattr(other.model, side), getattr(self.model, side))
             for side in ("lower", "upper")
@@ -71,6 +71,10 @@ class Fitted:
         self.model = replace(self.model, lower=lower, upper=upper)
         self.x = torch.where(joints[:, None], other.x, self.x)
         self.score = torch.where(joints, other.score, self.score)
+        if self.jacobian is not None and other.jacobian is not None:
+            self.jacobian = torch.where(joints, other.jacobian, self.jacobian)
+        if self.error is not None and other.error is not None:
+            self.error = torch.where(joints, other.error, self.error)
 
 
 def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
@@ -94,9 +98,15 @@ def fit_coarse_to_fine(problem: TwinProblem, starts: Sequence[Fitted], rough: bo
     return _again(result, _near(result), lambda those: fit_to_whole(problem, those))
 
 
-def fit_over_wide_steps(problem: TwinProblem, now: Fitted) -> Fitted:
-    """A model fitted in windows, over wide steps where narrow ones may lead no further."""
-    return fit_side_by_side(problem.in_windows(), [now], _COARSE, rough=True)[0]
+def fit_over_wide_steps(problem: TwinProblem, now: Fitted, kept: torch.Tensor | None = None) -> Fitted:
+    """A model fitted in windows over wide steps, where narrow ones may lead no further.
+
+    Args:
+        problem: The joints simulated alone.
+        now: The model.
+        kept: Which windows that are trained on count for which joints, (R, n) bool; all if not given.
+    """
+    return fit_side_by_side(problem.in_windows(), [now], _COARSE, rough=True, kept=kept)[0]
 
 
 def fit_to_whole(problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
@@ -127,6 +137,7 @@ def fit_side_by_side(
     keep_jacobian: bool = False,
     part: float = 1.0,
     rough: bool = False,
+    kept: torch.Tensor | None = None,
 ) -> list[Fitted]:
     """Fit several models from their present x, each joint by itself.
 
@@ -140,23 +151,32 @@ def fit_side_by_side(
         keep_jacobian: Whether the last Jacobian is kept.
         part: Only so much of the beginning of the recordings is simulated.
         rough: Whether derivatives are taken over wide steps first.
+        kept: Which of the recordings that are trained on count for which joints, (R, n) bool; all if not given.
     """
     return spread(
-        lambda own: _fit(problem, own, max_iteration, keep_jacobian, part, rough),
+        lambda own: _fit(problem, own, max_iteration, keep_jacobian, part, rough, kept),
         starts,
         [start.tried for start in starts],
     )
 
 
 def _fit(
-    problem: TwinProblem, starts: Sequence[Fitted], max_iteration: int, keep_jacobian: bool, part: float, rough: bool
+    problem: TwinProblem,
+    starts: Sequence[Fitted],
+    max_iteration: int,
+    keep_jacobian: bool,
+    part: float,
+    rough: bool,
+    kept: torch.Tensor | None,
 ) -> list[Fitted]:
     """:func:`fit_side_by_side` in one process."""
     slots = [Slot(model=s.model, rows=s.model.size + len(_TRIALS)) for s in starts]
     batch = SideBySide(problem, slots, training=True)
     where = batch.dataset.train.clone()
     where[math.ceil(part * len(where)) :] = False
-    samples = float(where[where.any(dim=1)][::_STRIDE].sum())
+    counts = where[where.any(dim=1)][::_STRIDE].sum(dim=0).double()
+    weight = torch.ones(len(counts), starts[0].model.num_joints) if kept is None else kept.float()
+    samples = counts @ weight.double()
     ways = [_Way(start, samples, keep_jacobian, rough) for start in starts]
     for _ in range(max_iteration):
         rows = [way.ask() for way in ways]
@@ -164,7 +184,7 @@ def _fit(
         errors = batch.split(batch.simulate(physical, where, _STRIDE))
         for way, x, error in zip(ways, rows, errors, strict=True):
             if not way.finished:  # where it ends must not depend on what is fitted beside it
-                way.tell(x, error)
+                way.tell(x, error if kept is None else error * weight)
         if all(way.finished for way in ways):
             break
     return [way.result() for way in ways]
@@ -173,7 +193,7 @@ def _fit(
 class _Way:
     """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
 
-    def __init__(self, start: Fitted, samples: float, keep: bool, rough: bool):
+    def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool):
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
@@ -246,8 +266,8 @@ class _Way:
         if bool(at_favoured.any()):
             difference = error[1 : 1 + size] - error[:1]
             columns = difference / self._step.T[:, None, None, :].float()
-            hessian = torch.einsum("pkrj,skrj->jps", columns, columns).double() / self._samples
-            gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).double() / self._samples
+            hessian = torch.einsum("pkrj,skrj->jps", columns, columns).double() / self._samples[:, None, None]
+            gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).double() / self._samples[:, None]
             self._hessian = torch.where(at_favoured[:, None, None], hessian, self._hessian)
             self._gradient = torch.where(at_favoured[:, None], gradient, self._gradient)
             if self._keep:

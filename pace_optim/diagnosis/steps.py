@@ -16,6 +16,7 @@ from pace_optim.diagnosis.pruning import pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import exchanged, swapped
 from pace_optim.diagnosis.trials import NEXT_FLOOR, Round
+from pace_optim.diagnosis.trimming import fit_trimmed
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -87,24 +88,31 @@ class Steps:
             self.effort[open_joints],
             self.floor[open_joints],
             self.say,
-            rough=self._is_rough(branch.now, branch.errors.mse, LOOK_AHEAD),
+            rough=bool(self._rough(branch.now, branch.errors.mse, LOOK_AHEAD).any()),
         )
         return None if found is None else part.round_of_all(found, branch.now)
 
-    def _is_rough(self, now: Fitted, mse: torch.Tensor, times: float) -> bool:
-        """Whether contacts or springs of joints above so many times the floor may keep narrow derivatives back."""
-        far = mse.sqrt() > times * self.floor
-        return any(
-            e.is_stiff and bool((has & far).any()) for e, has in zip(now.model.effects, now.model.has, strict=True)
-        )
+    def _rough(self, now: Fitted, mse: torch.Tensor, times: float) -> torch.Tensor:
+        """Joints above so many times the floor, where contacts or springs may keep narrow derivatives back, (n,)."""
+        stiff = [has for effect, has in zip(now.model.effects, now.model.has, strict=True) if effect.is_stiff]
+        has_stiff = torch.stack(stiff).any(dim=0) if stiff else torch.zeros_like(self.floor, dtype=torch.bool)
+        return has_stiff & (mse.sqrt() > times * self.floor)
 
     def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
-        """A model fitted to whole recordings, over wide steps where narrow ones may have led no further; its errors."""
-        if self._is_rough(now, now.score, NEXT_FLOOR):  # or another effect would be sought beside it
+        """A model fitted to whole recordings, as well as it can be before another effect is sought; its errors."""
+        if bool(self._rough(now, now.score, NEXT_FLOOR).any()):
             now = fit_over_wide_steps(problem, now)
         if now.jacobian is None:  # it was fitted in windows
             now = fit_to_whole(problem, [now])[0]
-        return now, validation_errors(problem, [now])[0]
+        errors = validation_errors(problem, [now])[0]
+        rough = self._rough(now, now.score, NEXT_FLOOR)
+        if bool(rough.any()) and (trimmed := fit_trimmed(problem, now, rough)) is not None:
+            other = fit_to_whole(problem, [trimmed])[0]
+            other_errors = validation_errors(problem, [other])[0]
+            better = other_errors.mse < errors.mse
+            now.take(other, better)
+            errors = replace(errors, square=torch.where(better, other_errors.square, errors.square))
+        return now, errors
 
     def along_own_motion(self, problem: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted, BlockErrors]:
         """The joints along the motion of the robot with a model, the model fitted there, and its errors."""
