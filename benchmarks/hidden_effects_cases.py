@@ -19,7 +19,8 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_to_whole
+from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_to_whole
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import start_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.validation import validation_errors

@@ -14,7 +14,7 @@ from pace_actuators.effects import Effect, get_effect
 from pace_envs import set_physics_dt
 from pace_optim.atomic import write_json
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.trials import Trial

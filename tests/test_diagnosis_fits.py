@@ -12,8 +12,10 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import descent, search
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import check_data
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.fitted import Fitted
+from pace_optim.diagnosis.levenberg_marquardt import Way
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.own_motion import OwnMotion
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot, _merged
@@ -184,7 +186,7 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
 def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench):
     """After such a step derivatives are new, which is no gain and no failure."""
     model = JointModel.base(bench.problem)
-    way = descent._Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=False)
+    way = Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=False)
     lowest, last = 1.0, model.size + 2
     asked = 0
     while not way.finished and asked < 10:
@@ -202,7 +204,7 @@ def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench
 
 def gaining(model, truth, gains):
     """A descent whose favoured steps lower the error by these parts, (asks, joints); how often it had to be asked."""
-    way = descent._Way(Fitted.start(model, truth), samples=torch.ones(1), keep=False, rough=False)
+    way = Way(Fitted.start(model, truth), samples=torch.ones(1), keep=False, rough=False)
     lowest, asked = torch.ones(model.num_joints), 0
     for gain in [torch.zeros(model.num_joints), *(torch.tensor(each) for each in gains)]:  # derivatives come first
         if way.finished:

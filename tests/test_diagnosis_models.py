@@ -9,7 +9,7 @@ from diagnoses import errors_of, joint_alone
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis import pruning, sharing, some_joints
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.one_round import _ranked
 from pace_optim.diagnosis.screening import Probe

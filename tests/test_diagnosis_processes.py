@@ -14,8 +14,9 @@ from diagnoses import joint_alone
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import processes
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel, start_values
 from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.screening import screen

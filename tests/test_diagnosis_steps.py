@@ -12,8 +12,9 @@ from problems import DT
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import next_experiment, one_for_several, one_round, search, some_joints, swapping
 from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
 from pace_optim.diagnosis.error_map import error_map
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
 from pace_optim.diagnosis.screening import absorbed_effects

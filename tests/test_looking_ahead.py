@@ -8,7 +8,7 @@ from diagnoses import errors_of, make_trial
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import search, steps
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.trials import Round
 

@@ -13,9 +13,9 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.data_check import DataCheck
-from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.diagnose import Findings, summary_of
 from pace_optim.diagnosis.evenness import unevenness
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.stand_ins import stand_ins, varying

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.descent import fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.joint_twins import reference_path, twin_problem
 from pace_optim.joint_twins.problem import TwinProblem

@@ -11,7 +11,7 @@ import torch
 
 from pace_optim.comparison.noise import lattice_step, noise_floor
 from pace_optim.diagnosis.base_fit import whole_vector
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.fit_result import FitResult
 from pace_optim.joint_twins.problem import TwinProblem

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem

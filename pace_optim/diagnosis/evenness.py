@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.screening import free_columns
 
 _FEWEST = 3

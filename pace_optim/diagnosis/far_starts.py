@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel, start_values
 from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot

@@ -10,7 +10,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.dataset import make_dataset
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.verdict import labels

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem

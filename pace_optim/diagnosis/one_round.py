@@ -8,8 +8,9 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.trials import RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.verdict import labels
 from pace_optim.joint_twins import reference_path, twin_problem

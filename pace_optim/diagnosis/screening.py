@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, start_values
 from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot

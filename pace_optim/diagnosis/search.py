@@ -9,8 +9,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted
 from pace_optim.diagnosis.evenness import unevenness
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.pruning import Without
 from pace_optim.diagnosis.steps import LOOK_AHEAD, Branch, Steps, combined
 from pace_optim.diagnosis.trials import RIVAL, Round, Trial, near_trials

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.some_joints import SomeJoints
 

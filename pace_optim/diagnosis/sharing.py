@@ -8,7 +8,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.validation import validation_errors
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_coarse_to_fine
+from pace_optim.diagnosis.descent import fit_coarse_to_fine
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.validation import validation_errors

@@ -9,7 +9,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps, fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.descent import fit_over_wide_steps, fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.one_for_several import one_for_several
 from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last

@@ -8,7 +8,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.descent import Fitted, fit_side_by_side
+from pace_optim.diagnosis.descent import fit_side_by_side
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.trials import NEXT_FLOOR, RIVAL, Round, near_trials

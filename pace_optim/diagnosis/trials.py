@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import BlockErrors, judge
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 
 RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.descent import Fitted, fit_over_wide_steps
+from pace_optim.diagnosis.descent import fit_over_wide_steps
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors
-from pace_optim.diagnosis.descent import Fitted
+from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins.problem import TwinProblem
 
