@@ -27,6 +27,14 @@ class Way:
     """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
 
     def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool):
+        """Begin at the model's x.
+
+        Args:
+            start: The model.
+            samples: How many count for each joint, (n,).
+            keep: Whether the last Jacobian is kept.
+            rough: Whether derivatives are taken over wide steps first.
+        """
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
