@@ -2,6 +2,7 @@
 
 import json
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
@@ -23,23 +24,23 @@ MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
 
 def record(effect: str, joints: str, duration: float, seed: int, folder: Path) -> dict[str, list[str]]:
     """Recordings to fit and, of another kind, to validate on, by a simulator that shares no code with ours."""
-    files: dict[str, list[str]] = {part: [] for part in MOTIONS}
-    for part, motions in MOTIONS.items():
-        for motion in motions:
-            made = collect(
-                CollectionCfg(
-                    task=TASK,
-                    excitation=motion,
-                    duration=duration,
-                    seed=seed,
-                    effects=(effect,),
-                    effect_joints=joints,
-                    noise=NOISE,
-                    output=folder / f"{motion}.npz",
-                )
-            )
-            files[part].append(str(made.recordings[0]))
-    return files
+    cfgs = {
+        motion: CollectionCfg(
+            task=TASK,
+            excitation=motion,
+            duration=duration,
+            seed=seed,
+            effects=(effect,),
+            effect_joints=joints,
+            noise=NOISE,
+            output=folder / f"{motion}.npz",
+        )
+        for motions in MOTIONS.values()
+        for motion in motions
+    }
+    with ProcessPoolExecutor() as pool:
+        made = dict(zip(cfgs, pool.map(collect, cfgs.values()), strict=True))
+    return {part: [str(made[motion].recordings[0]) for motion in motions] for part, motions in MOTIONS.items()}
 
 
 def main() -> None:
@@ -48,7 +49,7 @@ def main() -> None:
     parser.add_argument("--effect", default="stribeck_friction", help="what is hidden (default stribeck_friction)")
     parser.add_argument("--effect_joints", default=".*KFE", metavar="REGEX", help="where (default: the knees)")
     parser.add_argument("--seed", type=int, default=0, help="of the hidden parameters and the noise")
-    parser.add_argument("--duration", type=float, default=10.0, metavar="S", help="of each recording (default 10)")
+    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="of each recording (default 6)")
     parser.add_argument("--log_dir", type=Path, default=Path("logs/demo"), help="where all goes (default logs/demo)")
     args = parser.parse_args()
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
