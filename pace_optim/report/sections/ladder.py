@@ -10,6 +10,8 @@ from ..markup import Section, esc, figure, table
 from ..run_data import RunData
 
 _PARTS = {"validation": ("validation", "var(--heldedge)"), "train": ("training", "var(--target)")}
+_TICKS = [digit * 10.0**power for power in range(-6, 7) for digit in (1, 2, 5)]
+"""Where plotly itself would write 5 for both 5 and 0.5."""
 
 
 def ladder(run: RunData) -> Section | None:
@@ -96,9 +98,8 @@ def _layout(unit: str) -> dict[str, Any]:
     axis = {
         "type": "log",
         "title": {"text": f"error [{unit}]"},
-        "nticks": 6,
-        "exponentformat": "none",
-        "minexponent": 9,
+        "tickvals": _TICKS,
+        "ticktext": [f"{tick:g}" for tick in _TICKS],
     }
     return {"yaxis": axis, "xaxis": {"type": "category", "showgrid": False}, "hovermode": "closest"}
 
