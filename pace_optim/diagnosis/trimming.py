@@ -1,7 +1,7 @@
 """A fit that leaves out where the model is far worse than elsewhere: least trimmed squares.
 
 A joint that rattles in a gap or sticks and slips may, with a nearly right model, go on oscillating in one window where
-the robot comes to rest. That window's error then outweighs all others and says nothing of where the truth lies. The
+the robot does not. That window's error then outweighs all others and says nothing of where the truth lies. The
 windows that fit best do, and the others follow once the model is right.
 
 Source: Rousseeuw 1984, least median of squares regression (and concentration steps).
