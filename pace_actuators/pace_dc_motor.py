@@ -238,7 +238,10 @@ class PaceDCMotor:
         if position is None:  # no position target: velocity and effort control
             position = encoder_pos
         velocity_error = -encoder_vel if velocity is None else velocity - encoder_vel
-        effort = pd_effort(position - encoder_pos, velocity_error, stiffness, damping)
+        position_error = position - encoder_pos
+        effort = pd_effort(position_error, velocity_error, stiffness, damping)
+        if self.effects is not None:
+            effort = self.effects.given_by_controller(effort, position_error)
         if feed_forward is not None:
             effort += feed_forward
         if self.cfg.delay_mode == "effort":

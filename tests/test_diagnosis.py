@@ -162,6 +162,20 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     json.dumps(entries)
 
 
+@pytest.mark.parametrize(
+    ("after", "significant", "said"),
+    [
+        (3e-4, True, "the error falls from 1 to 0.3 mrad with it (t = 4.0 over blocks of one second). Sign: "),
+        (9.5e-4, False, "falls from 1 to 0.95 mrad with it, less than the 1.1 times that count. Sign: "),
+        (5e-4, False, "falls from 1 to 0.5 mrad with it, too unevenly to count (t = 4.0 over blocks"),
+        (2e-3, False, "the error does not fall: from 1 to 2 mrad with it. Sign: "),
+    ],
+)
+def test_the_evidence_says_what_came_of_an_effect_and_why_it_does_not_count(after, significant, said):
+    this = Round(trials=[[make_trial(GAIN, 0, after, significant)]], chosen=[None], rivals=[[]])
+    assert said in ranking(outcome_of([1e-3], [1e-3], rounds=[this]), ("hip",))[0]["evidence"]
+
+
 def test_the_ranking_begins_with_what_was_added_in_any_round():
     trials = [[make_trial(GAIN, 0, 2e-4), make_trial(QUADRATIC, 0, 3e-4)]], [[make_trial(STRIBECK, 0, 1e-4)]]
     rounds = [

@@ -61,7 +61,7 @@ def test_the_library_holds_what_it_should():
         "proportional_gain", "derivative_gain", "drive_bandwidth", "velocity_filter", "torque_limit",
         "torque_speed_limit", "command_rate_limit", "torque_ripple", "joint_elasticity", "backlash", "payload",
         "com_offset", "encoder_scale", "encoder_eccentricity", "other_delay", "measurement_delay", "clock_skew",
-        "mount_compliance",
+        "mount_compliance", "creeping_friction", "integral_gain",
     } <= set(EFFECTS)  # fmt: skip
 
 
@@ -186,6 +186,41 @@ def test_a_bristle_is_a_spring_that_gives_way_at_the_friction_level():
     # after the turn the slope is twice as steep: the bristle pulls the other way
     assert drive.one(q=x - moved) - torques[-1] == pytest.approx(2 * stiffness * moved, rel=0.02)
     assert float(drive.motor.joint_friction) == 0.0
+
+
+def test_friction_that_creeps_is_its_tangent_at_the_present_speed():
+    drive = Drive(["creeping_friction"], {"creeping_friction.velocity": 0.05})
+    for v in (0.0, 1e-6, 0.02, -0.07, 0.4):
+        drive(v=v)
+        level, slope = float(drive.motor.joint_friction), float(drive.motor.joint_implicit_damping)
+        assert level + slope * abs(v) == pytest.approx(0.5 * math.tanh(abs(v) / 0.05), abs=1e-12)
+        assert slope == pytest.approx(0.5 / 0.05 / math.cosh(v / 0.05) ** 2)
+        assert level >= 0.0
+    values = {"stribeck_friction.effort": 1.5, "stribeck_friction.velocity": 0.2, "creeping_friction.velocity": 1e-3}
+    for order in (1, -1):  # after all that changes the level
+        both = Drive(["creeping_friction", "stribeck_friction"][::order], values)
+        both(v=0.1)
+        assert float(both.motor.joint_friction) == pytest.approx(0.5 + 1.5 * math.exp(-0.25))
+
+
+@pytest.mark.parametrize("mode", ["command", "effort"])
+def test_an_integral_sums_the_error_that_the_controller_sees_up_to_its_limit(mode):
+    values = {"integral_gain.gain": 400.0, "integral_gain.effort": 0.15}
+    drive = Drive(["integral_gain"], values, delay_mode=mode, delay=1.0, encoder_bias=0.02)
+    errors = [0.1, 0.1, 0.1, -0.5, -0.5, 0.0]
+    summed, integral = [], 0.0
+    for error in errors:
+        integral = max(-0.15, min(0.15, integral + 400 * DT * error))
+        summed.append(100 * error + integral)
+    expected = summed if mode == "command" else [summed[max(k - 1, 0)] for k in range(len(errors))]
+    targets = [e - 0.02 for e in errors]
+    late = [*targets[1:], targets[-1]] if mode == "command" else targets
+    if mode == "command":  # a target counts one step later
+        drive.one(targets[0])
+        drive.motor.effects.reset()
+    assert [drive.one(target) for target in late] == pytest.approx(expected)
+    drive.motor.reset()
+    assert drive.one(targets[0]) == pytest.approx(100 * 0.1 + 400 * DT * 0.1)
 
 
 def test_limits_of_the_drive():

@@ -104,6 +104,8 @@ TWIN_CASES = {
     "friction_asymmetry": {"effort": 0.5},
     "quadratic_friction": {"coefficient": 0.5},
     "presliding_friction": {"stiffness": 10.0},
+    "creeping_friction": {"velocity": 0.1},
+    "integral_gain": {"gain": 200.0, "effort": 5.0},
     "friction_drift": {"ratio": -0.7, "time_constant": 1.0},
     "torque_offset": {"effort": 1.0},
     "parallel_spring": {"stiffness": 5.0, "rest": 0.2},

@@ -111,7 +111,9 @@ def test_viscous_friction_lets_a_speed_die_out_exponentially():
     assert np.abs(fine - finer).max() < 2e-6, "smooth torques are integrated to second order"
 
 
-@pytest.mark.parametrize("name", [None, "stribeck_friction", "joint_elasticity", "backlash", "presliding_friction"])
+@pytest.mark.parametrize(
+    "name", [None, "stribeck_friction", "joint_elasticity", "backlash", "presliding_friction", "creeping_friction"]
+)
 def test_a_finer_step_changes_the_motion_by_less_than_the_noise(name):
     effects = {} if name is None else {name: draw_effect(name, ROBOT, np.random.default_rng(1))}
     truth = Truth(base=BASE, effects=effects)
@@ -198,7 +200,7 @@ def test_every_effect_changes_the_motion_and_its_null_does_not(name):
 
 
 def test_the_library_has_every_effect_of_the_list_and_outside_it_there_are_at_least_four():
-    assert len(library_effects()) == 27 and len(outside_effects()) >= 4
+    assert len(library_effects()) == 29 and len(outside_effects()) >= 4
     assert not set(library_effects()) & set(outside_effects())
 
 

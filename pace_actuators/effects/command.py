@@ -143,3 +143,52 @@ class DerivativeGain(Effect):
     def controller(self, s: DriveState) -> None:
         """Scale kd."""
         s.damping *= 1 + self.gain
+
+
+@register_effect
+class IntegralGain(Effect):
+    """The controller integrates its error, which the recording does not say: τ + I.
+
+    I(k) = clip(I(k-1) + ki e(k) Δt, ± τ_I), Δt the control step, e the error of position; I is 0 when a recording or an
+    episode begins.
+    """
+
+    name = "integral_gain"
+    stage = "controller"
+    parameters = (
+        EffectParameter(name="gain", unit="N m/(rad s)", lower=0.0, upper=1000.0, null=0.0, start=10.0, meaning="ki"),
+        EffectParameter(
+            name="effort",
+            unit="N m",
+            lower=0.1,
+            upper=200.0,
+            null=None,
+            start=20.0,
+            scale="log",
+            meaning="largest torque of the integral",
+        ),
+    )
+    equation = "τ + ki ∫ (q* - q) dt, the integral's torque within ± τ_I"
+    looks = "the joint leans less and less while its command holds; it overshoots after a step"
+    source = "PID position loops of servo drives, e.g. Dynamixel control tables; mjlab's integral_gain"
+    probes = ({"effort": 100.0}, {"effort": 5.0}, {"effort": 1.0})
+    two_sided = False
+    separates = "a staircase that holds each of its steps longer"
+    gain: torch.Tensor
+    effort: torch.Tensor
+
+    def prepare(self) -> None:
+        """What an error adds in a control step."""
+        self._per_step = self.gain * self.control_dt
+        if not hasattr(self, "_integral"):
+            self._integral = self.zeros()
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """Nothing is integrated yet."""
+        self._integral[rows] = 0.0
+
+    def controller_effort(self, s: DriveState) -> None:
+        """Add the integral's torque."""
+        summed = self._integral + self._per_step * s.position_error
+        self._integral = torch.clamp(summed, -self.effort, self.effort)
+        s.effort += self._integral

@@ -27,6 +27,7 @@ class DriveState:
         armature: Rotor inertia that the simulator carries [kg m²].
 
     What effects read:
+        position_error: Of the controller, q* less what it takes for the position [rad].
         joint_pos, joint_vel: True joint position [rad] and speed [rad/s].
         motor_pos, motor_vel: Position [rad] and speed [rad/s] of the motor at the joint; other than the joint's where
             the transmission gives way.
@@ -50,6 +51,7 @@ class DriveState:
     viscous_friction: torch.Tensor
     implicit_damping: torch.Tensor
     armature: torch.Tensor
+    position_error: torch.Tensor
     joint_pos: torch.Tensor
     joint_vel: torch.Tensor
     motor_pos: torch.Tensor

@@ -161,6 +161,9 @@ class Effect:
     def controller(self, s: DriveState) -> None:
         """Once per control step: change ``s.stiffness`` and ``s.damping``."""
 
+    def controller_effort(self, s: DriveState) -> None:
+        """Once per control step, after the PD law and before delays: change ``s.effort``."""
+
     def effort_command(self, s: DriveState) -> None:
         """Once per control step, after the controller and its delay: change ``s.effort``."""
 

@@ -207,3 +207,40 @@ class PreslidingFriction(Effect):
         s.effort += torch.where(self._on, ahead * s.motor_vel - self._sigma * self._bristle, 0.0)
         s.implicit_damping += implicit
         s.friction = torch.where(self._on, 0.0, s.friction)
+
+
+@register_effect
+class CreepingFriction(Effect):
+    """Coulomb friction that fades towards standstill, so that a loaded joint creeps instead of sticking.
+
+    F tanh(|v|/v_s) is its tangent at the present speed, L + D |v|: the level L is left to the simulator, which lets it
+    turn within a step, and D acts on the speed at the end of the step. Both are ≥ 0: no v_s is too small for the step,
+    and none creates energy.
+    """
+
+    name = "creeping_friction"
+    stage = "friction"
+    parameters = (
+        EffectParameter(name="velocity", unit="rad/s", lower=0.0, upper=0.5, null=0.0, start=0.02, meaning="v_s"),
+    )
+    equation = "F tanh(v / v_s) in place of F sgn(v)"
+    looks = "a joint that should stick creeps on under its load; soft reversals"
+    source = "regularised Coulomb friction (e.g. Marques, Flores, Claro, Lankarani 2016); simulators' soft friction"
+    probes = ({"velocity": 0.005}, {"velocity": 0.02}, {"velocity": 0.08}, {"velocity": 0.25})
+    two_sided = False
+    separates = "a staircase that holds each of its steps longer, and a slow triangle"
+    velocity: torch.Tensor
+
+    def prepare(self) -> None:
+        """Where it acts."""
+        self._on = self.velocity > 0
+        self._velocity = torch.where(self._on, self.velocity, 1.0)
+
+    def transmission(self, s: DriveState) -> None:
+        """Split the level, after all that changes it."""
+        relative = s.motor_vel.abs() / self._velocity
+        share = torch.tanh(relative)
+        slope = 1 - share.square()
+        level = (share - slope * relative).clamp(min=0.0)
+        s.implicit_damping += torch.where(self._on, slope * s.friction / self._velocity, 0.0)
+        s.friction = torch.where(self._on, level * s.friction, s.friction)

@@ -18,6 +18,7 @@ _STAGES = (
     "measurement",
     "sensed_velocity",
     "controller",
+    "controller_effort",
     "effort_command",
     "drive",
     "friction",
@@ -199,6 +200,15 @@ class EffectStack:
             self.run("controller")
             stiffness, damping = s.stiffness, s.damping
         return joint_vel, stiffness, damping
+
+    def given_by_controller(self, effort: torch.Tensor, position_error: torch.Tensor) -> torch.Tensor:
+        """The torque of the PD law after the effects on it [N m]; ``position_error`` is what that saw [rad]."""
+        if not self._at["controller_effort"]:
+            return effort
+        s = self.state
+        s.effort, s.position_error = effort, position_error
+        self.run("controller_effort")
+        return s.effort.clone()
 
     def asked_of_drive(self, effort: torch.Tensor) -> torch.Tensor:
         """The controller's torque after the effects on it [N m]."""

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
+from pace_optim.diagnosis.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, near_floor, real_effects
@@ -132,7 +133,7 @@ def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effec
                     "validation_rmse_before": _rms(t.mse_before for t in shown),
                     "validation_rmse_after": _rms(t.mse_after for t in shown),
                     "significant": bool(good),
-                    "evidence": _evidence(shown, effect),
+                    "evidence": _evidence(shown, effect, first=depth == 0),
                     "confounded_with": confounded,
                     "screen_score": max(t.screen_score for t in own),
                     "values": {joint_names[t.joint]: t.values for t in shown},
@@ -148,13 +149,20 @@ def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effec
     )
 
 
-def _evidence(trials: Sequence[Trial], effect: type[Effect]) -> str:
+def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
     before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
     strongest = max(trials, key=lambda t: t.ratio)
-    verb = "falls" if after < before else "does not fall:"
+    blocks = f"t = {strongest.t:.1f} over blocks of one second"
+    verb, why = "falls", f" ({blocks})"
+    if after >= before:
+        verb, why = "does not fall:", ""
+    elif not strongest.significant:
+        least = FIRST_RATIO if first else NEXT_RATIO
+        little = f", less than the {least:g} times that count" if before < least * after else ""
+        why = little or f", too unevenly to count ({blocks})"
     return (
-        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} mrad with it "
-        f"(t = {strongest.t:.1f} over blocks of one second). Sign: {effect.looks}."
+        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} mrad with it{why}. "
+        f"Sign: {effect.looks}."
     )
 
 

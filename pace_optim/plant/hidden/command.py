@@ -91,7 +91,6 @@ class IntegralGain(HiddenEffect):
     """An integrator nobody speaks of: torque += ki ∫ error dt, the integral's torque within ± limit."""
 
     name = "integral_gain"
-    outside = True
     draws = draws_of(
         ki=Draw(unit="N m/(rad s)", low=40.0, high=200.0, torque=True),
         limit=Draw(unit="N m", low=3.0, high=10.0, torque=True, role="shape"),

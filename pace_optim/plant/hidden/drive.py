@@ -116,3 +116,17 @@ class ThermalDerating(HiddenEffect):
         """The torque that is left [N m]."""
         self.warmth = self.warmth + state.h / self.time_constant * ((torque / self.reference) ** 2 - self.warmth)
         return torque / (1 + self.a * self.warmth)
+
+
+@hidden
+class TorqueDeadBand(HiddenEffect):
+    """The power stage loses what it is asked for near zero: |τ| falls by τ_d, and to nothing below it."""
+
+    name = "torque_dead_band"
+    outside = True
+    draws = draws_of(tau_d=Draw(unit="N m", low=0.3, high=1.5, torque=True))
+    drive_rank = 1
+
+    def drive(self, torque: np.ndarray, state: State) -> np.ndarray:
+        """The torque beyond the band [N m]."""
+        return torque - np.clip(torque, -self.tau_d, self.tau_d)

@@ -102,6 +102,29 @@ class PreslidingFriction(HiddenEffect):
 
 
 @hidden
+class CreepingFriction(HiddenEffect):
+    """F tanh(v / v_s) in place of the set-valued law: no speed is low enough to stick."""
+
+    name = "creeping_friction"
+    draws = draws_of(v_s=Draw(unit="rad/s", low=0.01, high=0.15, log=True))
+
+    def prepare(self, drives: Drives) -> None:
+        """Where friction is smooth."""
+        self.level = np.zeros_like(drives.friction)
+        self.smooth = self.v_s > 0
+        self.scale = np.where(self.smooth, self.v_s, 1.0)
+
+    def friction(self, forward: np.ndarray, backward: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Take the level over from the sharp law."""
+        self.level = np.where(state.motor_vel > 0, forward, backward)
+        return np.where(self.smooth, 0.0, forward), np.where(self.smooth, 0.0, backward)
+
+    def motor_torque(self, state: State) -> np.ndarray:
+        """The smooth friction [N m]."""
+        return np.where(self.smooth, -self.level * np.tanh(state.motor_vel / self.scale), 0.0)
+
+
+@hidden
 class FrictionDrift(HiddenEffect):
     """d and F_c times 1 + δ (1 - e^(-t/T)), t the time within the session."""
 

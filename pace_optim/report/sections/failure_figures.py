@@ -236,7 +236,7 @@ def _white(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
     else:
         text = (
             f"Not white: the sample before explains {share:.0f} % of the variance, and errors stay alike for "
-            f"{1e3 * time:.3g} ms. Something that can be modelled is left."
+            f"{_duration(time)}. Something that can be modelled is left."
         )
     return {
         "text": text,
@@ -324,3 +324,7 @@ FIGURES: dict[str, FailureFigure] = {
     ),
 }
 """By name, in their order on the page."""
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
