@@ -32,6 +32,7 @@ EFFECTS: dict[str, Callable[[np.random.Generator], Sizes]] = {
     "backlash": lambda rng: {"stiffness": 4000.0, "damping": 0.2, "gap": rng.uniform(0.005, 0.02)},
     "stribeck_friction": lambda rng: {"stribeck": rng.uniform(0.3, 1.2), "velocity": rng.uniform(0.05, 0.3)},
     "quadratic_friction": lambda rng: {"quadratic": rng.uniform(0.02, 0.1)},
+    "soft_friction": lambda rng: {"softness": rng.uniform(0.01, 0.05)},
     "torque_gain": lambda rng: {"gain": rng.choice([-1, 1]) * rng.uniform(0.1, 0.25)},
     "torque_ripple": lambda rng: {
         "ripple": rng.uniform(0.2, 0.6),
@@ -62,9 +63,8 @@ def commands(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 def model(base: Sizes, sizes: Sizes, friction_time_constant: float) -> mujoco.MjModel:
     """A pendulum; with an elastic shaft its drive is a body of its own."""
-    hard = f'solreffriction="{friction_time_constant} 1" ' + (
-        'solimpfriction="0.999 0.9999 0.001"' if friction_time_constant < 0.02 else ""
-    )
+    soft = sizes.get("softness", friction_time_constant)
+    hard = f'solreffriction="{soft} 1" ' + ('solimpfriction="0.999 0.9999 0.001"' if soft < 0.005 else "")
     drive = f'<joint name="drive" axis="0 1 0" armature="{base["armature"]}" damping="{base["viscous_friction"]}" '
     drive += f'frictionloss="{base["friction"]}" {hard}/>'
     load = f'<inertial pos="0 0 {-LOAD_LENGTH}" mass="{LOAD_MASS}" diaginertia="1e-9 1e-9 1e-9"/>'
@@ -170,6 +170,9 @@ def main() -> None:
     )
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
     args = parser.parse_args()
+    for name in ("seeds", "max_effects", "friction_time_constant"):
+        if not getattr(args, name) > 0:
+            parser.error(f"--{name} is {getattr(args, name)}, expected a value above 0.")
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for effect in args.effects:
             with tempfile.TemporaryDirectory() as folder:

@@ -334,8 +334,13 @@ class PaceDCMotor:
         return self.effects is not None and self.effects.needs_load
 
     @property
+    def needs_link(self) -> bool:
+        """Whether effects need what :meth:`set_link` gives."""
+        return self.effects is not None and self.effects.needs_link
+
+    @property
     def changes_armature(self) -> bool:
-        """Whether ``joint_armature`` changes from call to call, by what :meth:`set_link` gives."""
+        """Whether ``joint_armature`` changes from call to call."""
         return self.effects is not None and self.effects.changes_armature
 
     @property

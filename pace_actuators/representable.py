@@ -25,7 +25,7 @@ class World:
     """Whether a drive can change the joint's friction at every physics step."""
 
     inertia_per_step: bool = True
-    """Whether a drive can change the joint's inertia at every physics step, by what the joint carries."""
+    """Whether a drive is told the joint's inertia at every physics step, and can change it."""
 
     friction_hook: str = ""
     """What the user must add for that, in words; empty if nothing."""
@@ -55,7 +55,7 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
         world: Where it is to be used.
 
     Raises:
-        ValueError: If an effect changes friction or inertia at every step, and the world has no way to do so.
+        ValueError: If an effect changes friction or reads the inertia at every step, and the world has no way to do so.
     """
     notes = []
     for cfg in drives.effects:
@@ -70,9 +70,9 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
                 f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
                 "use the model that scripts/export.py --format mjcf writes, which has it."
             )
-        if kind.changes_armature and not world.inertia_per_step:
+        if kind.reads_link and not world.inertia_per_step:
             raise ValueError(
-                f"{kind.name} changes the joint's inertia at every physics step, which {world.name} cannot do. "
+                f"{kind.name} depends on the joint's inertia at every physics step, which {world.name} cannot do. "
                 "Fit again without it, or train elsewhere."
             )
         if kind.overrides("friction") or kind.overrides("transmission"):
@@ -87,14 +87,14 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
-    """Refuse a drive that changes the joint's inertia at every step where that cannot be done.
+    """Refuse a drive that depends on the joint's inertia at every step where that cannot be told.
 
     Raises:
         ValueError: If it does.
     """
-    if motor.changes_armature and not world.inertia_per_step and motor.effects is not None:
-        names = ", ".join(effect.name for effect in motor.effects.effects if effect.changes_armature)
+    if motor.needs_link and not world.inertia_per_step and motor.effects is not None:
+        names = ", ".join(effect.name for effect in motor.effects.effects if effect.reads_link)
         raise ValueError(
-            f"{names} changes the joint's inertia at every physics step, which {world.name} cannot do. Leave it out of "
-            "the drive's effects."
+            f"{names} depends on the joint's inertia at every physics step, which {world.name} cannot do. "
+            "Leave it out of the drive's effects."
         )

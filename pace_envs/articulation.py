@@ -361,7 +361,7 @@ class Articulation:
         """Give a drive what its effects read of the link."""
         if actuator.needs_load:
             actuator.set_load_effort(pick(self.load_effort, actuator.joint_indices))
-        if actuator.changes_armature:
+        if actuator.needs_link:
             actuator.set_link(*self._sim.felt_link(self._columns_of(actuator)))
 
     def _write_model(self, actuator: PaceDCMotor, effect: Effect) -> None:

@@ -61,7 +61,7 @@ def test_the_library_holds_what_it_should():
         "proportional_gain", "derivative_gain", "drive_bandwidth", "velocity_filter", "torque_limit",
         "torque_speed_limit", "command_rate_limit", "torque_ripple", "joint_elasticity", "backlash", "payload",
         "com_offset", "encoder_scale", "encoder_eccentricity", "other_delay", "measurement_delay", "clock_skew",
-        "mount_compliance", "creeping_friction", "integral_gain",
+        "mount_compliance", "creeping_friction", "soft_friction", "integral_gain",
     } <= set(EFFECTS)  # fmt: skip
 
 
@@ -188,19 +188,46 @@ def test_a_bristle_is_a_spring_that_gives_way_at_the_friction_level():
     assert float(drive.motor.joint_friction) == 0.0
 
 
-def test_friction_that_creeps_is_its_tangent_at_the_present_speed():
-    drive = Drive(["creeping_friction"], {"creeping_friction.velocity": 0.05})
+def drag(drive):
+    """What a drive adds to its viscous friction, wherever that acts."""
+    return float(drive.motor.joint_viscous_friction + drive.motor.joint_implicit_damping) - 2.0
+
+
+def test_friction_that_creeps_is_its_tangent_at_the_speed_in_the_middle_of_the_step():
+    drive, before = Drive(["creeping_friction"], {"creeping_friction.velocity": 0.05}), 0.0
     for v in (0.0, 1e-6, 0.02, -0.07, 0.4):
         drive(v=v)
-        level, slope = float(drive.motor.joint_friction), float(drive.motor.joint_implicit_damping)
-        assert level + slope * abs(v) == pytest.approx(0.5 * math.tanh(abs(v) / 0.05), abs=1e-12)
-        assert slope == pytest.approx(0.5 / 0.05 / math.cosh(v / 0.05) ** 2)
+        middle, before = abs(1.5 * v - 0.5 * before), v
+        level, slope = float(drive.motor.joint_friction), drag(drive)
+        assert level + slope * middle == pytest.approx(0.5 * math.tanh(middle / 0.05), abs=1e-12)
+        assert slope == pytest.approx(0.5 / 0.05 / math.cosh(middle / 0.05) ** 2)
         assert level >= 0.0
+    drive.motor.reset()
+    drive(v=0.02)  # as if it had been so before
+    assert drag(drive) == pytest.approx(0.5 / 0.05 / math.cosh(0.4) ** 2)
     values = {"stribeck_friction.effort": 1.5, "stribeck_friction.velocity": 0.2, "creeping_friction.velocity": 1e-3}
     for order in (1, -1):  # after all that changes the level
         both = Drive(["creeping_friction", "stribeck_friction"][::order], values)
         both(v=0.1)
         assert float(both.motor.joint_friction) == pytest.approx(0.5 + 1.5 * math.exp(-0.25))
+
+
+@pytest.mark.parametrize(
+    ("target", "v", "effort", "level", "slope"),
+    [
+        (0.002, 0.0, 0.2 - 0.9 * (0.2 - 0.05), 0.0, 1.0),  # below: a tenth of what pushes is left
+        (1.0, 0.3, 100.0 - 0.3, 0.5, 0.0),  # beyond, in the way of the motion: left to the simulator
+        (-1.0, 0.3, -100.3 + 0.5, 0.0, 0.0),  # beyond, and against a turn
+    ],
+)
+def test_soft_friction_is_that_of_mujocos_constraint(target, v, effort, level, slope):
+    drive = Drive(["soft_friction"], {"soft_friction.time_constant": 0.02})
+    inertia = torch.full((1, 1), 0.3, dtype=torch.float64)
+    drive.motor.set_link(inertia, inertia, inertia)
+    drive.motor.set_load_effort(torch.full((1, 1), -0.05, dtype=torch.float64))
+    assert drive.one(target, v=v) == pytest.approx(effort)
+    assert float(drive.motor.joint_friction) == level
+    assert drag(drive) == pytest.approx(slope * 0.9 * 2 / (0.95 * 0.02) * (0.3 + 0.1))
 
 
 @pytest.mark.parametrize("mode", ["command", "effort"])

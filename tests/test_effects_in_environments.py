@@ -20,6 +20,7 @@ ENERGY = {
     "friction_drift": [{"ratio": -0.8, "time_constant": 1.0}, {"ratio": 0.8, "time_constant": 1.0}],
     "presliding_friction": [{"stiffness": k} for k in (10.0, 300.0, 3000.0)],
     "creeping_friction": [{"velocity": v} for v in (1e-4, 0.01, 0.5)],
+    "soft_friction": [{"time_constant": t} for t in (1e-3, 0.02, 0.2)],
     "joint_elasticity": [{"stiffness": k, "damping": c} for k in (80.0, 1e3, 2e4) for c in (0.0, 0.5, 20.0)],
     "backlash": [{"gap": g, "stiffness": k, "damping": 0.0} for g in (0.004, 0.05) for k in (300.0, 2e4)],
 }
@@ -248,6 +249,7 @@ PAIRS = [
         ("creeping_friction", "stribeck_friction", "joint_elasticity"),
         {"creeping_friction.velocity": 0.02, "stribeck_friction.effort": 1.0, "joint_elasticity.stiffness": 300.0},
     ),
+    (("soft_friction", "stribeck_friction"), {"soft_friction.time_constant": 0.02, "stribeck_friction.effort": 1.0}),
     (("integral_gain", "proportional_gain"), {"integral_gain.gain": 100.0, "proportional_gain.gain": 0.2}),
     (
         ("joint_elasticity", "presliding_friction"),

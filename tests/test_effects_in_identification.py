@@ -105,6 +105,7 @@ TWIN_CASES = {
     "quadratic_friction": {"coefficient": 0.5},
     "presliding_friction": {"stiffness": 10.0},
     "creeping_friction": {"velocity": 0.1},
+    "soft_friction": {"time_constant": 0.05},
     "integral_gain": {"gain": 200.0, "effort": 5.0},
     "friction_drift": {"ratio": -0.7, "time_constant": 1.0},
     "torque_offset": {"effort": 1.0},

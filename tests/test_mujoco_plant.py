@@ -49,11 +49,11 @@ def error(folder, effects=(), values=None, physics_dt=0.00125):
     return float(problem.evaluator().residuals(truth[None], where=where).error.double().square().mean().sqrt())
 
 
-def written(folder, monkeypatch, sizes):
+def written(folder, monkeypatch, sizes, friction_time_constant=4e-4):
     """Recordings of a drive with a hidden effect of this size."""
     monkeypatch.setattr(mujoco_plant, "drawn_base", lambda rng: BASE)
     monkeypatch.setitem(mujoco_plant.EFFECTS, "clean", lambda rng: sizes)
-    mujoco_plant.record(folder, "clean", 0, 4e-4)
+    mujoco_plant.record(folder, "clean", 0, friction_time_constant)
     return folder
 
 
@@ -76,3 +76,12 @@ def test_friction_of_mujocos_default_creeps(tmp_path):
     sharp, soft = (mujoco_plant.simulate(command, 85.0, base, {}, constant) for constant in (4e-4, 0.02))
     assert np.ptp(sharp[200:]) < 1e-6
     assert np.ptp(soft[200:]) > 1e-5
+
+
+@pytest.mark.parametrize("friction_time_constant", [0.02, 0.05])
+def test_soft_friction_moves_as_mujocos_own(friction_time_constant, tmp_path, monkeypatch):
+    folder = written(tmp_path, monkeypatch, {}, friction_time_constant)
+    values = {"time_constant": friction_time_constant}
+    with_it, without = error(folder, ["soft_friction"], values, physics_dt=0.0003125), error(folder)
+    assert without > 1e-3
+    assert with_it < 0.15 * without

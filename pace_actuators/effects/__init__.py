@@ -3,7 +3,17 @@
 :class:`Effect` says how to write one; :func:`available_effects` lists those that come with the package.
 """
 
-from pace_actuators.effects import command, drive, friction, measurement, model, mount, transmission, two_mass
+from pace_actuators.effects import (
+    command,
+    drive,
+    fading_friction,
+    friction,
+    measurement,
+    model,
+    mount,
+    transmission,
+    two_mass,
+)
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, probe_points
 from pace_actuators.effects.effect_cfg import SHARED, EffectCfg, effect_cfgs
@@ -21,6 +31,7 @@ __all__ = [
     "command",
     "drive",
     "effect_cfgs",
+    "fading_friction",
     "friction",
     "get_effect",
     "measurement",

@@ -7,7 +7,7 @@ import operator
 
 import torch
 
-_LOAD_FIELDS = ("load_effort", "load_stiffness", "link_inertia", "spare_inertia")
+_LINK_FIELDS = ("load_stiffness", "link_inertia", "spare_inertia")
 
 
 class DriveState:
@@ -78,10 +78,10 @@ class DriveState:
         """All fields zero."""
         return cls({name: torch.zeros(num_envs, num_joints, device=device, dtype=dtype) for name in _FIELDS})
 
-    def of_rows(self, rows: slice, with_load: bool = True) -> DriveState:
-        """The same fields, seen through some rows; those of the load only where they are wanted."""
-        wanted = _FIELDS if with_load else [name for name in _FIELDS if name not in _LOAD_FIELDS]
-        return DriveState({name: getattr(self, name)[rows] for name in wanted})
+    def of_rows(self, rows: slice, with_load: bool = True, with_link: bool = True) -> DriveState:
+        """The same fields, seen through some rows; those of load and link only where they are wanted."""
+        left_out = (() if with_load else ("load_effort",)) + (() if with_link else _LINK_FIELDS)
+        return DriveState({name: getattr(self, name)[rows] for name in _FIELDS if name not in left_out})
 
     def __getattr__(self, name: str) -> torch.Tensor:
         """Only reached by names that are no field.
@@ -89,8 +89,9 @@ class DriveState:
         Raises:
             AttributeError: Always.
         """
-        if name in _LOAD_FIELDS:
-            raise AttributeError(f"{name} is not computed for this effect: declare reads_load = True in its class.")
+        if name == "load_effort" or name in _LINK_FIELDS:
+            flag = "reads_load" if name == "load_effort" else "reads_link"
+            raise AttributeError(f"{name} is not computed for this effect: declare {flag} = True in its class.")
         raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
     def __deepcopy__(self, memo: dict) -> DriveState:

@@ -94,9 +94,11 @@ class Effect:
     parts_motor_and_link: ClassVar[bool] = False
     """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
     reads_load: ClassVar[bool] = False
-    """Whether it reads ``s.load_effort`` and what else the drive carries: without it they are not computed."""
+    """Whether it reads ``s.load_effort``: without it that is not computed."""
+    reads_link: ClassVar[bool] = False
+    """Whether it reads the link's inertia and what else of it the state has: without it they are not computed."""
     changes_armature: ClassVar[bool] = False
-    """Whether it changes ``s.armature`` from step to step, and reads the link's inertia."""
+    """Whether it changes ``s.armature`` from step to step."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     absorbed_by: ClassVar[str] = ""

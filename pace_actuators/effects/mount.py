@@ -30,6 +30,7 @@ class MountCompliance(Effect):
     stage = "transmission"
     shared = True
     is_stiff = True
+    reads_link = True
     changes_armature = True
     reads_load = True
     two_sided = False

@@ -79,7 +79,7 @@ class EffectStack:
             )
             self.effects.append(effect)
             self.cfgs.append(cfg)
-            self._view[effect] = self.state.of_rows(rows, with_load=effect.reads_load)
+            self._view[effect] = self.state.of_rows(rows, effect.reads_load, effect.reads_link)
             self._configure(effect, cfg)
         self._at = {
             stage: [
@@ -97,6 +97,8 @@ class EffectStack:
         self.lags = [effect for effect in self.effects if effect.overrides("observation_lag")]
         self.needs_load = any(effect.reads_load for effect in self.effects)
         """Whether the torque of gravity and load must be given."""
+        self.needs_link = any(effect.reads_link for effect in self.effects)
+        """Whether the inertia of what the joints carry must be given."""
 
     @property
     def is_trapezoidal(self) -> bool:
