@@ -62,6 +62,7 @@ def test_the_library_holds_what_it_should():
         "torque_speed_limit", "command_rate_limit", "torque_ripple", "joint_elasticity", "backlash", "payload",
         "com_offset", "encoder_scale", "encoder_eccentricity", "other_delay", "measurement_delay", "clock_skew",
         "mount_compliance", "creeping_friction", "soft_friction", "integral_gain",
+        "command_acceleration_limit",
     } <= set(EFFECTS)  # fmt: skip
 
 
@@ -119,6 +120,21 @@ def test_the_targets_rate_is_limited_before_it_is_delayed():
         inside.append(inside[-1] + max(-limit * DT, min(limit * DT, target - inside[-1])))
     late = [0.7 * inside[max(k - 1, 0)] + 0.3 * inside[max(k - 2, 0)] for k in range(len(inside))]
     assert [drive.one(target) / 100.0 for target in targets] == pytest.approx(late)
+
+
+def test_the_target_speeds_up_and_brakes_on_its_profile():
+    limit, way = 40.0, 0.2
+    drive = Drive(["command_acceleration_limit"], {"command_acceleration_limit.acceleration": limit}, damping=0.0)
+    assert drive.one(0.0) == 0.0
+    inside = [drive.one(way) / 100 for _ in range(round(0.2 / DT))]
+    whole = 2 * math.sqrt(way / limit)  # half of the way faster and faster, half of it slower and slower
+    for k, x in enumerate(inside, start=1):
+        t = k * DT
+        exact = 0.5 * limit * t**2 if t < whole / 2 else way - 0.5 * limit * max(whole - t, 0.0) ** 2
+        assert x == pytest.approx(exact, abs=0.5 * limit * whole * DT)
+    assert max(inside) < way + 0.25 * limit * DT**2 and inside[-1] == pytest.approx(way)
+    fast = Drive(["command_acceleration_limit"], {"command_acceleration_limit.acceleration": 2e8})
+    assert [fast.one(x) for x in (0.0, 0.3, -0.2)] == pytest.approx([0.0, 30.0, -20.0])
 
 
 @pytest.mark.parametrize("name", ["joint_elasticity", "backlash"])

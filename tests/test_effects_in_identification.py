@@ -118,6 +118,7 @@ TWIN_CASES = {
     "torque_limit": {"effort": 10.0},
     "torque_speed_limit": {"velocity": 4.0, "effort": 30.0},
     "command_rate_limit": {"velocity": 2.0},
+    "command_acceleration_limit": {"acceleration": 30.0},
     "torque_ripple": {"sine": 1.0, "cosine": 0.0, "periods": 20.0},
     "joint_elasticity": {"stiffness": 300.0, "damping": 0.5, "encoder_side": 0.0},
     "backlash": {"gap": 0.02, "stiffness": 3000.0, "damping": 5.0, "encoder_side": 0.0},

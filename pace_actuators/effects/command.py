@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from typing import ClassVar
+
 import torch
 
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.effects.drive_state import DriveState
-from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.effects.effect import Effect, EffectParameter, off
 from pace_actuators.effects.registry import register_effect
 
 
@@ -58,6 +61,70 @@ class CommandRateLimit(Effect):
         limited = self._target + error.clamp(-self._step, self._step)
         self._target = torch.where(error.abs() <= self._step, s.joint_pos_target, limited)
         s.joint_pos_target = self._target
+
+
+@register_effect
+class CommandAccelerationLimit(Effect):
+    """The drive's firmware moves its target on a profile: as fast as it may, and so that it can stop at the command.
+
+    With a the acceleration, h a step of the profile, e = q* - x what is left to go:
+
+        v <- v + clip(sgn(e) min(|e|/h, a h (√(1/4 + 2 |e|/(a h²)) - 1/2)) - v, ± a h),  x <- x + h v
+    """
+
+    name = "command_acceleration_limit"
+    stage = "command"
+    parameters = (
+        EffectParameter(
+            name="acceleration",
+            unit="rad/s^2",
+            lower=2.0,
+            upper=2000.0,
+            null=float("inf"),
+            start=100.0,
+            scale="log",
+            meaning="of the target inside the drive",
+        ),
+    )
+    equation = "|d²q*/dt²| <= a inside the drive, which stops at its command"
+    looks = "from some frequency on, the acceleration no longer rises: late and too wide in the fast parts"
+    source = "profile acceleration of servo firmware, e.g. Dynamixel and Feetech control tables"
+    probes = tuple({"acceleration": a} for a in (300.0, 150.0, 80.0, 40.0, 20.0, 10.0))
+    two_sided = False
+    separates = "a larger and faster motion"
+    profile_dt: ClassVar[float] = 0.00125
+    """Longest step of the profile [s]."""
+    acceleration: torch.Tensor
+
+    def prepare(self) -> None:
+        """Steps of the profile in a control step, and what one adds to the speed."""
+        self._steps = max(1, math.ceil(self.control_dt / self.profile_dt - 1e-9))
+        self._h = self.control_dt / self._steps
+        self._off = off(self.acceleration)
+        self._gain = torch.where(self._off, 1.0, self.acceleration) * self._h
+        if not hasattr(self, "_target"):
+            self._target, self._speed = self.zeros(), self.zeros()
+            self._fresh = torch.ones_like(self.zeros(), dtype=torch.bool)
+
+    def reset_state(self, rows: torch.Tensor | slice) -> None:
+        """The next target counts as reached."""
+        self._fresh[rows] = True
+
+    def command(self, s: DriveState) -> None:
+        """Follow the target on the profile."""
+        if bool(self._fresh.any()):
+            self._target = torch.where(self._fresh, s.joint_pos_target, self._target)
+            self._speed = torch.where(self._fresh, 0.0, self._speed)
+            self._fresh[:] = False
+        h, gain = self._h, self._gain
+        for _ in range(self._steps):
+            error = s.joint_pos_target - self._target
+            left = error.abs()
+            stops = gain * (torch.sqrt(0.25 + 2 * left / (gain * h)) - 0.5)
+            change = torch.copysign(torch.minimum(stops, left / h), error) - self._speed
+            self._speed = self._speed + torch.clamp(change, -gain, gain)
+            self._target = self._target + h * self._speed
+        s.joint_pos_target = torch.where(self._off, s.joint_pos_target, self._target)
 
 
 @register_effect

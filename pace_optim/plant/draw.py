@@ -20,7 +20,13 @@ VISIBLE = 3.0
 _DRAWS = 3  # of each round
 _ROUNDS = 4
 _BOOST = 1.7  # from round to round
-_NOT_IN_BACKGROUND = {"torque_limit", "torque_speed_limit", "command_rate_limit", "backlash"}
+_NOT_IN_BACKGROUND = {
+    "torque_limit",
+    "torque_speed_limit",
+    "command_rate_limit",
+    "command_acceleration_limit",
+    "backlash",
+}
 _STIFFEST = 1e5  # [N m/rad], of a small elasticity
 _BENCH_BASE = {
     "armature": Draw(unit="kg m^2", low=0.05, high=0.2),

@@ -30,6 +30,39 @@ class CommandRateLimit(HiddenEffect):
 
 
 @hidden
+class CommandAccelerationLimit(HiddenEffect):
+    """The drive's own target speeds up and brakes with a at most, and comes to rest where it is asked to be."""
+
+    name = "command_acceleration_limit"
+    draws = draws_of(a=Draw(unit="rad/s^2", low=8.0, high=80.0, log=True, role="inverse", null=np.inf))
+
+    def prepare(self, drives: Drives) -> None:
+        """Start at the first target, at rest."""
+        self.last: np.ndarray | None = None
+        self.limited = np.isfinite(self.a)
+        self.most = np.where(self.limited, self.a, 1.0)
+
+    def command(self, target: np.ndarray, dt: float) -> np.ndarray:
+        """Targets as the drive takes them [rad]: full throttle, or full brake once only the way to stop is left."""
+        if self.last is None:
+            self.last, self.pace = target.copy(), np.zeros_like(target)
+        parts = 25
+        h = dt / parts
+        for _ in range(parts):
+            left = target - self.last
+            way = np.where(left >= 0, 1.0, -1.0)
+            towards = self.pace * way
+            brakes = (towards > 0) & (towards**2 / (2 * self.most) >= np.abs(left))
+            faster = self.pace + np.where(brakes, -way, way) * self.most * h
+            near = (np.abs(left) <= 0.5 * self.most * h * h + np.abs(self.pace) * h) & (
+                np.abs(self.pace) <= 2 * self.most * h
+            )
+            self.pace = np.where(near, 0.0, faster)
+            self.last = np.where(near, target, self.last + h * self.pace)
+        return np.where(self.limited, self.last, target)
+
+
+@hidden
 class OtherDelay(HiddenEffect):
     """The path that the base delay does not delay is late by T: the torque if the base delays targets, or reverse."""
 
