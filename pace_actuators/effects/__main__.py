@@ -54,7 +54,10 @@ _PARTLY = """
 Others are alike in part, the more so the narrower the recording: `com_offset` and the encoder bias (an absolute
 reference separates them), `drive_bandwidth` and `joint_elasticity` (a known added mass), `parallel_spring` and a gain
 or a payload (a wide range of motion), `encoder_scale` and `payload` (a known added mass), `torque_speed_limit` and
-`quadratic_friction` (a large, fast motion), `backlash` and `joint_elasticity` (several amplitudes).
+`quadratic_friction` (a large, fast motion), `backlash` and `joint_elasticity` (several amplitudes), and the three
+frictions that do not stick, `presliding_friction`, `creeping_friction` and `soft_friction` (a staircase that holds each
+of its steps longer). Of these give a joint one: each takes Coulomb friction over from the simulator. `soft_friction` is
+no physics of a drive but that of MuJoCo's solver: it is for recordings that were made in MuJoCo.
 
 Not to be found by any smooth model, but a quality of the recording: a delay that jitters, dropped commands, coarse
 quantisation. They raise the noise.
