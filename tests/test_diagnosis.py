@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
 from pace_optim.diagnosis.next_experiment import rivals_of
 from pace_optim.diagnosis.screening import _FOLDS, _explained
 from pace_optim.diagnosis.trials import Round
-from pace_optim.diagnosis.verdict import labels, ranking, verdict
+from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -127,6 +128,27 @@ def test_blocks_are_seconds_of_the_samples_that_count():
 def test_the_verdict_weighs_what_is_left_against_the_floor(before, after, effects, expected):
     floor = torch.ones(len(before), dtype=torch.float64)
     assert verdict(outcome_of(before, after, effects), floor)[0] == expected
+
+
+@pytest.mark.parametrize("effect", ["creeping_friction", "soft_friction"])
+@pytest.mark.parametrize(
+    ("before", "other", "expected", "kept"),
+    [
+        ([2.5], (), "nothing_missing", []),
+        ([5.0], (), "effect", ["smooth"]),
+        ([2.5, 5.0], (), "effect", ["smooth@b"]),
+        ([2.5], (STRIBECK,), "effect", ["smooth", "stribeck_friction"]),
+    ],
+)
+def test_a_little_smoothing_of_friction_alone_is_nothing_missing(effect, before, other, expected, kept):
+    outcome = outcome_of(before, [1.0] * len(before), (get_effect(effect), *other))
+    floor = torch.ones(len(before), dtype=torch.float64)
+    assert verdict(outcome, floor)[0] == expected
+    joints = explained_joints(outcome, floor)
+    assert [bool(b) for b in joints] == [b > 3 or bool(other) for b in before]
+    named = [name.replace("smooth", effect) for name in kept]
+    model = SimpleNamespace(**{**vars(outcome.final.model), "has": outcome.final.model.has & joints})
+    assert labels(model, ("a", "b")[: len(before)]) == named
 
 
 def test_the_part_explained_is_of_what_lies_above_the_floor():

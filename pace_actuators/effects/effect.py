@@ -99,6 +99,9 @@ class Effect:
     """Whether it reads the link's inertia and what else of it the state has: without it they are not computed."""
     changes_armature: ClassVar[bool] = False
     """Whether it changes ``s.armature`` from step to step."""
+    smooths_friction: ClassVar[bool] = False
+    """Whether it only smooths Coulomb friction at standstill, as simulators do: a little of it alone is nothing
+    missing."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     absorbed_by: ClassVar[str] = ""

@@ -16,6 +16,7 @@ class _FadingFriction(Effect):
 
     stage = "friction"
     two_sided = False
+    smooths_friction = True
     separates = "a staircase that holds each of its steps longer, and a slow triangle"
 
     def prepare(self) -> None:

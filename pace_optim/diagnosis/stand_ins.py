@@ -41,6 +41,13 @@ def real_effects(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     return outcome.final.model.has & ~_at_bounds(outcome) & ~_uneven(outcome, floor)
 
 
+def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Effects that count as missing, (effects, n) bool: not those that smooth friction where it hardly shows."""
+    model = outcome.final.model
+    smooths = torch.tensor([effect.smooths_friction for effect in model.effects], dtype=torch.bool)[:, None]
+    return model.has & ~(smooths & (outcome.base_errors.mse.sqrt() <= UNKNOWN_RATIO * floor))
+
+
 def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects that stand in for something else, and what shows it: a sentence each."""
     stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome, floor)))

@@ -13,7 +13,7 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, near_floor, real_effects
+from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, counts, near_floor, real_effects
 from pace_optim.diagnosis.trials import Trial
 
 EXPLAINED = 0.5
@@ -44,7 +44,8 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 
     They explain at least half of the error above the floor, and not all of them stand in for something else. Near the
-    floor it does not matter how.
+    floor it does not matter how. How friction is smoothed at standstill is not missing where it makes less of an error
+    than would be a finding of its own.
 
     Args:
         outcome: Where the search ended.
@@ -52,7 +53,7 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """
     excess, left = above_floor(outcome, floor)
     enough = (left <= (1 - EXPLAINED) * excess) & real_effects(outcome, floor).any(dim=0)
-    return outcome.final.model.has.any(dim=0) & (enough | near_floor(outcome, floor))
+    return counts(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
 
 
 def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
