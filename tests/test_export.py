@@ -74,6 +74,20 @@ def test_the_mjcf_holds_a_payload(result):
     assert np.allclose(model.body_ipos, original.body_ipos, atol=1e-5)
 
 
+def test_the_mjcf_holds_a_soft_friction(result):
+    constants = {"LF_KFE": 0.02, "RF_KFE": 0.05, "LH_KFE": 0.0}
+    changed = with_effects(
+        result, ["soft_friction@.*KFE"], {"soft_friction.time_constant": {**dict.fromkeys(JOINTS, 0.0), **constants}}
+    )
+    exported = export(changed, "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    for name, constant in constants.items():
+        column = model.joint(name).dofadr[0]
+        assert model.dof_solref[column, 0] == pytest.approx(constant or 2 * DT)
+        assert (model.dof_solimp[column, 0] == pytest.approx(0.9)) == (constant > 0)
+    assert "soft_friction is in the model" in " ".join(exported.notes)
+
+
 def test_the_cfg_gives_the_same_torque(result):
     space: dict = {}
     exec(compile(export(result, "cfg").text, "exported.py", "exec"), space)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.effects.fading_friction import SoftFriction
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import use_identified
 
@@ -37,6 +39,10 @@ def mjcf(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         joint.frictionloss = drives.values("friction", [name])[name]
         _set_damping(joint, drives.values("viscous_friction", [name])[name])
         joint.solref_friction, joint.solimp_friction = model.dof_solref[column], model.dof_solimp[column]
+    for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
+        joint = spec.joint(name)
+        joint.solref_friction = [time_constant, 1.0]
+        joint.solimp_friction = [SoftFriction.impedance, SoftFriction.widest, 0.001, 0.5, 2.0]
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
     changed = _write_bodies(spec, plain, env)
@@ -44,6 +50,13 @@ def mjcf(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     env.close()
     plain.close()
     return _with_comment(spec.to_xml(), notes, drives), notes
+
+
+def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dict[str, float]:
+    """Time constants [s] of the joints whose friction is that of MuJoCo's own constraint."""
+    own = [cfg.joints(joint_names) for cfg in drives.effects if cfg.effect_class is SoftFriction]
+    values = drives.values("soft_friction.time_constant", own[0]) if own else {}
+    return {name: value for name, value in values.items() if value > 0}
 
 
 def _set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
@@ -86,7 +99,9 @@ def _notes(drives: IdentifiedDrives, changed: list[str]) -> list[str]:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     for effect in drives.effects:
         kind = effect.effect_class
-        if not kind.overrides("write_model"):
+        if kind is SoftFriction:
+            notes.append(f"{kind.name} is in the model: solreffriction and solimpfriction of its joints.")
+        elif not kind.overrides("write_model"):
             what = kind.equation or (kind.__doc__ or "").strip().splitlines()[0]
             notes.append(f"{kind.name} ({what}): it is not in the model.")
     return notes
