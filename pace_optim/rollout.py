@@ -128,13 +128,17 @@ class Rollout:
         behind = max(0, math.ceil(float(lag.max()))) + 2
         length = ahead + behind + 1
         seen = torch.zeros(length, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
-        rate = (lag[-1] - lag[0]) / max(1, steps - 1)  # lags are linear in time
+        late = (lag != 0).any(dim=2).any(dim=0).nonzero()[:, 0]
+        first = lag[0, late]
+        rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
         for j, position in enumerate(self.simulated(steps + ahead)):
             seen[j % length] = position
             if j == 0:
                 seen[:] = position
             if (k := j - ahead) >= 0:
-                yield k, _interpolated(seen, k - (lag[0] + rate * k))
+                shown = seen[k % length].clone()
+                shown[late] = _interpolated(seen[:, late], k - (first + rate * k))
+                yield k, shown
 
     def _observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
