@@ -262,13 +262,28 @@ class Lean(Effect):
 
 
 @pytest.mark.slow
-def test_an_effect_of_one_s_own_is_considered(tmp_path):
+def test_an_effect_of_one_s_own_is_named_and_kept_when_its_refit_is_broken_off(tmp_path):
     run = hidden_run(tmp_path, "torque_offset").folder
+    broken = """
+import importlib, runpy, sys
+module = importlib.import_module("pace_optim.diagnosis.diagnose")
+
+def fit(settings, progress):
+    assert settings.effects == ["lean_of_my_own"] and settings.start["lean_of_my_own.torque"]["servo"] != 0.0
+    raise KeyboardInterrupt
+
+module.fit = fit
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
     (tmp_path / "lean_effects.py").write_text(OWN)
-    done = diagnose(run, "--no_refit", "--only", "--effects", "lean_effects:Lean", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    script = str(ROOT / "scripts" / "diagnose.py")
+    command = [sys.executable, "-c", broken, script, str(run), "--only", "--effects", "lean_effects:Lean"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode != 0 and "AssertionError" not in done.stderr, done.stderr
     content = json.loads((run / "diagnosis.json").read_text())
     assert content["tried"] == ["lean_of_my_own"] and content["added"] == ["lean_of_my_own"]
+    assert content["runs"] == [str(run)]
 
 
 def test_candidates_are_all_registered_effects_or_only_one_s_own():

@@ -83,22 +83,6 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
     found = search_effects(
         problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say, result
     )
-    runs, ladder = [str(folder)], _ladder(found)
-    if settings.refit and found.paying:
-        progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
-        final = found.outcome.final
-        refit_settings = replace(
-            run_settings,
-            effects=found.paying,
-            optimizer="least_squares",
-            physics_dt=physics_dt,
-            start=whole_values(final.model, final.x, problem.joint_names),
-            check_consistency=False,  # the run has done it
-            log_dir=str(folder.parent.parent),
-        )
-        progress.restart()
-        _, path = fit(refit_settings, progress)
-        runs.append(str(path))
     if result.effects:
         found.data.sentences.append(
             f"The run has {', '.join(result.effects)}: the search started from the base model, and looked for it again."
@@ -116,18 +100,38 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         data=found.data.sentences,
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
         advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
-        runs=runs,
+        runs=[str(folder)],
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
-        ladder=ladder,
+        ladder=_ladder(found),
         error_map=error_map(found.outcome.problem, found.outcome.final, found.data.floor),
         wall_time_s=time.monotonic() - begin,
     )
     diagnosis.save(folder)
-    for run in runs[1:]:
-        diagnosis.save(run)
+    if settings.refit and found.paying:
+        path = _refit(found, problem, run_settings, folder, progress)
+        diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
+        for run in diagnosis.runs:
+            diagnosis.save(run)
     progress.close()
     return diagnosis
+
+
+def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, progress: ProgressLine) -> Path:
+    """Fit the whole robot with what was found, from where the search ended; returns the new run's folder."""
+    progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
+    final = found.outcome.final
+    settings = replace(
+        run,
+        effects=found.paying,
+        optimizer="least_squares",
+        physics_dt=problem.physics_dt,
+        start=whole_values(final.model, final.x, problem.joint_names),
+        check_consistency=False,  # the run has done it
+        log_dir=str(folder.parent.parent),
+    )
+    progress.restart()
+    return fit(settings, progress)[1]
 
 
 def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
