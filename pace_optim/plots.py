@@ -15,7 +15,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from pace_optim.history import History
-from pace_optim.trajectory_errors import angle_text, angle_unit, held_out_spans, rms
+from pace_optim.number_text import angle_text, angle_unit
+from pace_optim.trajectory_errors import held_out_spans, rms
 
 _TARGET, _MEASURED, _SIMULATED, _HELD_OUT = "#a5abb2", "#1f5fa8", "#e07b00", "#8a6fc4"
 _JOINTS_PER_FIGURE = 12

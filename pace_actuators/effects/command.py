@@ -46,17 +46,13 @@ class CommandRateLimit(Effect):
         """Largest move per control step."""
         self._step = self.velocity * self.control_dt
         if not hasattr(self, "_target"):
-            self._target, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The next target counts as reached."""
-        self._fresh[rows] = True
+            self._target = self.zeros()
 
     def command(self, s: DriveState) -> None:
-        """Follow the target at the limit."""
-        if bool(self._fresh.any()):
-            self._target = torch.where(self._fresh, s.joint_pos_target, self._target)
-            self._fresh[:] = False
+        """Follow the target at the limit; the first counts as reached."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._target = torch.where(new, s.joint_pos_target, self._target)
         error = s.joint_pos_target - self._target
         limited = self._target + error.clamp(-self._step, self._step)
         self._target = torch.where(error.abs() <= self._step, s.joint_pos_target, limited)
@@ -104,18 +100,13 @@ class CommandAccelerationLimit(Effect):
         self._gain = torch.where(self._off, 1.0, self.acceleration) * self._h
         if not hasattr(self, "_target"):
             self._target, self._speed = self.zeros(), self.zeros()
-            self._fresh = torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The next target counts as reached."""
-        self._fresh[rows] = True
 
     def command(self, s: DriveState) -> None:
-        """Follow the target on the profile."""
-        if bool(self._fresh.any()):
-            self._target = torch.where(self._fresh, s.joint_pos_target, self._target)
-            self._speed = torch.where(self._fresh, 0.0, self._speed)
-            self._fresh[:] = False
+        """Follow the target on the profile; the first counts as reached."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._target = torch.where(new, s.joint_pos_target, self._target)
+            self._speed = torch.where(new, 0.0, self._speed)
         h, gain = self._h, self._gain
         for _ in range(self._steps):
             error = s.joint_pos_target - self._target
@@ -250,12 +241,11 @@ class IntegralGain(Effect):
         if not hasattr(self, "_integral"):
             self._integral = self.zeros()
 
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Nothing is integrated yet."""
-        self._integral[rows] = 0.0
-
     def controller_effort(self, s: DriveState) -> None:
-        """Add the integral's torque."""
+        """Add the integral's torque; it begins empty."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._integral = torch.where(new, 0.0, self._integral)
         summed = self._integral + self._per_step * s.position_error
         self._integral = torch.clamp(summed, -self.effort, self.effort)
         s.effort += self._integral

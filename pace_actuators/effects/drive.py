@@ -55,17 +55,13 @@ class DriveBandwidth(Effect):
         self._weight = -torch.expm1(-decay)
         self._mean_weight = torch.where(decay.isinf(), 1.0, 1 - self._weight / decay)
         if not hasattr(self, "_torque"):
-            self._torque, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The next torque counts as settled."""
-        self._fresh[rows] = True
+            self._torque = self.zeros()
 
     def drive(self, s: DriveState) -> None:
-        """Give the mean torque over the coming step."""
-        if bool(self._fresh.any()):
-            self._torque = torch.where(self._fresh, s.effort, self._torque)
-            self._fresh[:] = False
+        """Give the mean torque over the coming step; the first counts as settled."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._torque = torch.where(new, s.effort, self._torque)
         before, asked = self._torque, s.effort.clone()
         self._torque = torch.lerp(before, asked, self._weight)
         s.effort = torch.lerp(before, asked, self._mean_weight)

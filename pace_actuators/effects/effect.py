@@ -67,6 +67,7 @@ class Effect:
         dt: Time between two calls of the drive (the physics step) [s].
         control_dt: Time between two control steps [s].
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
+        new_rows: Which rows have no history yet, (rows, 1) bool; ``None`` if all have.
     """
 
     name: ClassVar[str]
@@ -138,6 +139,7 @@ class Effect:
         self.dt, self.control_dt, self.delay_mode = dt, control_dt, delay_mode
         self.is_trapezoidal = False
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
+        self.new_rows: torch.Tensor | None = ~self._no_rows()
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
@@ -149,7 +151,10 @@ class Effect:
         """Compute what follows from the parameters; called after each change of them."""
 
     def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Forget the history of some of its rows."""
+        """Forget the history of some of its rows: :meth:`take_new_rows` then tells of them."""
+        if self.new_rows is None:
+            self.new_rows = self._no_rows()
+        self.new_rows[rows] = True
 
     def advance(self, s: DriveState) -> None:
         """Once per physics step, before all else: bring the own state to the present joint state."""
@@ -193,6 +198,18 @@ class Effect:
 
     # ---- what a subclass uses ------------------------------------------------------------------------------------
 
+    def take_new_rows(self) -> torch.Tensor | None:
+        """Which rows have no history yet, (rows, 1) bool, or ``None``: all at first, and those of a reset.
+
+        It says so once; the effect lets their history begin, most often with the first value that it sees::
+
+            new = self.take_new_rows()
+            if new is not None:
+                self._target = torch.where(new, s.joint_pos_target, self._target)
+        """
+        new, self.new_rows = self.new_rows, None
+        return new
+
     def full(self, value: float) -> torch.Tensor:
         """A tensor of its shape (rows, num_joints)."""
         return torch.full(self.shape, value, **self._options)
@@ -200,6 +217,9 @@ class Effect:
     def zeros(self) -> torch.Tensor:
         """Zeros of its shape (rows, num_joints)."""
         return self.full(0.0)
+
+    def _no_rows(self) -> torch.Tensor:
+        return torch.zeros(self.shape[0], 1, dtype=torch.bool, device=self._options["device"])
 
     # ---- what the drive calls ------------------------------------------------------------------------------------
 

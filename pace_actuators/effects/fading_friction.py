@@ -22,17 +22,13 @@ class _FadingFriction(Effect):
     def prepare(self) -> None:
         """Where it acts."""
         if not hasattr(self, "_before"):
-            self._before, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The next speed counts as held."""
-        self._fresh[rows] = True
+            self._before = self.zeros()
 
     def middle_speed(self, s: DriveState) -> torch.Tensor:
         """The speed in the middle of the step, as the last two let expect [rad/s]; once per step."""
-        if bool(self._fresh.any()):
-            self._before = torch.where(self._fresh, s.motor_vel, self._before)
-            self._fresh[:] = False
+        new = self.take_new_rows()
+        if new is not None:
+            self._before = torch.where(new, s.motor_vel, self._before)
         middle = 1.5 * s.motor_vel - 0.5 * self._before
         self._before = s.motor_vel.clone()
         return middle

@@ -175,22 +175,18 @@ class PreslidingFriction(Effect):
         self._sigma = torch.where(self._on, self.stiffness, 0.0)
         if not hasattr(self, "_bristle"):
             self._bristle, self._position = self.zeros(), self.zeros()
-            self._fresh = torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """No bristle is bent."""
-        self._fresh[rows] = True
 
     def transmission(self, s: DriveState) -> None:
         """Take the Coulomb level over from the simulator.
 
         The bristle's force is taken at the present position, its slope towards the next one implicitly (a quarter
-        of a step, as Newmark's average acceleration does), so that no stiffness is too large for the step.
+        of a step, as Newmark's average acceleration does), so that no stiffness is too large for the step. At first no
+        bristle is bent.
         """
-        if bool(self._fresh.any()):
-            self._bristle = torch.where(self._fresh, 0.0, self._bristle)
-            self._position = torch.where(self._fresh, s.motor_pos, self._position)
-            self._fresh[:] = False
+        new = self.take_new_rows()
+        if new is not None:
+            self._bristle = torch.where(new, 0.0, self._bristle)
+            self._position = torch.where(new, s.motor_pos, self._position)
         level = s.friction.clamp(min=1e-9)
         moved = s.motor_pos - self._position
         direction = torch.sign(moved)

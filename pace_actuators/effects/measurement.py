@@ -78,17 +78,13 @@ class VelocityFilter(Effect):
         """Weight of the newest speed."""
         self._weight = -torch.expm1(-self.control_dt / self.time_constant)
         if not hasattr(self, "_seen"):
-            self._seen, self._fresh = self.zeros(), torch.ones_like(self.zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The next speed counts as settled."""
-        self._fresh[rows] = True
+            self._seen = self.zeros()
 
     def sensed_velocity(self, s: DriveState) -> None:
-        """Filter the speed."""
-        if bool(self._fresh.any()):
-            self._seen = torch.where(self._fresh, s.encoder_vel, self._seen)
-            self._fresh[:] = False
+        """Filter the speed; the first counts as settled."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._seen = torch.where(new, s.encoder_vel, self._seen)
         self._seen = torch.lerp(self._seen, s.encoder_vel, self._weight)
         s.encoder_vel = self._seen
 

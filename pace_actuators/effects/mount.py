@@ -67,22 +67,17 @@ class MountCompliance(Effect):
             zeros = self.zeros
             self._angle, self._speed, self._joint_speed = zeros(), zeros(), zeros()
             self._rest, self._link, self._total = zeros(), zeros(), zeros() + 1
-            self._fresh = torch.ones_like(zeros(), dtype=torch.bool)
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """The base rests where it carries the load."""
-        self._fresh[rows] = True
 
     def advance(self, s: DriveState) -> None:
-        """The base's step, now that the joint's speed after it is known."""
+        """The base's step, now that the joint's speed after it is known; it begins at rest under its load."""
         moved = (self._rest * self.dt - self._link * (s.joint_vel - self._joint_speed)) / self._total
         self._angle = self._angle + self.dt * (self._speed + 0.5 * moved)
         self._speed = self._speed + moved
-        if bool(self._fresh.any()):
+        new = self.take_new_rows()
+        if new is not None:
             settled = s.load_effort / (self._k + s.load_stiffness).clamp(min=1.0)
-            self._angle = torch.where(self._fresh, settled, self._angle)
-            self._speed = torch.where(self._fresh, 0.0, self._speed)
-            self._fresh[:] = False
+            self._angle = torch.where(new, settled, self._angle)
+            self._speed = torch.where(new, 0.0, self._speed)
 
     def transmission(self, s: DriveState) -> None:
         """What the link feels of the base."""

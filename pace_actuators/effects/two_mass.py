@@ -75,12 +75,6 @@ class _TwoMass(Effect):
             zeros = self.zeros
             self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
             self._drive, self._coupling, self._inertia, self._direction = zeros(), zeros(), zeros() + 1, zeros()
-            self._fresh = torch.ones_like(zeros(), dtype=torch.bool)
-            self._any_fresh = True
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Motor and link stand at rest against each other, the spring holding the load."""
-        self._fresh[rows] = self._any_fresh = True
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """Deflection that holds the load."""
@@ -101,10 +95,10 @@ class _TwoMass(Effect):
         moving = 0.5 * (self._speed + speed) if self.is_trapezoidal else speed
         self._angle = self._angle + self.dt * moving
         self._speed = speed
-        if self._any_fresh:
-            self._angle = torch.where(self._fresh, s.joint_pos + self.rest_deflection(s), self._angle)
-            self._speed = torch.where(self._fresh, s.joint_vel, self._speed)
-            self._fresh[:] = self._any_fresh = False
+        new = self.take_new_rows()
+        if new is not None:  # at rest against each other, the spring holding the load
+            self._angle = torch.where(new, s.joint_pos + self.rest_deflection(s), self._angle)
+            self._speed = torch.where(new, s.joint_vel, self._speed)
         s.motor_pos = torch.where(self._on, self._angle, s.motor_pos)
         s.motor_vel = torch.where(self._on, self._speed, s.motor_vel)
 
@@ -113,8 +107,8 @@ class _TwoMass(Effect):
         if not self._any:
             return
         twist = self._angle - s.joint_pos
-        if self._any_fresh:
-            twist = torch.where(self._fresh, self.rest_deflection(s), twist)
+        if self.new_rows is not None:
+            twist = torch.where(self.new_rows, self.rest_deflection(s), twist)
         s.encoder_pos += self._side * twist
 
     def sensed_velocity(self, s: DriveState) -> None:

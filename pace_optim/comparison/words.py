@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pace_optim.number_text import short_duration
+
 from .dimensions import Dimension
 from .regions import Region
 
@@ -60,15 +62,10 @@ def _between(low: float | None, high: float | None, unit: str, above: str = "abo
 
 def _after_reversal(low: float | None, high: float | None) -> str:
     if low is None:
-        return f"within {_duration(high)} after a reversal"
+        return f"within {short_duration(high)} after a reversal"
     if high is None:
-        return f"more than {_duration(low)} after the last reversal"
-    return f"between {_duration(low)} and {_duration(high)} after a reversal"
-
-
-def _duration(seconds: float | None) -> str:
-    seconds = seconds or 0.0
-    return f"{1e3 * seconds:g} ms" if seconds < 1 else f"{seconds:g} s"
+        return f"more than {short_duration(low)} after the last reversal"
+    return f"between {short_duration(low)} and {short_duration(high)} after a reversal"
 
 
 def _number(value: float | None) -> str:

@@ -34,7 +34,7 @@ class CommandAccelerationLimit(HiddenEffect):
     """The drive's own target speeds up and brakes with a at most, and comes to rest where it is asked to be."""
 
     name = "command_acceleration_limit"
-    draws = draws_of(a=Draw(unit="rad/s^2", low=25.0, high=150.0, log=True, role="inverse", null=np.inf))
+    draws = draws_of(a=Draw(unit="rad/s^2", low=8.0, high=80.0, log=True, role="inverse", null=np.inf))
 
     def prepare(self, drives: Drives) -> None:
         """Start at the first target, at rest."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from pace_optim.trajectory_errors import angle_text, angle_unit
+from pace_optim.number_text import angle_text, angle_unit, short_duration
 
 _PANELS = ("velocity", "since_reversal", "position", "load", "acceleration", "time")
 _MEASURED, _MODEL, _NOISE = "var(--measured)", "var(--simulated)", "var(--muted)"
@@ -236,7 +236,7 @@ def _white(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
     else:
         text = (
             f"Not white: the sample before explains {share:.0f} % of the variance, and errors stay alike for "
-            f"{_duration(time)}. Something that can be modelled is left."
+            f"{short_duration(time)}. Something that can be modelled is left."
         )
     return {
         "text": text,
@@ -324,7 +324,3 @@ FIGURES: dict[str, FailureFigure] = {
     ),
 }
 """By name, in their order on the page."""
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
