@@ -25,17 +25,20 @@ _STRIDE = 2
 def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
-    Each point is simulated once, on the beginning of each window of the training recordings.
+    Of a stiff one, the best point of each probe: the error at a point says little of where it leads, as another
+    stiffness has its resonance elsewhere, and no descent goes from one to the other. Each point is simulated once, on
+    the beginning of each window of the training recordings.
 
     Args:
         problem: The joints simulated alone, coarsely.
         now: The present model.
         effects: What is tried.
     """
-    return spread(lambda own: _best_points(problem, now, own), effects, effects)
+    starts = spread(lambda own: _best_points(problem, now, own), effects, effects)
+    return [start for of_effect in starts for start in of_effect]
 
 
-def _best_points(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
+def _best_points(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[list[Fitted]]:
     """:func:`far_starts` in one process."""
     bases = _bases(now)
     slots, values = [], []
@@ -53,10 +56,17 @@ def _best_points(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effec
     scores = batch.simulate(values, where, _STRIDE).square().sum(dim=(1, 2))
     result = []
     for effect, slot, points_of, score in zip(effects, slots, values, batch.split(scores), strict=True):
-        physical = points_of[score.argmin(dim=0), torch.arange(now.model.num_joints)]
-        model = slot.model.structure_held(effect, physical)
-        result.append(Fitted.start(model, physical, tried=effect))
+        every = torch.arange(len(score))
+        # each probe with all of the bases, or all of them
+        groups = every.unflatten(0, (len(bases), -1)).T if effect.is_stiff else every[None]
+        result.append([_best(now, slot.model, effect, points_of[group], score[group]) for group in groups])
     return result
+
+
+def _best(now: Fitted, model: JointModel, effect: type[Effect], points: torch.Tensor, score: torch.Tensor) -> Fitted:
+    """A start at each joint's best of some points, (points, n, P), by their scores, (points, n)."""
+    physical = points[score.argmin(dim=0), torch.arange(now.model.num_joints)]
+    return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
 
 
 def _bases(now: Fitted) -> list[torch.Tensor]:
