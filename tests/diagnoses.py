@@ -88,7 +88,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
     }
 
 
-def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True) -> Trial:
+def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True, likely: bool = False) -> Trial:
     """An effect that was tried on a joint, with its RMSE after [rad]."""
     return Trial(
         effect=effect,
@@ -99,6 +99,7 @@ def make_trial(effect: type[Effect], joint: int, after: float, significant: bool
         ratio=1e-3 / after,
         t=4.0,
         significant=significant,
+        likely=likely,
         values={},
     )
 

@@ -24,7 +24,7 @@ from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
-CLOCK, ELASTICITY = get_effect("clock_skew"), get_effect("joint_elasticity")
+CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))
 
 
 @pytest.fixture(scope="module")
@@ -285,3 +285,11 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
     # a lone effect was the best of its round: nothing is tried in its place
     lone = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]))
     assert swapping.swapped(bench.twins, lone, errors_of(3e-4), [first], floor) is None
+
+
+@pytest.mark.parametrize(("elastic", "chosen"), [(1.01, ELASTICITY), (1.04, BACKLASH), (0.99, ELASTICITY)])
+def test_of_two_effects_that_are_as_good_the_one_with_fewer_numbers_is_taken(elastic, chosen):
+    (taken,), ((other,),) = one_round._choose(
+        [[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]]
+    )
+    assert {taken, other} == {BACKLASH, ELASTICITY} and taken is chosen

@@ -54,7 +54,8 @@ class World:
             before = float(errors.mse[j].sqrt())
             own = [e for e in effects if now.model.may_get(e)[j]]
             after = {e: self.rmse(joints[j], [*has, e]) for e in own}
-            trials.append([make_trial(e, j, after[e], after[e] * 1.2 < before) for e in sorted(own, key=after.get)])
+            order = sorted(own, key=after.get)
+            trials.append([make_trial(e, j, after[e], 1.2 * after[e] < before, 1.1 * after[e] < before) for e in order])
         chosen = [next((t.effect for t in each if t.significant), None) for each in trials]
         return Round(trials=trials, chosen=chosen, rivals=[[] for _ in trials], models=models)
 
@@ -149,6 +150,41 @@ def test_the_best_effect_stays_where_no_other_leads_further(monkeypatch):
     assert effects == [{"mount_compliance", "torque_gain"}] and rounds == 2
     hardly_better = {**STANDS_IN, frozenset((ELASTICITY, GAIN)): 5.7}
     assert found(monkeypatch, hardly_better)[0] == [{"mount_compliance", "torque_gain"}]
+
+
+# none of them pays alone
+BOTH_LACK = mrad(
+    {
+        (MOUNT,): 39.0,
+        (ELASTICITY,): 38.5,
+        (GAIN,): 34.0,
+        (SPRING,): 38.0,
+        (GAIN, MOUNT): 33.9,
+        (GAIN, ELASTICITY): 33.9,
+        (GAIN, SPRING): 0.2,
+    }
+)
+
+
+def test_two_effects_that_hide_each_other_are_found_by_a_guess_at_the_likelier(monkeypatch):
+    outcome, world = searched(monkeypatch, BOTH_LACK)
+    assert world.effects_of(outcome.final) == [[GAIN, SPRING]]
+    told = outcome.rounds[0].trials[0][0]  # what it brings beside the other
+    assert told.effect is GAIN and told.significant and told.mse_before == pytest.approx(38e-3**2)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {(GAIN,): 38.0},  # nothing is likely
+        {(GAIN, SPRING): 33.0},  # it leads nowhere
+        {(GAIN, SPRING): 28.0, (SPRING,): 34.5},  # it does not pay beside the other
+        {(): 0.29, (GAIN,): 0.25, (GAIN, SPRING): 0.1},  # the joint is near the floor
+    ],
+)
+def test_a_guess_that_does_not_pay_is_taken_back(monkeypatch, changes):
+    effects, _ = found(monkeypatch, {**BOTH_LACK, **mrad(changes)})
+    assert effects == [set()]
 
 
 def test_each_joint_takes_its_own_way(monkeypatch):

@@ -68,6 +68,8 @@ class Judgement:
     t: float
     """t statistic of the blocks' log ratio."""
     significant: bool
+    likely: bool
+    """Whether it may be there, though this does not show it: a fall that would count were it as even as a clear one."""
 
 
 def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first: bool) -> Judgement:
@@ -88,14 +90,14 @@ def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first
     logs = (before.square[:, joint].clamp(min=1e-30) / after.square[:, joint].clamp(min=1e-30)).log()
     count = len(logs)
     if count < 4:
-        return Judgement(ratio=ratio, t=0.0, significant=False)
+        return Judgement(ratio=ratio, t=0.0, significant=False, likely=False)
     falls = (before.square[:, joint] - after.square[:, joint]) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
     threshold = float(stats.t.isf(LEVEL / (2 * max(1, tried)), count - 1))
     least = FIRST_RATIO if first else NEXT_RATIO
     enough = t > threshold or (ratio >= CLEAR_RATIO and t > CLEAR_T)
-    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)
+    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough, likely=ratio >= least and t > CLEAR_T)
 
 
 def _t(values: torch.Tensor) -> float:

@@ -26,6 +26,8 @@ PER_JOINT = 4
 """How many of them."""
 FROM_SCREENING = 2
 """How many of the best screened go on in any case, where refits began with all effects."""
+ALIKE = 1.02
+"""Of effects whose validation RMSE is within this factor of the best, the one with the fewest numbers is taken."""
 _PART, _ITERATIONS = 0.7, 6
 """Of each window, and how far, where refits begin: after four, what needs another derivative gain too is far behind."""
 FAR_FROM_FLOOR = 50.0
@@ -179,7 +181,7 @@ def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted
 
 
 def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
-    """Each joint's best significant effect; among rivals, the one that most joints want."""
+    """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest."""
     wanted: dict[type[Effect], int] = {}
     near: list[list[Trial]] = []
     refused = _worse_for_the_robot(trials)
@@ -197,10 +199,18 @@ def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[
             chosen.append(None)
             rivals.append([])
             continue
-        best = min(close, key=lambda t: (-wanted[t.effect], t.mse_after))
+        most = max(wanted[t.effect] for t in close)
+        best = _simplest([t for t in close if wanted[t.effect] == most])
         chosen.append(best.effect)
         rivals.append([t.effect for t in close if t.effect is not best.effect])
     return chosen, rivals
+
+
+def _simplest(trials: Sequence[Trial]) -> Trial:
+    """The best trial of a joint, or one with fewer numbers that is as good."""
+    least = min(t.mse_after for t in trials)
+    alike = [t for t in trials if t.mse_after <= ALIKE**2 * least]
+    return min(alike, key=lambda t: (len(t.effect.parameters), t.mse_after))
 
 
 def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]:

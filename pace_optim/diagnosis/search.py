@@ -65,6 +65,8 @@ def add_effects(
             branch, found = together, steps.tried(together)
         elif any(effect is not None for effect in found.chosen):
             branch, found = _led_on(steps, branch, found)
+        elif (guessed := _guessed(steps, branch, found)) is not None:
+            branch, found = guessed, steps.tried(guessed)
         else:
             break
     branch = steps.simplified(branch)
@@ -100,6 +102,34 @@ def _at_once(steps: Steps, branch: Branch, found: Round) -> Branch | None:
                 return replace(grown, rounds=[*grown.rounds[:-1], grown.rounds[-1].with_trials(trials)])
             joints = [j for j, trial in trials.items() if trial.significant]
     return None
+
+
+def _guessed(steps: Steps, branch: Branch, found: Round) -> Branch | None:
+    """The branch two rounds on, by effects that are likely only; ``None`` if they do not pay beside the next ones.
+
+    Where several effects of a size are missing, what one of them brings is uneven: the others cover it here and there.
+    """
+    far = branch.errors.mse.sqrt() > LOOK_AHEAD * steps.floor
+    likely = [next((t.effect for t in own if t.likely), None) for own in found.trials]
+    guesses = [effect if yes else None for effect, yes in zip(likely, far.tolist(), strict=True)]
+    if not any(guesses) or len(branch.rounds) + 2 > steps.max_effects:
+        return None
+    steps.say(f"looking beyond {', '.join(dict.fromkeys(e.name for e in guesses if e is not None))}, which is likely")
+    one = steps.grown(branch, replace(found, chosen=guesses))
+    ahead = steps.tried(one)
+    if ahead is None or not any(ahead.chosen):
+        return None
+    two = steps.grown(one, ahead)
+    trials: dict[int, Trial] = {}
+    for effect in dict.fromkeys(e for e in guesses if e is not None):
+        joints = [j for j, guess in enumerate(guesses) if guess is effect]
+        if effect not in two.now.model.effects:  # another has taken its place
+            return None
+        trials |= _judged_again(steps, effect, joints, found, two)
+    if not all(trial.significant for trial in trials.values()):
+        return None
+    at = len(branch.rounds)
+    return replace(two, rounds=[*two.rounds[:at], two.rounds[at].with_trials(trials), *two.rounds[at + 1 :]])
 
 
 def _judged_again(

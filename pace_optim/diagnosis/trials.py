@@ -32,6 +32,7 @@ class Trial:
     """RMSE before / after."""
     t: float = 0.0
     significant: bool = False
+    likely: bool = False
 
     def judged(self, before: BlockErrors, after: BlockErrors, tried: int, first: bool) -> Trial:
         """The trial with what the effect has brought its joint; arguments as for :func:`judge`."""
@@ -43,6 +44,7 @@ class Trial:
             ratio=verdict.ratio,
             t=verdict.t,
             significant=verdict.significant,
+            likely=verdict.likely,
         )
 
 
