@@ -1,16 +1,13 @@
 """Runs compared from the command line: what is written, what is printed, and what is refused."""
 
-import contextlib
-import io
 import json
-import runpy
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Browser
+from command_lines import run_script
 from problems import BENCH, record
 from run_folders import JOINTS, make_result, make_trajectory, write_run
 
@@ -24,16 +21,6 @@ from pace_optim.report import write_report
 from pace_optim.report.sections.failure import _worst_place
 
 ROOT = Path(__file__).parents[1]
-
-
-def script(*arguments):
-    """Run the command in this process: exit code, what it printed, what it complained of."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", ["scripts/compare.py", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            runpy.run_path(str(ROOT / "scripts" / "compare.py"), run_name="__main__")
-    return ended.value.code or 0, out.getvalue(), err.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +156,8 @@ def test_the_ladder_is_in_the_last_run_alone(tmp_path):
 
 def test_the_command_prints_the_places_and_ends_with_the_run(tmp_path):
     base, last = two_steps(tmp_path)
-    code, out, err = script(base, last)
+    done = run_script("compare", base, last)
+    code, out, err = done.returncode, done.stdout, done.stderr
     assert code == 0, err
     lines = out.splitlines()
     assert lines[-1] == f"run: {last}" and lines[0].startswith("joint")
@@ -177,7 +165,7 @@ def test_the_command_prints_the_places_and_ends_with_the_run(tmp_path):
 
 
 def test_help_shows_an_example():
-    assert "example:\n  scripts/compare.py " in script("--help")[1]
+    assert "example:\n  scripts/compare.py " in run_script("compare", "--help").stdout
 
 
 @pytest.mark.parametrize(
@@ -190,7 +178,8 @@ def test_help_shows_an_example():
     ],
 )
 def test_bad_input_is_one_message(make, message, tmp_path):
-    code, _, err = script(*make(tmp_path))
+    done = run_script("compare", *make(tmp_path))
+    code, err = done.returncode, done.stderr
     assert code == 2 and err.startswith("error: ") and err.count("\n") == 1
     assert message in err
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from command_lines import run_script
 from diagnoses import hidden_run, make_trial, outcome_of
 from problems import BENCH
 from run_folders import make_result
@@ -213,15 +214,10 @@ def test_the_ranking_begins_with_what_was_added_in_any_round():
 # ------------------------------------------------------------------ from a run's folder
 
 
-def diagnose(*arguments, cwd=None):
-    command = [sys.executable, str(ROOT / "scripts" / "diagnose.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd or ROOT)
-
-
 @pytest.mark.slow
 def test_a_hidden_effect_is_named(tmp_path):
     run = hidden_run(tmp_path, "stribeck_friction").folder
-    done = diagnose(run, "--no_refit", "--max_effects", 1)
+    done = run_script("diagnose", run, "--no_refit", "--max_effects", 1)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0] == "verdict: effect"
     assert done.stdout.splitlines()[-1] == f"run: {run}"
@@ -236,7 +232,7 @@ def test_a_hidden_effect_is_named(tmp_path):
 @pytest.mark.slow
 def test_where_nothing_is_missing_nothing_is_named(tmp_path):
     run = hidden_run(tmp_path, None).folder
-    done = diagnose(run, "--no_refit", "--max_effects", 1)
+    done = run_script("diagnose", run, "--no_refit", "--max_effects", 1)
     assert done.returncode == 0, done.stderr
     content = json.loads((run / "diagnosis.json").read_text())
     assert content["verdict"] == "nothing_missing" and content["added"] == []
@@ -307,7 +303,7 @@ def test_bad_input_is_one_line_and_status_2(tmp_path, arguments, message):
     fitted.mkdir()
     make_result(task=BENCH).save(fitted / "result.json")
     write_json(fitted / "settings.json", {"settings": {"task": BENCH}, "digests": {}})
-    done = diagnose(*({"RUN": tmp_path, "FITTED": fitted}.get(word, word) for word in arguments))
+    done = run_script("diagnose", *({"RUN": tmp_path, "FITTED": fitted}.get(word, word) for word in arguments))
     assert done.returncode == 2 and message in done.stderr, done.stderr
     assert "Traceback" not in done.stderr and len(done.stderr.strip().splitlines()) == 1
     assert not (fitted / "diagnosis.json").exists()

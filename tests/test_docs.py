@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from command_lines import run_script
 from other_simulators import isaaclab_wheel, mjlab_python
 from torque_sequence import write_result
 
@@ -135,9 +136,8 @@ def test_the_commands_exist_with_these_options(page):
 
 @cache
 def help_of(script: str) -> str:
-    """Each script is asked once: starting one takes seconds."""
-    command = [sys.executable, ROOT / script, "--help"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    """Each script is asked once."""
+    return run_script(Path(script).stem, "--help").stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -4,13 +4,12 @@ import copy
 import dataclasses
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from command_lines import run_script
 from effect_envs import null_values, rms
 from problems import ANYMAL, BENCH, CALM, DT, chirp, env_cfg, legs_chirp, make_problem, record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -251,8 +250,7 @@ def test_a_parameter_has_the_keys_of_its_joints_or_one_for_all():
     ],
 )
 def test_a_wrong_effect_is_one_line_and_exit_code_2(effects, message, tmp_path):
-    command = [sys.executable, ROOT / "scripts" / "fit.py", "--task", BENCH, "--effects", *effects]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    run = run_script("fit", "--task", BENCH, "--effects", *effects, cwd=tmp_path)
     assert run.returncode == 2
     (line,) = run.stderr.splitlines()
     assert line.startswith("error: ") and message in line

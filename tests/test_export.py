@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from command_lines import run_script
 from other_simulators import isaaclab_wheel, mjlab_python
 from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
 
@@ -160,7 +161,7 @@ def test_the_mjlab_configuration_runs_there(result, tmp_path):
 
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_the_command_line_writes_every_format(result, tmp_path, fmt):
-    done = command(result, "--format", fmt, "--output", tmp_path / "out")
+    done = run_script("export", result, "--format", fmt, "--output", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out").read_text() == export(result, fmt).text
     assert done.stdout.splitlines()[-1] == f"written: {tmp_path / 'out'}"
@@ -174,11 +175,6 @@ def test_bad_input_is_one_line_and_exit_code_2(result, tmp_path):
         ((result, "--format", "urdf"), "invalid choice"),
         ((unknown, "--format", "json"), "There is no effect 'warp_drive'"),
     ):
-        done = command(*args)
+        done = run_script("export", *args)
         assert done.returncode == 2 and said in done.stderr, done.stderr
         assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
-
-
-def command(*args) -> subprocess.CompletedProcess:
-    words = [sys.executable, str(ROOT / "scripts" / "export.py"), *map(str, args)]
-    return subprocess.run(words, capture_output=True, text=True, check=False)
