@@ -131,7 +131,10 @@ def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, pr
         log_dir=str(folder.parent.parent),
     )
     progress.restart()
-    return fit(settings, progress)[1]
+    result, path = fit(settings, progress)
+    if result.stop_reasons == ["interrupted"]:
+        progress.say(f"the fit of the whole robot was interrupted: scripts/fit.py --resume {path} goes on with it")
+    return path
 
 
 def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
