@@ -97,16 +97,17 @@ def test_three_blocks_prove_nothing():
 
 
 @pytest.mark.parametrize(
-    ("better", "worse", "significant", "likely"),
+    ("better", "worse", "pairs", "significant", "likely"),
     [
-        (0.3, 1.05, False, True),  # t = 3.1, and 4.6 are needed
-        (0.3, 2.0, False, False),  # it does not fall
-        (0.85, 0.95, False, False),  # by less than counts
-        (0.2, 0.25, True, True),
+        (0.3, 1.05, 6, False, True),  # t = 3.1, and 4.6 are needed
+        (0.3, 1.05, 2, False, False),  # t = 1.6
+        (0.3, 2.0, 6, False, False),  # it does not fall
+        (0.85, 0.95, 6, False, False),  # by less than counts
+        (0.2, 0.25, 6, True, True),
     ],
 )
-def test_an_uneven_fall_is_likely_and_no_finding(better, worse, significant, likely):
-    after = torch.tensor([[better], [worse]] * 6, dtype=torch.float64)
+def test_an_uneven_fall_is_likely_and_no_finding(better, worse, pairs, significant, likely):
+    after = torch.tensor([[better], [worse]] * pairs, dtype=torch.float64)
     before = BlockErrors(square=torch.ones_like(after), weight=torch.ones(len(after), dtype=torch.float64))
     found = judge(before, replace(before, square=after), 0, 29, True)
     assert (found.significant, found.likely) == (significant, likely)
