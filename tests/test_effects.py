@@ -408,3 +408,13 @@ def test_a_wrong_declaration_is_refused(declaration, message):
     with pytest.raises(ValueError, match=message):
         register_effect(type("Wrong", (Effect,), content))
     assert "wrong" not in available_effects()
+
+
+def test_rows_begin_anew_at_first_and_after_a_reset_and_say_so_once():
+    effect = get_effect("command_rate_limit")(3, 2, dt=0.001, control_dt=0.002)
+    assert effect.take_new_rows().flatten().tolist() == [True] * 3
+    assert effect.take_new_rows() is None
+    effect.reset_state(torch.tensor([False, True, False]))
+    effect.reset_state(torch.tensor([False, False, True]))
+    assert effect.take_new_rows().flatten().tolist() == [False, True, True]
+    assert effect.take_new_rows() is None
