@@ -114,14 +114,15 @@ def _guessed(steps: Steps, branch: Branch, found: Round) -> Branch | None:
     guesses = [effect if yes else None for effect, yes in zip(likely, far.tolist(), strict=True)]
     if not any(guesses) or len(branch.rounds) + 2 > steps.max_effects:
         return None
-    steps.say(f"looking beyond {', '.join(dict.fromkeys(e.name for e in guesses if e is not None))}, which is likely")
+    wanted = list(dict.fromkeys(effect for effect in guesses if effect is not None))
+    steps.say(f"looking beyond what is likely: {', '.join(effect.name for effect in wanted)}")
     one = steps.grown(branch, replace(found, chosen=guesses))
     ahead = steps.tried(one)
     if ahead is None or not any(ahead.chosen):
         return None
     two = steps.grown(one, ahead)
     trials: dict[int, Trial] = {}
-    for effect in dict.fromkeys(e for e in guesses if e is not None):
+    for effect in wanted:
         joints = [j for j, guess in enumerate(guesses) if guess is effect]
         if effect not in two.now.model.effects:  # another has taken its place
             return None
