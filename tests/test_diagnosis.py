@@ -1,7 +1,5 @@
 """A diagnosis: its arithmetic on what is known, and whether it names a hidden effect."""
 
-import importlib
-import io
 import json
 import subprocess
 import sys
@@ -24,8 +22,6 @@ from pace_optim.diagnosis.next_experiment import rivals_of
 from pace_optim.diagnosis.screening import _FOLDS, _explained
 from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
-from pace_optim.fit_settings import FitSettings
-from pace_optim.progress import ProgressLine
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -302,19 +298,6 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     content = json.loads((run / "diagnosis.json").read_text())
     assert content["tried"] == ["lean_of_my_own"] and content["added"] == ["lean_of_my_own"]
     assert content["runs"] == [str(run)]
-
-
-@pytest.mark.parametrize("stopped", ["interrupted", "converged"])
-def test_an_interrupted_refit_is_said_with_how_to_go_on(tmp_path, monkeypatch, stopped):
-    module = importlib.import_module("pace_optim.diagnosis.diagnose")
-    monkeypatch.setattr(module, "fit", lambda *_: (SimpleNamespace(stop_reasons=[stopped]), tmp_path / "refit"))
-    monkeypatch.setattr(module, "whole_values", lambda *_: {})
-    outcome = SimpleNamespace(final=SimpleNamespace(model=None, x=None))
-    found = SimpleNamespace(paying=["torque_gain"], outcome=outcome)
-    problem = SimpleNamespace(joint_names=["servo"], physics_dt=0.00125)
-    said = io.StringIO()
-    module._refit(found, problem, FitSettings(task=BENCH), tmp_path / "task" / "run", ProgressLine(said))
-    assert (f"--resume {tmp_path / 'refit'}" in said.getvalue()) is (stopped == "interrupted")
 
 
 def test_candidates_are_all_registered_effects_or_only_one_s_own():

@@ -145,7 +145,8 @@ def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
     assert outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())
 
 
-def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
+@pytest.mark.parametrize("stopped", ["converged", "interrupted"])
+def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch, stopped):
     found = Findings(
         outcome=ended(run.problem, 5e-3),
         data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
@@ -155,19 +156,20 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch):
         paying=["parallel_spring"],
         shares={SPRING: 1.0},
     )
-    refits = []
+    refits, said = [], []
 
     def fit(settings, progress):
         refits.append(settings)
-        return None, run.folder.parent / "refit"
+        return SimpleNamespace(stop_reasons=[stopped]), run.folder.parent / "refit"
 
-    (run.folder.parent / "refit").mkdir()
+    (run.folder.parent / "refit").mkdir(exist_ok=True)
     module = sys.modules[Findings.__module__]
     for name, made in (("search_effects", found), ("advise", []), ("error_map", {})):
         monkeypatch.setattr(module, name, lambda *_, made=made: made)
     monkeypatch.setattr(module, "fit", fit)
-    quiet = SimpleNamespace(say=lambda _: None, restart=lambda: None, close=lambda: None)
-    diagnosis = diagnose(DiagnosisSettings(run=run.folder), quiet)
+    line = SimpleNamespace(say=said.append, restart=lambda: None, close=lambda: None)
+    diagnosis = diagnose(DiagnosisSettings(run=run.folder), line)
+    assert any(f"scripts/fit.py --resume {diagnosis.runs[-1]}" in text for text in said) is (stopped == "interrupted")
     assert refits[0].effects == ["parallel_spring"] and diagnosis.runs[-1].endswith("refit")
     assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]
     assert SAID in diagnosis.summary and "75 %" in diagnosis.summary
