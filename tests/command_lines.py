@@ -12,13 +12,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def run_script(name: str, *arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
-    """What ``scripts/<name>.py`` prints, and its exit code."""
+def run_script(name: str, *arguments, cwd: Path | None = None) -> subprocess.CompletedProcess:
+    """What ``scripts/<name>.py`` prints, and its exit code; in the present folder, or another."""
     words = [f"scripts/{name}.py", *map(str, arguments)]
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.chdir(cwd)
-        patch.syspath_prepend(str(cwd))
+        patch.chdir(cwd or Path.cwd())
         patch.setattr(sys, "argv", words)
         with pytest.raises(SystemExit) as ended:
             runpy.run_path(str(ROOT / words[0]), run_name="__main__")

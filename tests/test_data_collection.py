@@ -1,7 +1,6 @@
 """Data collection: recordings that replay exactly, encoders as asked for, and a command line that does not lie."""
 
 import csv
-import runpy
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from command_lines import run_script
 
 import pace_envs
 from pace_envs.tasks.pace import go2
@@ -28,15 +28,11 @@ EXACT = 1e-12  # [rad²]
 
 
 def script(name: str, *args: str) -> int:
-    """Run a script in this process."""
-    main = runpy.run_path(str(ROOT / "scripts" / f"{name}.py"))["main"]
-    before, sys.argv = sys.argv, [name, *args]
-    try:
-        return run_cli(main)
-    except SystemExit as end:
-        return int(end.code or 0)
-    finally:
-        sys.argv = before
+    """Run a script in this process; what it prints is captured as if the test had."""
+    done = run_script(name, *args)
+    print(done.stdout, end="")
+    print(done.stderr, end="", file=sys.stderr)
+    return done.returncode
 
 
 def record(folder: Path, *args: str, name: str = "r.npz"):

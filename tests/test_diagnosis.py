@@ -95,7 +95,7 @@ def test_three_blocks_prove_nothing():
 @pytest.mark.parametrize(
     ("better", "worse", "pairs", "significant", "likely"),
     [
-        (0.3, 1.05, 6, False, True),  # t = 3.1, and 4.6 are needed
+        (0.3, 1.05, 6, False, True),  # t = 3.1, and 4.7 are needed
         (0.3, 1.05, 2, False, False),  # t = 1.6
         (0.3, 2.0, 6, False, False),  # it does not fall
         (0.85, 0.95, 6, False, False),  # by less than counts
