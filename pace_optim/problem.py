@@ -55,6 +55,11 @@ class Problem:
         """The effects whose parameters are identified, as on the command line."""
         return [cfg.label for cfg in effect_cfgs(self.env_cfg.sim2real.effects)]
 
+    @property
+    def joints_stand_alone(self) -> bool:
+        """Whether no joint moves another."""
+        return max(len(tree) for tree in self.trees) == 1
+
     def make_env(self, num_envs: int, simulation: Callable[..., Simulation] | None = None) -> ManagerBasedRLEnv:
         """Build the environment.
 

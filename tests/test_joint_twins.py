@@ -1,11 +1,16 @@
 """Joints simulated alone along a reference: friction at reversals, and the load that drives are told of."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
-from problems import ANYMAL, env_cfg, legs_chirp, make_problem, record
+from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, record
 
-from pace_optim.joint_twins import reference_path, twin_problem
+from pace_envs import set_physics_dt
+from pace_optim.joint_twins import measured_path, reference_path, twin_problem
 from pace_optim.joint_twins.simulation import _with_friction
+from pace_optim.recording import Load
 
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.0, "delay": 2.0}
 
@@ -56,3 +61,32 @@ def test_a_joint_s_own_payload_is_that_of_its_link_alone():
     twice, whole = path.model_effects["payload", "ratio"].inertia, path.feel.inertia
     assert torch.allclose(twice[..., 2], whole[..., 2])  # the shank is all that the knee moves
     assert bool((twice[..., 0] < 0.5 * whole[..., 0]).all())  # the hip moves thigh and shank too
+
+
+def moved_by(problem, physical):
+    """Positions of the robot, or of joints alone, at every control step."""
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(physical[None], problem.dataset.sampled)
+    return torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
+
+
+def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
+    """With noise on it, every third sample only, an encoder bias, and a payload sought beside the known load."""
+    fine = env_cfg()
+    set_physics_dt(fine, 0.00025)
+    truth = {**CALM, "encoder_bias": 0.1}
+    target = chirp(2.0)[::3]
+    held = np.repeat(target, 3, axis=0)[: 3 * len(target) - 2]
+    recording = record(held, truth, cfg=fine, load=Load(load_mass=1.0, load_length=0.15), noise=1e-3)
+    third = {"time": recording.time[::3], "dof_pos": recording.dof_pos[::3], "des_dof_pos": target}
+    recording = replace(recording, **third)
+    whole = make_problem(recording).with_effects(["payload"])
+    plain = whole.with_effects(())
+    physical = whole.space.from_dict({**truth, "payload.ratio": 0.2})
+    path = measured_path(plain, plain.space.from_dict(truth), ["payload"])
+    twins = twin_problem(whole, path).with_physics_dt(0.00025)
+    robot = moved_by(whole.with_physics_dt(0.00025), physical)
+    apart = (moved_by(twins, physical) - robot).abs().max()
+    without = moved_by(twin_problem(plain, path).with_physics_dt(0.00025), plain.space.from_dict(truth))
+    assert float(apart) < 2e-4
+    assert float((without - robot).abs().max()) > 2e-3  # the payload shows

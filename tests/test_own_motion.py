@@ -12,11 +12,16 @@ FLOOR = 0.5
 
 
 class Robot:
-    """Where its model moves it, and how well the model fits along each motion; one entry each time it is looked at."""
+    """How far its model is from its reference, where it moves, and how well the model fits there, each time one looks.
 
-    def __init__(self, monkeypatch, positions, scores, trees=(("knee",),)):
+    Joints with neighbours have no distance that would do.
+    """
+
+    def __init__(self, monkeypatch, positions, scores, away=None):
         self.positions, self.scores, self.fits = iter(positions), iter(scores), 0
-        self.problem = SimpleNamespace(trees=[list(tree) for tree in trees])
+        self.problem = SimpleNamespace(joints_stand_alone=away is not None)
+        distances = iter(away or ())
+        monkeypatch.setattr(OwnMotion, "_away", lambda *_: next(distances))
         monkeypatch.setattr(OwnMotion, "_path", lambda *_: self.path(next(self.positions)))
         monkeypatch.setattr(own_motion, "twin_problem", lambda _, path: self.twins(path))
         monkeypatch.setattr(own_motion, "fit_side_by_side", self.fit)
@@ -34,9 +39,8 @@ class Robot:
         self.fits += 1
         return [SimpleNamespace(score=torch.tensor(next(self.scores)))]
 
-    def follow(self, position):
+    def follow(self, position, n=1):
         """Whether it is the same reference and the same model, and where the reference is."""
-        n = sum(len(tree) for tree in self.problem.trees)
         motion = OwnMotion(problem=self.problem, candidates=(), enough=torch.full((n,), FLOOR))
         twins, now = self.twins(self.path(position)), SimpleNamespace(score=torch.full((n,), 40.0))
         along, fitted = motion.follow(twins, now)
@@ -44,13 +48,13 @@ class Robot:
 
 
 def test_a_joint_alone_that_hardly_moves_otherwise_stays_on_its_reference(monkeypatch):
-    robot = Robot(monkeypatch, positions=[0.019], scores=[])
+    robot = Robot(monkeypatch, positions=[], scores=[], away=[0.009])
     assert robot.follow(0.0) == (True, True, 0.0)
     assert robot.fits == 0
 
 
 def test_a_joint_alone_is_fitted_again_until_its_motion_stays(monkeypatch):
-    robot = Robot(monkeypatch, positions=[0.5, 0.45, 0.44], scores=[[20.0], [10.0]])
+    robot = Robot(monkeypatch, positions=[0.5, 0.45], scores=[[20.0], [10.0]], away=[0.3, 0.011, 0.005])
     assert robot.follow(0.0) == (False, False, pytest.approx(0.45))
     assert robot.fits == 2
 
@@ -65,6 +69,6 @@ def test_a_joint_alone_is_fitted_again_until_its_motion_stays(monkeypatch):
     ],
 )
 def test_joints_follow_their_neighbours_as_long_as_that_pays(monkeypatch, scores, fits):
-    robot = Robot(monkeypatch, positions=[0.0] * 4, scores=scores, trees=[["hip", "knee"]])
-    assert robot.follow(0.0)[:2] == (False, False)
+    robot = Robot(monkeypatch, positions=[0.0] * 4, scores=scores)
+    assert robot.follow(0.0, n=2)[:2] == (False, False)
     assert robot.fits == fits

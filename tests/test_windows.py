@@ -13,6 +13,8 @@ from pace_optim.diagnosis.base_fit import joint_vectors
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.side_by_side import SideBySide, Slot
 from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.step_error import step_error
+from pace_optim.windows import Windows
 
 DURATION = 6.5
 EFFECTS = {
@@ -62,6 +64,25 @@ def test_every_sample_is_in_one_window(bench):
             assert bool(whole.sampled[start, r])
     assert torch.allclose(cut.session_start - cut.start_time, whole.session_start[[0, 0, 0, 1, 1, 2]])
     assert len(cut.command) < 0.5 * len(whole.command)
+
+
+def test_windows_without_samples_that_count_are_left_out(bench):
+    data = bench.twins.dataset
+    some = torch.zeros_like(data.sampled)
+    some[2 * len(some) // 3 :, 0] = True  # the end of the long one
+    windows = Windows.of(data, DT).with_samples(some)
+    assert windows.recording.tolist() == [0]
+    assert int(windows.mask(some).sum()) == int((some & data.sampled).sum())
+
+
+def test_what_half_the_step_changes_is_as_on_whole_recordings(bench):
+    problem, values = bench.problem, physical(bench.problem, CALM)
+    where = problem.dataset.train
+    finer = problem.with_physics_dt(problem.physics_dt / 2)
+    coarse, fine = (p.evaluator().residuals(values[None], where) for p in (problem, finer))
+    change = float((coarse.error[0] - fine.error[0])[coarse.where].square().mean().sqrt())
+    assert change > 1e-5
+    assert float(step_error(problem, values, where)) == pytest.approx(change, rel=0.1)
 
 
 def test_a_window_has_its_own_part_of_the_reference(bench):

@@ -10,7 +10,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.descent import fit_side_by_side, fit_to_whole
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.joint_twins import measured_path, reference_path, twin_problem
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem
 
@@ -41,14 +41,15 @@ def fit_base(
     names = [effect.name for effect in effects if effect.overrides("write_model")]
     fitted = Fitted.start(model, joint_vectors(problem, physical))
     at_control_step = problem.with_physics_dt(problem.control_dt)
+    along = measured_path if problem.joints_stand_alone else reference_path
     for i in range(_ROUNDS):
         say(f"base model, round {i + 1}")
-        path = reference_path(at_control_step, whole_vector(problem, model.to_physical(fitted.x)))
+        path = along(at_control_step, whole_vector(problem, model.to_physical(fitted.x)))
         coarse = twin_problem(at_control_step, path).in_windows()
         before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6)[0]
         if float((fitted.x - before.x).abs().max()) < _FAR:
             break
-    path = reference_path(problem, whole_vector(problem, model.to_physical(fitted.x)), names)
+    path = along(problem, whole_vector(problem, model.to_physical(fitted.x)), names)
     twins = twin_problem(problem, path)
     fitted = fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
     x = fitted.x

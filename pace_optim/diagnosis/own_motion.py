@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -17,8 +18,9 @@ from pace_optim.joint_twins.path import ReferencePath
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem
 
-_FAR = 0.02
-"""A joint without neighbours feels a reference that is this near [rad] as its own motion: gravity is linear there."""
+_FAR = 0.01
+"""A joint without neighbours feels a reference that is this near (RMS) [rad] as its own motion: gravity is linear
+there."""
 _TIMES = 4
 """At most: what was fitted along the motion of a wrong model gives a better one, and so on."""
 _ITERATIONS = 6
@@ -48,19 +50,34 @@ class OwnMotion:
             now: The model, fitted along it.
         """
         self.say("motion of the robot with what was found")
-        alone = max(len(tree) for tree in self.problem.trees) == 1
+        alone = self.problem.joints_stand_alone
         for _ in range(_TIMES):
-            path, before = self._path(now), now.score
-            if alone and float((path.position - twins.path.position).abs().max()) < _FAR:
+            if alone and self._away(twins, now) < _FAR:
                 break
-            twins = twin_problem(self.problem, path)
+            before = now.score
+            twins = twin_problem(self.problem, self._path(now))
             now = fit_side_by_side(twins.in_windows(), [now], max_iteration=_ITERATIONS)[0]
             if bool(((now.score <= self.enough**2) | (now.score > _GAIN * before)).all()):
                 break
         return twins, now
 
+    def _away(self, twins: TwinProblem, now: Fitted) -> float:
+        """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""
+        problem = twins.coarse().with_effects(labels(now.model, twins.joint_names))
+        rollout, sampled = problem.evaluator().rollout(1), problem.dataset.sampled
+        rollout.start(self._values(problem, now)[None], sampled)
+        square = torch.zeros(())
+        for k, _ in enumerate(rollout.simulated(rollout.duration_steps)):
+            away = rollout.robot.data.joint_pos - problem.path.position[k]
+            square = square + away[sampled[k]].square().sum()
+        rollout.env.close()
+        return math.sqrt(float(square) / (int(sampled.sum()) * len(problem.joint_names)))
+
     def _path(self, now: Fitted) -> ReferencePath:
         problem = self.problem.with_effects(labels(now.model, self.problem.joint_names))
-        values = problem.space.from_dict(whole_values(now.model, now.x, problem.joint_names))
         changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
-        return reference_path(problem, values, changing)
+        return reference_path(problem, self._values(problem, now), changing)
+
+    @staticmethod
+    def _values(problem: Problem, now: Fitted) -> torch.Tensor:
+        return problem.space.from_dict(whole_values(now.model, now.x, problem.joint_names))

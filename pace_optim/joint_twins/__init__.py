@@ -5,10 +5,11 @@ The rigid body of joint j, moved as in a reference simulation, is one inertia an
     M_j(t) q̈_j = τ_j - friction + f_j(t) + K_j(t) (q_j - q_j,ref(t))
 
 M, f and K come from MuJoCo along the reference; the drive is the same ``PaceDCMotor``. What one joint's change does
-to the motion of the others is left out: what the twins suggest is confirmed with the whole robot.
+to the motion of the others is left out: what the twins suggest is confirmed with the whole robot. Where joints have no
+neighbours, the measured motion serves as the reference.
 """
 
-from pace_optim.joint_twins.path import ReferencePath, reference_path
+from pace_optim.joint_twins.path import ReferencePath, measured_path, reference_path
 from pace_optim.joint_twins.problem import twin_problem
 
-__all__ = ["ReferencePath", "reference_path", "twin_problem"]
+__all__ = ["ReferencePath", "measured_path", "reference_path", "twin_problem"]

@@ -12,6 +12,7 @@ import torch
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
+from pace_optim.dataset import Dataset
 from pace_optim.problem import Problem
 
 if TYPE_CHECKING:
@@ -119,17 +120,62 @@ def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequ
         model_effects: Effects on the rigid-body model whose influence is wanted.
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
-    rollout = problem.evaluator().rollout(1)
-    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
+    rollout = _begun(problem, values)
     robot, positions, velocities = rollout.robot, [], []
     for _ in rollout.simulated(rollout.duration_steps):
         positions.append(robot.data.joint_pos.clone())
         velocities.append(robot.data.joint_vel.clone())
-    q, v = torch.stack(positions), torch.stack(velocities)
+    return _along(problem, values, model_effects, rollout, torch.stack(positions), torch.stack(velocities))
+
+
+def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
+    """What each joint feels along the measured motion, straight between samples.
+
+    For robots whose joints have no neighbours: what those feel depends on their position only.
+
+    Args:
+        problem: The problem, without effects.
+        physical: A candidate's physical parameters, (size,); its encoder biases count.
+        model_effects: Effects on the rigid-body model whose influence is wanted.
+    """
+    problem, values = _on_all_joints(problem, physical, model_effects)
+    bias = torch.tensor([values["encoder_bias"][name] for name in problem.joint_names], dtype=torch.float64)
+    rollout = _begun(problem, values)
+    position = bias + _at_every_step(problem.dataset, rollout.duration_steps)
+    return _along(problem, values, model_effects, rollout, position, torch.zeros_like(position))
+
+
+def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
+    """One candidate at the beginning of all recordings."""
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
+    return rollout
+
+
+def _at_every_step(dataset: Dataset, count: int) -> torch.Tensor:
+    """Measured positions at control steps, (count, R, n), straight between samples and held after the last."""
+    steps, measured = np.arange(count), dataset.measured.numpy()
+    result = np.empty((count, *measured.shape[1:]))
+    for r in range(dataset.num_recordings):
+        at = dataset.sampled[:, r].nonzero()[:, 0].numpy()
+        for j in range(measured.shape[2]):
+            result[:, r, j] = np.interp(steps, at, measured[at, r, j])
+    return torch.from_numpy(result)
+
+
+def _along(
+    problem: Problem,
+    values: dict[str, dict[str, float]],
+    model_effects: Sequence[str],
+    rollout: Rollout,
+    q: torch.Tensor,
+    v: torch.Tensor,
+) -> ReferencePath:
+    """What each joint feels along a motion, (T, R, n) [rad] and [rad/s]; closes the rollout's environment."""
     middle_q, middle_v = 0.5 * (q[:-1] + q[1:]), 0.5 * (v[:-1] + v[1:])
     motion = (middle_q, middle_v, (v[1:] - v[:-1]) / problem.control_dt)
     models = _models(rollout.env)
-    columns = robot.dof_columns.numpy()
+    columns = rollout.robot.dof_columns.numpy()
     whole = feel = _feel(models, columns, *motion)
     stiffness = _stiffness(models, columns, problem, *motion)
     changes = {}

@@ -12,8 +12,8 @@ from pace_optim.dataset import Dataset
 from pace_optim.evaluator import Evaluator
 from pace_optim.joint_twins.path import ReferencePath
 from pace_optim.joint_twins.simulation import TwinSimulation
-from pace_optim.joint_twins.windows import in_windows
 from pace_optim.problem import Problem
+from pace_optim.windows import Windows
 
 
 @dataclass(kw_only=True, eq=False)
@@ -49,8 +49,9 @@ class TwinProblem(Problem):
 
     def in_windows(self) -> TwinProblem:
         """The same with recordings cut into windows: some times as fast, to lead a fit, not to judge by."""
-        dataset, path = in_windows(self.dataset, self.path, self.control_dt)
-        return replace(self, dataset=dataset, path=path)
+        windows = Windows.of(self.dataset, self.control_dt)
+        path = self.path.at(windows.step, windows.recording)
+        return replace(self, dataset=windows.cut(self.dataset), path=path)
 
     def coarse(self) -> TwinProblem:
         """The same in windows, and at the control step."""
