@@ -148,8 +148,30 @@ def test_the_way_taken_is_tried_again_where_the_robot_moves_otherwise_with_it(mo
 def test_the_best_effect_stays_where_no_other_leads_further(monkeypatch):
     effects, rounds = found(monkeypatch, IS_IT)
     assert effects == [{"mount_compliance", "torque_gain"}] and rounds == 2
-    hardly_better = {**STANDS_IN, frozenset((ELASTICITY, GAIN)): 5.7}
-    assert found(monkeypatch, hardly_better)[0] == [{"mount_compliance", "torque_gain"}]
+    worse = {**STANDS_IN, frozenset((ELASTICITY, GAIN)): 6.1}
+    assert found(monkeypatch, worse)[0] == [{"mount_compliance", "torque_gain"}]
+
+
+def test_another_way_is_taken_that_leaves_less_with_as_many_numbers(monkeypatch):
+    better = {**STANDS_IN, frozenset((ELASTICITY, GAIN)): 5.8}
+    assert found(monkeypatch, better)[0] == [{"joint_elasticity", "torque_gain"}]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "rmse", "wins"),
+    [  # numbers: mount and elasticity 3, spring 2, gain 1
+        ([GAIN], [SPRING], 1.019, True),  # as low, with fewer
+        ([GAIN], [SPRING], 1.021, False),
+        ([MOUNT], [ELASTICITY], 0.99, True),  # lower, with as many
+        ([MOUNT], [ELASTICITY], 1.0, False),
+        ([SPRING, GAIN], [GAIN], 0.92, False),  # not lower by what more numbers must bring
+        ([SPRING, GAIN], [GAIN], 0.90, True),
+        ([SPRING, GAIN], [GAIN, SPRING], 0.92, False),  # the same, come upon in another order
+    ],
+)
+def test_one_way_beats_another_by_its_error_or_its_fewer_numbers(one, other, rmse, wins):
+    own, others = (steps.End(effects=frozenset(e), mse=r**2) for e, r in ((one, 1e-3 * rmse), (other, 1e-3)))
+    assert own.beats(others) is wins
 
 
 # none of them pays alone

@@ -12,7 +12,7 @@ from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.trials import RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import ALIKE, RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -26,8 +26,6 @@ PER_JOINT = 4
 """How many of them."""
 FROM_SCREENING = 2
 """How many of the best screened go on in any case, where refits began with all effects."""
-ALIKE = 1.02
-"""Of effects whose validation RMSE is within this factor of the best, the one with the fewest numbers is taken."""
 _PART, _ITERATIONS = 0.7, 6
 """Of each window, and how far, where refits begin: after four, what needs another derivative gain too is far behind."""
 FAR_FROM_FLOOR = 50.0

@@ -13,7 +13,7 @@ from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.pruning import Without
 from pace_optim.diagnosis.steps import LOOK_AHEAD, Branch, Steps, combined
-from pace_optim.diagnosis.trials import RIVAL, Round, Trial, near_trials
+from pace_optim.diagnosis.trials import Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -151,12 +151,13 @@ def _led_on(steps: Steps, branch: Branch, found: Round) -> tuple[Branch, Round |
     """The branch with the effects that lead furthest, and what could come next.
 
     The best effect of the first round may stand in for two others, each of which is worse alone. Where it leaves
-    much unexplained, the next one of each joint leads on for a round too, and is taken if it ends lower.
+    much unexplained, the next one of each joint leads on for a round too, and is taken if it ends lower, or as low with
+    fewer numbers: the others that are missing give much to whatever has numbers to spare.
     """
     first = steps.grown(branch, found)
     ahead = steps.tried(first)
-    reach, enough = first.reach(ahead), (LOOK_AHEAD * steps.floor) ** 2
-    unexplained = (first.errors.mse > enough) & (reach > enough)
+    ends, enough = first.ends(ahead), (LOOK_AHEAD * steps.floor) ** 2
+    unexplained = (first.errors.mse > enough) & (torch.tensor([end.mse for end in ends]) > enough)
     other = _next_choice(found, unexplained)
     if branch.rounds or ahead is None or other is None:
         return first, ahead
@@ -165,8 +166,9 @@ def _led_on(steps: Steps, branch: Branch, found: Round) -> tuple[Branch, Round |
     now, errors = steps.settled(branch.problem, combined(branch.problem, branch.now, other))
     way = Branch(problem=branch.problem, now=now, errors=errors, rounds=[other])
     beyond = steps.tried(way)
-    better = unexplained & (RIVAL**2 * way.reach(beyond) < reach)
-    if not bool(better.any()):
+    others = zip(way.ends(beyond), ends, unexplained.tolist(), strict=True)
+    better = [yes and end.beats(one) for end, one, yes in others]
+    if not any(better):
         return first, ahead
     chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
     taken = steps.grown(branch, replace(found, chosen=chosen))

@@ -16,7 +16,7 @@ from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import exchanged, swapped
-from pace_optim.diagnosis.trials import NEXT_FLOOR, Round
+from pace_optim.diagnosis.trials import ALIKE, NEXT_FLOOR, RIVAL, Round
 from pace_optim.diagnosis.trimming import fit_trimmed
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
@@ -39,12 +39,35 @@ class Branch:
         trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
         return sum(trial.mse_before - trial.mse_after for trial in trials if trial.effect is effect)
 
-    def reach(self, found: Round | None) -> torch.Tensor:
-        """Squared validation error of each joint with the best of what could come next, (n,) [rad²]."""
-        reach = self.errors.mse.clone()
-        for j, trials in enumerate([] if found is None else found.trials):
-            reach[j] = min([float(reach[j]), *(t.mse_after for t in trials if t.significant)])
-        return reach
+    def ends(self, found: Round | None) -> list[End]:
+        """Where the best of what could come next leads each joint."""
+        model, mse, ends = self.now.model, self.errors.mse, []
+        for j in range(model.num_joints):
+            own = {effect for effect, has in zip(model.effects, model.has, strict=True) if has[j]}
+            trials = [] if found is None else [t for t in found.trials[j] if t.significant and t.mse_after < mse[j]]
+            best = min(trials, key=lambda trial: trial.mse_after, default=None)
+            ends.append(
+                End(effects=frozenset(own), mse=float(mse[j]))
+                if best is None
+                else End(effects=frozenset({*own, best.effect}), mse=best.mse_after)
+            )
+        return ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class End:
+    """Where a way leads a joint."""
+
+    effects: frozenset[type[Effect]]
+    mse: float
+    """On validation [rad²]."""
+
+    def beats(self, other: End) -> bool:
+        """Whether to go this way in place of another: for less error, or for as little with fewer numbers."""
+        numbers, others = (sum(len(e.parameters) for e in end.effects) for end in (self, other))
+        if self.effects == other.effects or numbers > others:
+            return self.mse * RIVAL**2 < other.mse
+        return self.mse < (ALIKE**2 if numbers < others else 1.0) * other.mse
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
