@@ -86,6 +86,10 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     path = measured_path(plain, plain.space.from_dict(truth), ["payload"])
     twins = twin_problem(whole, path).with_physics_dt(0.00025)
     robot = moved_by(whole.with_physics_dt(0.00025), physical)
+    without_noise = reference_path(plain, plain.space.from_dict(truth))
+    armature = torch.tensor([truth["armature"]])
+    expected = without_noise.typical_effort(armature).tolist()
+    assert path.typical_effort(armature).tolist() == pytest.approx(expected, rel=0.1)
     apart = (moved_by(twins, physical) - robot).abs().max()
     without = moved_by(twin_problem(plain, path).with_physics_dt(0.00025), plain.space.from_dict(truth))
     assert float(apart) < 2e-4

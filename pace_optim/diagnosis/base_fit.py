@@ -10,13 +10,16 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.descent import fit_side_by_side, fit_to_whole
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.joint_twins import measured_path, reference_path, twin_problem
+from pace_optim.joint_twins import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem
 
 _FAR = 0.02
 """Where a normalised parameter has moved further than this the reference is simulated again."""
 _ROUNDS = 3
+_AWAY = 0.05
+"""What a joint without neighbours feels is taken along the measured motion, unless it ends further from it than this
+(RMS) [rad]: then gravity is not linear in between."""
 
 
 def fit_base(
@@ -37,23 +40,37 @@ def fit_base(
         The problem of single joints, the fitted model with its Jacobian, and the typical torque of each joint
         (n,) [N m].
     """
-    model = JointModel.base(problem)
+    fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
     names = [effect.name for effect in effects if effect.overrides("write_model")]
-    fitted = Fitted.start(model, joint_vectors(problem, physical))
-    at_control_step = problem.with_physics_dt(problem.control_dt)
     along = measured_path if problem.joints_stand_alone else reference_path
+    twins, fitted = _fit_along(problem, fitted, along, names, say)
+    if along is measured_path and float(fitted.score.max()) > _AWAY**2:
+        twins, fitted = _fit_along(problem, fitted, reference_path, names, say)
+    armature = fitted.model.to_physical(fitted.x)[:, BASE.index("armature")]
+    return twins, fitted, twins.path.typical_effort(armature)
+
+
+def _fit_along(
+    problem: Problem,
+    fitted: Fitted,
+    along: Callable[[Problem, torch.Tensor, Sequence[str]], ReferencePath],
+    model_effects: Sequence[str],
+    say: Callable[[str], None],
+) -> tuple[TwinProblem, Fitted]:
+    """The joints along a reference that follows the model, and the model fitted there."""
+
+    def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
+        return along(of, whole_vector(of, fitted.model.to_physical(fitted.x)), model_effects)
+
+    at_control_step = problem.with_physics_dt(problem.control_dt)
     for i in range(_ROUNDS):
         say(f"base model, round {i + 1}")
-        path = along(at_control_step, whole_vector(problem, model.to_physical(fitted.x)))
-        coarse = twin_problem(at_control_step, path).in_windows()
+        coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()
         before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6)[0]
         if float((fitted.x - before.x).abs().max()) < _FAR:
             break
-    path = along(problem, whole_vector(problem, model.to_physical(fitted.x)), names)
-    twins = twin_problem(problem, path)
-    fitted = fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
-    x = fitted.x
-    return twins, fitted, path.typical_effort(model.to_physical(x)[:, BASE.index("armature")])
+    twins = twin_problem(problem, path(problem, model_effects))
+    return twins, fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
 
 
 def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:

@@ -24,6 +24,9 @@ _STEP = 1e-4
 _STIFFNESS_EVERY = 8
 """The derivative of the torque varies slowly: it is computed at every so many control steps."""
 
+_SPAN = 0.02
+"""Accelerations are differences of slopes over so much time before and after [s]: measured positions have noise."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Feel:
@@ -71,9 +74,10 @@ class ReferencePath:
         Args:
             armature: (n,) [kg m²].
         """
-        q, dt = self.position, self.control_dt
-        acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / dt**2
-        effort = (self.feel.inertia[1:] + armature) * acceleration - self.feel.torque[1:]
+        q, span = self.position, max(1, round(_SPAN / self.control_dt))
+        acceleration = (q[2 * span :] - 2 * q[span:-span] + q[: -2 * span]) / (span * self.control_dt) ** 2
+        inertia, torque = (each[span : span + len(acceleration)] for each in (self.feel.inertia, self.feel.torque))
+        effort = (inertia + armature) * acceleration - torque
         return effort.square().mean(dim=(0, 1)).sqrt()
 
     def on_joints(self, joints: Sequence[int]) -> ReferencePath:
