@@ -3,7 +3,7 @@
 import pytest
 from browser import CHROMIUM, Browser
 from diagnoses import make_diagnosis
-from run_folders import JOINTS, write_run
+from run_folders import JOINTS, make_result, write_run
 from test_report import NASTY, page_of
 
 from pace_optim.atomic import write_json
@@ -35,6 +35,14 @@ def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
     ):
         assert text in page.text, text
     assert "pre" in page.tags and not page.unbalanced
+
+
+def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
+    with_it = folder_with(tmp_path / "with", make_diagnosis())
+    make_result(effects=["stribeck_friction"]).save(with_it / "result.json")
+    without = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
+    assert "Add it" in without and "This run is the fit with it." not in without
+    assert "This run is the fit with it." in page_of(with_it).text and "Add it" not in page_of(with_it).text
 
 
 def test_commands_in_the_advice_can_be_copied(tmp_path):

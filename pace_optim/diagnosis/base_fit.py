@@ -15,7 +15,7 @@ from pace_optim.joint_twins.problem import TwinProblem
 from pace_optim.problem import Problem
 
 _FAR = 0.02
-"""Where a normalised parameter has moved further than this the reference is simulated again."""
+"""Where a normalised parameter has moved further than this the reference is computed again."""
 _ROUNDS = 3
 _AWAY = 0.05
 """What a joint without neighbours feels is taken along the measured motion, unless it ends further from it than this

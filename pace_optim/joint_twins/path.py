@@ -23,7 +23,6 @@ _STEP = 1e-4
 """Change of a position for a derivative [rad]."""
 _STIFFNESS_EVERY = 8
 """The derivative of the torque varies slowly: it is computed at every so many control steps."""
-
 _SPAN = 0.02
 """Accelerations are differences of slopes over so much time before and after [s]: measured positions have noise."""
 
@@ -74,7 +73,8 @@ class ReferencePath:
         Args:
             armature: (n,) [kg m²].
         """
-        q, span = self.position, max(1, round(_SPAN / self.control_dt))
+        q = self.position
+        span = max(1, min(round(_SPAN / self.control_dt), (len(q) - 1) // 2))
         acceleration = (q[2 * span :] - 2 * q[span:-span] + q[: -2 * span]) / (span * self.control_dt) ** 2
         inertia, torque = (each[span : span + len(acceleration)] for each in (self.feel.inertia, self.feel.torque))
         effort = (inertia + armature) * acceleration - torque

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from pace_optim.number_text import angle_unit, three_figures
@@ -30,18 +31,27 @@ def diagnosis(run: RunData) -> Section | None:
     content = run.read_json("diagnosis.json")
     if not content:
         return None
-    parts = [_verdict(content), _ladder(content), _ranking(content), _error_map(content), _joints(content)]
+    parts = [
+        _verdict(content, run.result.effects),
+        _ladder(content),
+        _ranking(content),
+        _error_map(content),
+        _joints(content),
+    ]
     parts += [_advice(content), _data(content)]
     return Section(id="diagnosis", title="Which effect is missing", html="".join(parts))
 
 
-def _verdict(content: dict[str, Any]) -> str:
+def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
+    """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content["added"] or content.get("paying", []), content.get("explained", 1.0)
     if content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
     add = ""
-    if effects:
+    if effects and set(effects) == set(had):
+        add = "<p>This run is the fit with it.</p>"
+    elif effects:
         why = "Add it" if content["added"] else "Until it is known, this lowers the error"
         add = f"<p>{why}: <code>scripts/fit.py … --effects {esc(' '.join(effects))}</code></p>"
     return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
