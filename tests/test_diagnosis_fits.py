@@ -9,7 +9,7 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis import descent, search
+from pace_optim.diagnosis import base_fit, descent, search
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import check_data
 from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
@@ -28,6 +28,39 @@ STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadr
 def bench():
     """A short chirp of one joint."""
     return joint_alone()
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "left", "references"),
+    [
+        (0, 0.04, ["measured_path"]),
+        (0, 0.06, ["measured_path", "reference_path"]),  # gravity is not linear so far from what was measured
+        (1, 0.04, ["reference_path"]),
+    ],
+)
+def test_the_base_model_moves_along_what_was_measured_only_near_it(bench, monkeypatch, neighbours, left, references):
+    used = []
+
+    def fitted_along(problem, fitted, along, model_effects, say):
+        used.append(along.__name__)
+        twins = SimpleNamespace(path=SimpleNamespace(typical_effort=lambda armature: armature))
+        return twins, replace(fitted, score=torch.tensor([left**2], dtype=torch.float64))
+
+    monkeypatch.setattr(base_fit, "_fit_along", fitted_along)
+    trees = [[*bench.problem.joint_names, *["other"] * neighbours]]
+    base_fit.fit_base(replace(bench.problem, trees=trees), bench.problem.space.to_physical(bench.problem.space.start))
+    assert used == references
+
+
+def test_how_far_a_joint_is_from_its_reference(bench):
+    motion = OwnMotion(problem=bench.problem, candidates=(), enough=torch.zeros(1))
+
+    def away(**changes):
+        values = torch.tensor([[({**CALM, **changes})[name] for name in BASE]], dtype=torch.float64)
+        return motion._away(bench.twins, Fitted.start(JointModel.base(bench.problem), values))
+
+    assert away() < 1e-3
+    assert away(encoder_bias=CALM["encoder_bias"] + 0.03) == pytest.approx(0.03, rel=0.1)
 
 
 def test_an_effect_in_one_slot_changes_no_other(bench):
