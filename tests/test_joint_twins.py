@@ -15,6 +15,13 @@ from pace_optim.recording import Load
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.0, "delay": 2.0}
 
 
+def moved_by(problem, physical):
+    """Positions of the robot, or of joints alone, at every control step."""
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(physical[None], problem.dataset.sampled)
+    return torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
+
+
 def test_friction_turns_where_the_speed_passes_zero():
     """As a thousand small steps under the same push, each with friction against the speed that it ends with."""
     generator = torch.Generator().manual_seed(0)
@@ -48,10 +55,7 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     physical = whole.space.from_dict(values)
     path = reference_path(whole, physical, ["payload"])
     twins = twin_problem(whole, path).with_physics_dt(0.00125)
-    rollout = twins.evaluator().rollout(1)
-    rollout.start(physical[None], twins.dataset.sampled)
-    moved = torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
-    assert float((moved - path.position).abs().max()) < 3e-4
+    assert float((moved_by(twins, physical) - path.position).abs().max()) < 3e-4
 
 
 def test_a_joint_s_own_payload_is_that_of_its_link_alone():
@@ -61,13 +65,6 @@ def test_a_joint_s_own_payload_is_that_of_its_link_alone():
     twice, whole = path.model_effects["payload", "ratio"].inertia, path.feel.inertia
     assert torch.allclose(twice[..., 2], whole[..., 2])  # the shank is all that the knee moves
     assert bool((twice[..., 0] < 0.5 * whole[..., 0]).all())  # the hip moves thigh and shank too
-
-
-def moved_by(problem, physical):
-    """Positions of the robot, or of joints alone, at every control step."""
-    rollout = problem.evaluator().rollout(1)
-    rollout.start(physical[None], problem.dataset.sampled)
-    return torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
 
 
 def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():

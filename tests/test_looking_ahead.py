@@ -157,6 +157,19 @@ def test_another_way_is_taken_that_leaves_less_with_as_many_numbers(monkeypatch)
     assert found(monkeypatch, better)[0] == [{"joint_elasticity", "torque_gain"}]
 
 
+def test_a_way_ends_with_the_best_of_what_pays():
+    model = SimpleNamespace(effects=(MOUNT,), has=torch.tensor([[True, True]]), num_joints=2)
+    branch = steps.Branch(problem=None, now=SimpleNamespace(model=model), errors=errors_of(8e-3, 8e-3), rounds=[])
+    trials = [
+        make_trial(GAIN, 0, 1e-3, False),
+        make_trial(SPRING, 0, 3e-3, True),
+        make_trial(ELASTICITY, 0, 5e-3, True),
+    ]
+    ends = branch.ends(Round(trials=[trials, []], chosen=[SPRING, None], rivals=[[], []]))
+    assert [end.effects for end in ends] == [{MOUNT, SPRING}, {MOUNT}]
+    assert [end.mse for end in ends] == pytest.approx([9e-6, 64e-6])
+
+
 @pytest.mark.parametrize(
     ("one", "other", "rmse", "wins"),
     [  # numbers: mount and elasticity 3, spring 2, gain 1
