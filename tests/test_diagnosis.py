@@ -17,7 +17,8 @@ from run_folders import make_result
 from pace_actuators.effects import get_effect
 from pace_optim.atomic import write_json
 from pace_optim.diagnosis import candidate_effects
-from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, judge
+from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, check_long_enough, judge
+from pace_optim.diagnosis.diagnose import search_effects
 from pace_optim.diagnosis.next_experiment import rivals_of
 from pace_optim.diagnosis.screening import _FOLDS, _explained
 from pace_optim.diagnosis.trials import Round
@@ -118,14 +119,48 @@ def test_a_further_effect_must_bring_more_than_the_first():
 
 
 def test_blocks_are_seconds_of_the_samples_that_count():
-    error = torch.ones(1000, 2, 1)
+    error = torch.ones(2400, 2, 1)
     error[:, 1] = 2.0
-    where = torch.zeros(1000, 2, dtype=torch.bool)
-    where[200:, 0], where[:410, 1] = True, True  # 2 s, and 1.025 s, whose last part is too short
+    where = torch.zeros(2400, 2, dtype=torch.bool)
+    where[200:2200, 0], where[:410, 1] = True, True  # 5 s, and 1.025 s, whose last part is too short
     blocks = block_errors(error, where, 0.0025)
-    assert blocks.square[:, 0].tolist() == [1.0, 1.0, 4.0]
-    assert blocks.weight.tolist() == [400.0, 400.0, 400.0]
-    assert float(blocks.mse[0]) == pytest.approx(2.0)
+    assert blocks.square[:, 0].tolist() == [1.0] * 5 + [4.0]
+    assert blocks.weight.tolist() == [400.0] * 6
+    assert float(blocks.mse[0]) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "count", "weight"),
+    [
+        ([20.0], 20, 400),
+        ([1.8], 6, 120),  # of a short recording: shorter blocks, and as many
+        ([1.2, 0.6], 6, 120),
+        ([1.0], 4, 100),  # none shorter than a quarter of a second
+        ([0.6], 2, 100),
+    ],
+)
+def test_blocks_of_short_recordings_are_shorter(seconds, count, weight):
+    where = torch.zeros(8000, len(seconds), dtype=torch.bool)
+    for r, duration in enumerate(seconds):
+        where[: round(duration / 0.0025), r] = True
+    blocks = block_errors(torch.ones(8000, len(seconds), 1), where, 0.0025)
+    assert blocks.weight.tolist() == [weight] * count
+
+
+def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
+    where = torch.zeros(400, 2, dtype=torch.bool)
+    where[:200, 0] = where[100:300:2, 1] = True
+    check_long_enough(where, 0.0025)
+    where[100:, 0] = False
+    with pytest.raises(
+        ValueError, match=r"lasts 0\.75 s, .* expected 1 s or more\. Record for longer, or .*--validation"
+    ):
+        check_long_enough(where, 0.0025)
+    run = hidden_run(tmp_path, None, duration=2.5)
+    data = run.problem.dataset
+    short = replace(data, train=data.train | (torch.arange(len(data.train)) > 40)[:, None])
+    with pytest.raises(ValueError, match="too short to judge"):
+        search_effects(replace(run.problem, dataset=short), torch.zeros(5), [GAIN], 1)
 
 
 # ------------------------------------------------------------------ verdict
@@ -206,7 +241,7 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
 @pytest.mark.parametrize(
     ("after", "significant", "said"),
     [
-        (3e-4, True, "the error falls from 1 to 0.3 mrad with it (t = 4.0 over blocks of one second). Sign: "),
+        (3e-4, True, "the error falls from 1 to 0.3 mrad with it (t = 4.0 over blocks of up to one second). Sign: "),
         (9.5e-4, False, "falls from 1 to 0.95 mrad with it, less than the 1.1 times that count. Sign: "),
         (5e-4, False, "falls from 1 to 0.5 mrad with it, too unevenly to count (t = 4.0 over blocks"),
         (2e-3, False, "the error does not fall: from 1 to 2 mrad with it. Sign: "),
@@ -234,7 +269,7 @@ def test_the_ranking_begins_with_what_was_added_in_any_round():
 
 @pytest.mark.slow
 def test_a_hidden_effect_is_named(tmp_path):
-    run = hidden_run(tmp_path, "stribeck_friction").folder
+    run = hidden_run(tmp_path, "stribeck_friction", duration=3.0).folder
     done = run_script("diagnose", run, "--no_refit", "--max_effects", 1)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0] == "verdict: effect"
@@ -277,7 +312,7 @@ class Lean(Effect):
 
 @pytest.mark.slow
 def test_an_effect_of_one_s_own_is_named_and_kept_when_its_refit_is_broken_off(tmp_path):
-    run = hidden_run(tmp_path, "torque_offset").folder
+    run = hidden_run(tmp_path, "torque_offset", duration=2.5).folder
     broken = """
 import importlib, runpy, sys
 module = importlib.import_module("pace_optim.diagnosis.diagnose")
@@ -292,7 +327,18 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
     (tmp_path / "lean_effects.py").write_text(OWN)
     script = str(ROOT / "scripts" / "diagnose.py")
-    command = [sys.executable, "-c", broken, script, str(run), "--only", "--effects", "lean_effects:Lean"]
+    command = [
+        sys.executable,
+        "-c",
+        broken,
+        script,
+        str(run),
+        "--only",
+        "--effects",
+        "lean_effects:Lean",
+        "--max_effects",
+        "1",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode != 0 and "AssertionError" not in done.stderr, done.stderr
     content = json.loads((run / "diagnosis.json").read_text())

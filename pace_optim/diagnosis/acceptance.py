@@ -8,7 +8,13 @@ from dataclasses import dataclass
 import torch
 from scipy import stats
 
-_BLOCK_S = 1.0
+_LONGEST = 1.0
+"""A block [s]; shorter where that gives fewer than ``_WANTED``, but never below ``_SHORTEST``: in less time neighbours
+are alike."""
+_SHORTEST = 0.25
+_WANTED = 6
+_FEWEST = 4
+"""Blocks, below which nothing is shown."""
 FIRST_RATIO = 1.10
 """By how much the first effect must lower the validation RMSE."""
 NEXT_RATIO = 1.25
@@ -22,7 +28,7 @@ CLEAR_T = 2.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BlockErrors:
-    """Mean square errors of n joints in B blocks of one second of validation."""
+    """Mean square errors of n joints in B blocks of validation, of one second where there are enough."""
 
     square: torch.Tensor
     """(B, n) [rad²]."""
@@ -43,20 +49,52 @@ def block_errors(error: torch.Tensor, where: torch.Tensor, control_dt: float) ->
         where: Which samples count, (T, R) bool.
         control_dt: [s].
     """
-    length = max(1, round(_BLOCK_S / control_dt))
-    squares, weights = [], []
+    blocks = _blocks(where, control_dt)
+    return BlockErrors(
+        square=torch.stack([error[own, r].double().square().mean(dim=0) for r, own in blocks]),
+        weight=torch.tensor([len(own) for _, own in blocks], dtype=torch.float64),
+    )
+
+
+def check_long_enough(where: torch.Tensor, control_dt: float) -> None:
+    """See that recordings are long enough to judge by.
+
+    Args:
+        where: Which samples count, (T, R) bool.
+        control_dt: [s].
+
+    Raises:
+        ValueError: If they are not.
+    """
+    if len(_blocks(where, control_dt)) < _FEWEST:
+        raise ValueError(
+            f"What was kept for validation lasts {sum(_spans(where)) * control_dt:.2g} s, too short to judge a model "
+            f"by; expected {_FEWEST * _SHORTEST:g} s or more. Record for longer, or fit again with further recordings "
+            "as --validation."
+        )
+
+
+def _blocks(where: torch.Tensor, control_dt: float) -> list[tuple[int, torch.Tensor]]:
+    """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
+    length = min(_LONGEST, max(_SHORTEST, sum(_spans(where)) * control_dt / _WANTED))
+    steps = max(1, round(length / control_dt))
+    blocks = []
     for r in range(where.shape[1]):
         at = where[:, r].nonzero()[:, 0]
         if not len(at):
             continue
-        # blocks of time, so that coarse sampling has the same ones
-        block = (at - at[0]) // length
+        block = (at - at[0]) // steps
         for b in range(int(block[-1]) + 1):
             own = at[block == b]
             if len(own) * 2 >= (block == 0).sum():
-                squares.append(error[own, r].double().square().mean(dim=0))
-                weights.append(len(own))
-    return BlockErrors(square=torch.stack(squares), weight=torch.tensor(weights, dtype=torch.float64))
+                blocks.append((r, own))
+    return blocks
+
+
+def _spans(where: torch.Tensor) -> list[int]:
+    """Control steps from the first to the last sample of recordings that have any."""
+    found = (column.nonzero()[:, 0] for column in where.T)
+    return [int(at[-1] - at[0]) + 1 for at in found if len(at)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +113,7 @@ class Judgement:
 def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first: bool) -> Judgement:
     """Compare two models block by block.
 
-    Neighbouring samples are alike, blocks of one second hardly: the mean of the blocks' log(MSE before / MSE after),
+    Neighbouring samples are alike, blocks hardly: the mean of the blocks' log(MSE before / MSE after),
     and that of MSE before - MSE after, are held against their scatter. The threshold is Student's for the chance that
     the best of ``tried`` candidates looks this good by luck in either of them.
 
@@ -89,7 +127,7 @@ def judge(before: BlockErrors, after: BlockErrors, joint: int, tried: int, first
     ratio = math.sqrt(float(before.mse[joint]) / max(float(after.mse[joint]), 1e-300))
     logs = (before.square[:, joint].clamp(min=1e-30) / after.square[:, joint].clamp(min=1e-30)).log()
     count = len(logs)
-    if count < 4:
+    if count < _FEWEST:
         return Judgement(ratio=ratio, t=0.0, significant=False, likely=False)
     falls = (before.square[:, joint] - after.square[:, joint]) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere

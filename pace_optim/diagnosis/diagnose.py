@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from pace_actuators.effects import Effect, available_effects, get_effect
+from pace_optim.diagnosis.acceptance import check_long_enough
 from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
@@ -161,7 +162,11 @@ def search_effects(
         max_effects: Most effects of a joint.
         say: Shows how far it is.
         run: The whole robot's own fit, if there is one.
+
+    Raises:
+        ValueError: If the validation recordings are too short to judge by.
     """
+    check_long_enough(problem.dataset.validation, problem.control_dt)
     torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base, run)

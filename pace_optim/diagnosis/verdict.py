@@ -153,7 +153,7 @@ def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effec
 def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
     before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
     strongest = max(trials, key=lambda t: t.ratio)
-    blocks = f"t = {strongest.t:.1f} over blocks of one second"
+    blocks = f"t = {strongest.t:.1f} over blocks of up to one second"
     verb, why = "falls", f" ({blocks})"
     if after >= before:
         verb, why = "does not fall:", ""
