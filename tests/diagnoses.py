@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -152,8 +153,9 @@ def hidden_run(folder, effect, seed=0, duration=4.0):
     return SimpleNamespace(folder=run, problem=load_problem(BENCH, data=data, validation=validation))
 
 
+@cache
 def joint_alone() -> SimpleNamespace:
-    """A short chirp without noise, its problem with a twin of each joint, and the truth."""
+    """A short chirp without noise, its problem with a twin of each joint, and the truth. Made once: change nothing."""
     fine = env_cfg()  # what the robot does, not what a coarse step makes of it
     set_physics_dt(fine, DT / 10)
     recordings = [record(target, CALM, cfg=fine) for target in (chirp(5.0), chirp(4.0, 0.2, 3.0))]

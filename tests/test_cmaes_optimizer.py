@@ -194,11 +194,16 @@ def test_a_diverging_candidate_gets_the_worst_score_and_the_search_goes_on(bench
 # ---------------------------------------------------------------- checkpoints
 
 
-@pytest.mark.parametrize("split", [False, True])
+@pytest.fixture(scope="module", params=[False, True], ids=["together", "apart"])
+def unbroken(request, pendulums):
+    """A search of 30 generations, of all joints together or of each tree."""
+    trees = pendulums.trees if request.param else None
+    return trees, run(pendulums, 8, 30, trees=trees)
+
+
 @pytest.mark.parametrize("stop_at", [1, 17, 27])
-def test_a_restored_search_continues_bit_for_bit(pendulums, split, stop_at):
-    trees = pendulums.trees if split else None
-    whole = run(pendulums, 8, 30, trees=trees)
+def test_a_restored_search_continues_bit_for_bit(pendulums, unbroken, stop_at):
+    trees, whole = unbroken
     half = run(pendulums, 8, 30, trees=trees, after=lambda o: o.generation == stop_at and o.stop("interrupted"))
     assert half.generation == stop_at
     fresh = CMAESOptimizer(pendulums.space, 8, CMAESOptimizerCfg(max_iteration=30, epsilon=None), seed=1, trees=trees)

@@ -177,7 +177,7 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
             Fitted.start(*model.extended(values, effect, yes, each), effect)
             for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
-        fits = fit_side_by_side(bench.twins, starts, 8, keep_jacobian=True, part=0.4)
+        fits = fit_side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
         return screen(bench.twins, base, effects, effort), fits, far_starts(bench.twins, base, effects)
 
     probes, fits, far = found()

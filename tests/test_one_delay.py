@@ -46,6 +46,13 @@ def fitted(legs, change=lambda recording: recording):
     return problem, *fit_base(problem, physical(problem, TRUTH))
 
 
+@pytest.fixture(scope="module")
+def punctual(legs):
+    """Joints with one delay, and their base model."""
+    _, twins, base, _ = fitted(legs)
+    return twins, base
+
+
 @pytest.mark.parametrize(
     ("delay", "late"),
     [
@@ -77,13 +84,13 @@ def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     assert torch.equal(absorbed[LATE_LOG], ~late)
 
 
-def test_where_no_joint_is_late_the_base_model_stays_as_it_is(legs):
-    _, twins, base, _ = fitted(legs)
+def test_where_no_joint_is_late_the_base_model_stays_as_it_is(punctual):
+    twins, base = punctual
     assert hold_late_joints(twins, base) == (base, [])
 
 
-def test_a_joint_is_not_held_where_its_delay_does_not_matter(legs, monkeypatch):
+def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypatch):
     """That of a joint that hardly moves may be anything."""
-    _, twins, base, _ = fitted(legs)
+    twins, base = punctual
     monkeypatch.setattr("pace_optim.diagnosis.one_delay.later_than_most", lambda delay: torch.arange(len(delay)) == 4)
     assert hold_late_joints(twins, base) == (base, [])

@@ -23,7 +23,7 @@ def bench(monkeypatch):
     """A short chirp of one joint, cut into short windows; in the last of them the measured joint swings by itself."""
     monkeypatch.setattr(windows, "_LENGTH", 0.5)
     monkeypatch.setattr(windows, "_BEFORE", 0.25)
-    bench = joint_alone()
+    bench = SimpleNamespace(**vars(joint_alone()))
     trained = bench.twins.dataset.train.any(dim=0).nonzero()[0, 0]
     steps = int(bench.twins.dataset.train[:, trained].sum())
     last = slice(steps - round(0.5 / DT), steps)

@@ -45,7 +45,7 @@ class Dynamics:
         given = np.zeros(self.n, dtype=bool) if compliance is None else compliance.joints
         self.given = given
         self._any_given = bool(given.any())
-        pad = np.zeros((rows, self.size - self.n))
+        self._pad = pad = np.zeros((rows, self.size - self.n))
         self._J = np.concatenate([np.where(given, 0.0, drives.armature), pad], axis=1)
         mount_c = pad if drives.model.mount_damping is None else pad + drives.model.mount_damping
         self._D = np.concatenate([np.where(given, 0.0, drives.viscous_friction), mount_c], axis=1)
@@ -128,9 +128,11 @@ class Dynamics:
             force[:, n:] -= self._mount_k * q_mid[:, n:]
         inverse = self._inverse_of(M, h)
         v_free = self.v + _apply(inverse, h * force, body.blocks)
-        lower, upper = np.zeros_like(self.q), np.zeros_like(self.q)
-        lower[:, :n] = np.where(self.given, 0.0, -h * forward)
-        upper[:, :n] = np.where(self.given, 0.0, h * backward)
+        lower, upper = -h * forward, h * backward
+        if self._any_given:
+            lower, upper = np.where(self.given, 0.0, lower), np.where(self.given, 0.0, upper)
+        if self.size > n:
+            lower, upper = (np.concatenate([bound, self._pad], axis=1) for bound in (lower, upper))
         self._v_before = self.v
         self.v, self._impulse = friction_impulse(v_free, inverse, lower, upper, body.blocks, self._impulse)
         self.q = q_mid + 0.5 * h * self.v
