@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from diagnoses import hidden_run
-from problems import CALM
+from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
@@ -139,7 +139,7 @@ def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
         ("share", None),
     ):
         monkeypatch.setattr(module, name, lambda *_, made=made: made)
-    joints = SimpleNamespace(joint_names=("a", "b", "c", "d"))
+    joints = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=DT)
     found = search_effects(joints, None, [SPRING], 3)
     assert (found.verdict, found.paying, found.added) == ("nothing_missing", [], [])
     assert outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())
