@@ -111,6 +111,16 @@ def test_viscous_friction_lets_a_speed_die_out_exponentially():
     assert np.abs(fine - finer).max() < 2e-6, "smooth torques are integrated to second order"
 
 
+def test_a_link_swings_on_behind_a_motor_that_sticks():
+    """Coulomb friction is the motor's; an elastic shaft without damping hands none of it to the link."""
+    base = replace(BASE, friction=3.0)
+    shaft = {"joint_elasticity": {"k": {"servo": 300.0}, "c": {"servo": 0.0}, "encoder_on_link": {"servo": 1.0}}}
+    step = np.where(np.arange(round(2.0 / DT)) < 40, 0.0, 0.3)[:, None]
+    late = positions(Truth(base=base, effects=shaft), [run_of(step)])[0].dof_pos[-200:]
+    assert late.std() > 1e-3
+    assert positions(Truth(base=base), [run_of(step)])[0].dof_pos[-200:].std() < 1e-9
+
+
 @pytest.mark.parametrize(
     "name", [None, "stribeck_friction", "joint_elasticity", "backlash", "presliding_friction", "creeping_friction"]
 )
