@@ -59,9 +59,8 @@ def test_a_payload_of_nothing_keeps_a_loaded_robot_bit_for_bit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("calls", "integrator", "duration"), [(1, "implicitfast", 20.0), (2, "rk4", 4.0)])
-def test_the_extremes_of_all_bounds_stay_finite(calls, integrator, duration):
-    """For 20 s in the steps of a task, and for 4 s with the drives asked eight times as often."""
+@pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (2, "rk4")])
+def test_the_extremes_of_all_bounds_stay_finite_for_20_s(calls, integrator):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
     cfgs, corners, bases = [], [], []
     for name in EFFECTS:  # side by side, each on its rows, with each base
@@ -81,7 +80,7 @@ def test_the_extremes_of_all_bounds_stay_finite(calls, integrator, duration):
         bench.robot._write_passive(actuator)
         if effect.overrides("write_model"):
             bench.robot._write_model(actuator, effect)
-    reached = bench.follow(long_chirp(duration))[:, :, 0]
+    reached = bench.follow(long_chirp(20.0))[:, :, 0]
     for i, corner in enumerate(zip(corners, bases, strict=True)):
         assert bool(reached[:, i].isfinite().all()), corner
         assert float(reached[:, i].abs().max()) < 10.0, corner
@@ -121,7 +120,7 @@ def mechanical_energy(bench, load, base):
 
 
 @pytest.mark.parametrize("name", ENERGY)
-@pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (5, "implicitfast"), (2, "rk4")])
+@pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (5, "implicitfast"), (2, "rk4"), (5, "rk4")])
 def test_a_free_swing_never_gains_energy(name, calls, integrator):
     load = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.0}
     base = {"armature": 0.1, "viscous_friction": 0.05, "friction": 0.1, "encoder_bias": 0.0, "delay": 0.0}
