@@ -327,7 +327,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
     (tmp_path / "lean_effects.py").write_text(OWN)
     script = str(ROOT / "scripts" / "diagnose.py")
-    options = "--only --effects lean_effects:Lean --max_effects 1".split()
+    options = ["--only", "--effects", "lean_effects:Lean", "--max_effects", "1"]
     command = [sys.executable, "-c", broken, script, str(run), *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode != 0 and "AssertionError" not in done.stderr, done.stderr
