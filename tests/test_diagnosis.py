@@ -11,7 +11,7 @@ import pytest
 import torch
 from command_lines import run_script
 from diagnoses import hidden_run, make_trial, outcome_of
-from problems import BENCH
+from problems import BENCH, DT
 from run_folders import make_result
 
 from pace_actuators.effects import get_effect
@@ -20,6 +20,7 @@ from pace_optim.diagnosis import candidate_effects
 from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, check_long_enough, judge
 from pace_optim.diagnosis.diagnose import search_effects
 from pace_optim.diagnosis.next_experiment import rivals_of
+from pace_optim.diagnosis.processes import spread
 from pace_optim.diagnosis.screening import _FOLDS, _explained
 from pace_optim.diagnosis.trials import Round
 from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
@@ -161,6 +162,28 @@ def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
     short = replace(data, train=data.train | (torch.arange(len(data.train)) > 40)[:, None])
     with pytest.raises(ValueError, match="too short to judge"):
         search_effects(replace(run.problem, dataset=short), torch.zeros(5), [GAIN], 1)
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_search_flushes_denormal_numbers_and_puts_the_processors_setting_back(before, monkeypatch):
+    tiny, seen = sys.float_info.min, []
+
+    def first_step(*_):
+        seen.append((tiny / 2, *spread(lambda own: [tiny / 2 for _ in own], [1, 2], [GAIN, None])))
+        raise KeyboardInterrupt
+
+    module = sys.modules["pace_optim.diagnosis.diagnose"]  # the package has a function of this name
+    monkeypatch.setattr(module, "check_long_enough", lambda *_: None)
+    monkeypatch.setattr(module, "fit_base", first_step)
+    problem = SimpleNamespace(dataset=SimpleNamespace(validation=None), control_dt=DT)
+    try:
+        torch.set_flush_denormal(before)
+        with pytest.raises(KeyboardInterrupt):
+            search_effects(problem, torch.zeros(5), [GAIN], 1)
+        assert seen == [(0.0, 0.0, 0.0)]
+        assert (tiny / 2 == 0.0) is before
+    finally:
+        torch.set_flush_denormal(False)
 
 
 # ------------------------------------------------------------------ verdict

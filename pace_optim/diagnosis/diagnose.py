@@ -14,6 +14,7 @@ from pace_optim.diagnosis.acceptance import check_long_enough
 from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
+from pace_optim.diagnosis.denormals import flushed_denormals
 from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.one_delay import hold_late_joints
@@ -145,6 +146,7 @@ def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[
     return list(dict.fromkeys([*every, *own]))
 
 
+@flushed_denormals()
 def search_effects(
     problem: Problem,
     physical: torch.Tensor,
@@ -167,7 +169,6 @@ def search_effects(
         ValueError: If the validation recordings are too short to judge by.
     """
     check_long_enough(problem.dataset.validation, problem.control_dt)
-    torch.set_flush_denormal(True)
     twins, base, effort = fit_base(problem, physical, candidates, say)
     data = check_data(problem, twins, base, run)
     base, sentences = hold_late_joints(twins, base)
