@@ -12,6 +12,8 @@ from pace_optim.step_error import step_error
 from pace_optim.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
+_NOTHING = 1e-6
+"""Errors below this are nothing to speak of [rad]."""
 _OF_THE_STEP = (0.3, 5.0)
 """The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
 recording comes from a simulation with this very step."""
@@ -50,24 +52,36 @@ def fit_warnings(
     for group in uncertainty.indistinguishable:
         warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
     warnings += _critical_delays(problem, physical)
+    change = _change_at_half_the_step(problem, physical, rmse)
+    return warnings + _overfit(rmse, change) + _coarse_step(problem, rmse, change)
+
+
+def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+    """Whether the error on other data is larger than the fit and the physics step (its change [rad]) make it."""
     train, validation = rmse["train"].get("all"), rmse["validation"].get("all")
-    if train and validation and validation > _OVERFIT_RATIO * train and validation > 1e-6:
-        warnings.append(
-            f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
-            f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
-        )
-    return warnings + _coarse_step(problem, physical, rmse)
-
-
-def _coarse_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> list[str]:
-    """Whether a part of the error may come from the physics step."""
-    data = problem.dataset
-    part, where = ("validation", data.validation) if rmse["validation"].get("all") else ("train", data.train)
-    left = rmse[part].get("all")
-    if not left:
+    if not train or not validation or validation < _NOTHING:
         return []
-    change, (least, most) = float(step_error(problem, physical, where).square().mean().sqrt()), _OF_THE_STEP
-    if not least * left <= change <= most * left:
+    of_the_step = change if change <= _OF_THE_STEP[1] * validation else 0.0
+    if validation <= math.hypot(_OVERFIT_RATIO * train, of_the_step):
+        return []
+    return [
+        f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
+        f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
+    ]
+
+
+def _change_at_half_the_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> float:
+    """RMS change of the motion when the physics step is halved [rad], where errors are judged."""
+    data = problem.dataset
+    where = data.validation if rmse["validation"].get("all") else data.train
+    return float(step_error(problem, physical, where).square().mean().sqrt())
+
+
+def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+    """Whether a part of the error may come from the physics step (its change [rad])."""
+    left = rmse["validation"].get("all") or rmse["train"].get("all")
+    least, most = _OF_THE_STEP
+    if not left or not least * left <= change <= most * left:
         return []
     return [
         f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} mrad, "

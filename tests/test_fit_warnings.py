@@ -200,6 +200,15 @@ def test_a_validation_error_far_above_the_training_error_is_told(train, validati
         assert "1.6 mrad" in found[0] and "1.6 times" in found[0] and "does not carry over" in found[0]
 
 
+@pytest.mark.parametrize(("change", "told"), [(0.7e-3, True), (0.9e-3, False), (5e-3, False), (10e-3, True)])
+def test_what_the_physics_step_adds_to_the_validation_error_is_not_held_against_the_fit(change, told, monkeypatch):
+    problem = make_problem(record(chirp(0.2)))
+    monkeypatch.setattr("pace_optim.fit_warnings.step_error", lambda *_: torch.tensor([change]))
+    rmse = {"train": {"all": 1e-3}, "validation": {"all": 1.7e-3}}
+    found = fit_warnings(problem, physical(problem), known(problem), rmse)
+    assert any("does not carry over" in warning for warning in found) is told
+
+
 @pytest.mark.parametrize(("of_the_change", "told"), [(0.1, False), (0.5, True), (2.0, True), (5.0, False)])
 def test_a_physics_step_that_makes_the_error_is_told(of_the_change, told):
     problem = make_problem(record(chirp(0.2)))

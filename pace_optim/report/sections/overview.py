@@ -49,8 +49,6 @@ def _verdict(run: RunData) -> str:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
     else:
         sentences.append(f"On the data it was fitted to, it is {angle_text(train)}.")
-        if train and held_out > 1.5 * train and held_out > 1e-6:
-            sentences.append("So much more on unseen data says that the fit does not carry over.")
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
         sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
