@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pace_optim.recording import without_fact_files
+
 OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
 
 
@@ -67,7 +69,7 @@ class FitSettings:
     """Where runs are kept."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked without reading anything.
+        """Check what can be checked without reading anything, and leave out the JSON files beside recordings.
 
         Raises:
             ValueError: If a value is unusable.
@@ -82,6 +84,7 @@ class FitSettings:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")
+        self.data, self.validation = without_fact_files(self.data), without_fact_files(self.validation)
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""

@@ -182,6 +182,14 @@ def test_options_that_do_not_fit(fault, fails):
     assert re.search(expected, message), message
 
 
+def test_the_facts_beside_a_csv_may_be_listed_with_it(tmp_path):
+    path = save_recording(tmp_path / "r.csv", record())
+    facts = str(path.with_suffix(".json"))
+    settings = FitSettings(task=BENCH, data=[str(path), facts], validation=[facts])
+    assert settings.data == [str(path)]
+    assert settings.validation == [facts]  # alone it is no recording, and reading it says so
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A run that was made."""

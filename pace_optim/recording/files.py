@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+from collections.abc import Sequence
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,16 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
     fields = _add_json_facts(fields, path)
     return check_recording(fields, source=str(path), default_name=path.stem, found=found)
+
+
+def without_fact_files(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Leave out JSON files of facts that lie beside a recording that is listed too, as ``folder/*`` lists them."""
+    recordings = {Path(path).with_suffix("") for path in paths if Path(path).suffix.lower() in SUFFIXES}
+    return [
+        str(path)
+        for path in paths
+        if not (Path(path).suffix.lower() == ".json" and Path(path).with_suffix("") in recordings)
+    ]
 
 
 def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
