@@ -1,5 +1,6 @@
 """Models of joints alone: how they move, and how they are fitted."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -236,6 +237,45 @@ def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench
             error[last] = lowest
         way.tell(rows, error)
     assert asked == 4 and float(way.score) == pytest.approx(lowest**2)
+
+
+@pytest.mark.parametrize(
+    ("promised", "rough", "expected"),
+    [(1e-4, False, 1), (1e-3, False, 2), (1e-4, True, 5)],  # on to the narrowest of three steps
+)
+def test_a_descent_ends_where_its_linear_model_promises_next_to_nothing(bench, promised, rough, expected):
+    model = JointModel.base(bench.problem)
+    start = model.to_normalised(bench.truth_values)
+    axes = torch.linalg.qr(torch.randn(40, model.size + 1, generator=torch.Generator().manual_seed(0)).double())[0]
+    left, columns = axes[:, 0], axes[:, 1:]
+    bottom = start[0] + torch.full((model.size,), math.sqrt(promised / model.size), dtype=torch.float64)
+    way = Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=rough)
+    asked = 0
+    while not way.finished and asked < 10:
+        asked += 1
+        rows = way.ask()
+        way.tell(rows, (left + (rows[:, 0] - bottom) @ columns.T)[..., None, None])
+    assert asked == expected
+    assert float(way.score) == pytest.approx(1.0 + (promised if expected == 1 else 0.0), abs=1e-6)
+
+
+def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside_it(bench, monkeypatch):
+    model = JointModel.base(bench.problem)
+    off = bench.truth_values * torch.tensor([[1.5, 0.5, 2.0, 1.0, 1.0]])
+    first = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)])[0]
+    starts = [Fitted.start(model, model.to_physical(first.x)), Fitted.start(model, off)]
+    alone = [fit_side_by_side(bench.twins, [start])[0] for start in starts]
+    batches = []
+
+    def side_by_side(problem, slots, training):
+        batches.append(len(slots))
+        return SideBySide(problem, slots, training=training)
+
+    monkeypatch.setattr(descent, "SideBySide", side_by_side)
+    together = fit_side_by_side(bench.twins, starts)
+    assert batches == [2, 1]
+    for fitted, single in zip(together, alone, strict=True):
+        assert torch.equal(fitted.x, single.x) and torch.equal(fitted.score, single.score)
 
 
 def gaining(model, truth, gains):

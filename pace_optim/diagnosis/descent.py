@@ -19,6 +19,8 @@ _COARSE, _FINE, _WHOLE = 8, 3, 2
 """Iterations at the control step, then at the problem's physics step in windows, then on whole recordings."""
 _LONGER = 3
 """How many times as many at the control step, at most, for a model that still falls."""
+_THINNED = 0.8
+"""With less than this part of the models still on their way, only those are simulated."""
 _STRIDE = 2
 """Only every so many control steps count in a fit."""
 
@@ -116,21 +118,29 @@ def _fit(
     kept: torch.Tensor | None,
 ) -> list[Fitted]:
     """:func:`fit_side_by_side` in one process."""
-    slots = [Slot(model=s.model, rows=s.model.size + len(TRIALS)) for s in starts]
-    batch = SideBySide(problem, slots, training=True)
+    batch = _batch(problem, starts)
     where = batch.dataset.train.clone()
     where[math.ceil(part * len(where)) :] = False
     counts = where[where.any(dim=1)][::_STRIDE].sum(dim=0).double()
     weight = torch.ones(len(counts), starts[0].model.num_joints) if kept is None else kept.float()
     samples = counts @ weight.double()
-    ways = [Way(start, samples, keep_jacobian, rough) for start in starts]
+    ways = running = [Way(start, samples, keep_jacobian, rough) for start in starts]
     for _ in range(max_iteration):
-        rows = [way.ask() for way in ways]
-        physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
+        rows = [way.ask() for way in running]
+        physical = [way.model.to_physical(x) for way, x in zip(running, rows, strict=True)]
         errors = batch.split(batch.simulate(physical, where, _STRIDE))
-        for way, x, error in zip(ways, rows, errors, strict=True):
+        for way, x, error in zip(running, rows, errors, strict=True):
             if not way.finished:  # where it ends must not depend on what is fitted beside it
                 way.tell(x, error if kept is None else error * weight)
-        if all(way.finished for way in ways):
+        going = [way for way in running if not way.finished]
+        if not going:
             break
+        if len(going) < _THINNED * len(running):
+            running, batch = going, _batch(problem, going)
     return [way.result() for way in ways]
+
+
+def _batch(problem: TwinProblem, fits: Sequence[Fitted] | Sequence[Way]) -> SideBySide:
+    """What simulates one iteration of each."""
+    slots = [Slot(model=each.model, rows=each.model.size + len(TRIALS)) for each in fits]
+    return SideBySide(problem, slots, training=True)

@@ -19,6 +19,8 @@ _ENOUGH = 3e-3
 """A joint whose score falls by less than this part in an iteration has converged."""
 _STILL = 2
 """Steps in a row that gain less than that, after which a joint has converged."""
+_PROMISED = 3e-4
+"""A joint has converged, too, from where its linear model promises less than this part of the score."""
 _FALLS, _FALLS_OVER = 0.05, 3
 """A model still falls whose squared error over all joints has fallen by more than this part over so many steps."""
 
@@ -111,12 +113,24 @@ class Way:
             gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).double() / self._samples[:, None]
             self._hessian = torch.where(at_favoured[:, None, None], hessian, self._hessian)
             self._gradient = torch.where(at_favoured[:, None], gradient, self._gradient)
+            self._converged |= at_favoured & ~narrower & self._at_the_bottom()
             if self._keep:
                 mask = at_favoured.float()
                 old_j = torch.zeros_like(columns) if self._jacobian is None else self._jacobian
                 old_e = torch.zeros_like(error[0]) if self._error is None else self._error
                 self._jacobian = columns * mask + old_j * (1 - mask)
                 self._error = error[0] * mask + old_e * (1 - mask)
+
+    def _at_the_bottom(self) -> torch.Tensor:
+        """Joints whose linear model, of the narrowest derivatives, promises next to nothing, (n,) bool."""
+        result = self._width + 1 == len(self._widths)
+        for j in result.nonzero()[:, 0].tolist():
+            at = self._free[j].nonzero()[:, 0]
+            x, hessian, gradient = self.x[j, at], self._hessian[j][at[:, None], at], self._gradient[j][at]
+            move = bounded_step(x, hessian, gradient, _DAMPING) - x if len(at) else x
+            promised = -float(2 * gradient @ move + move @ hessian @ move)
+            result[j] = promised < _PROMISED * float(self.score[j])
+        return result
 
     def result(self) -> Fitted:
         """Where it ended."""
