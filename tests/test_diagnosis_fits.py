@@ -264,7 +264,7 @@ def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside
     off = bench.truth_values * torch.tensor([[1.5, 0.5, 2.0, 1.0, 1.0]])
     first = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)])[0]
     starts = [Fitted.start(model, model.to_physical(first.x)), Fitted.start(model, off)]
-    alone = [fit_side_by_side(bench.twins, [start])[0] for start in starts]
+    alone = [fit_side_by_side(bench.twins, [start], 4)[0] for start in starts]
     batches = []
 
     def side_by_side(problem, slots, training):
@@ -272,7 +272,7 @@ def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside
         return SideBySide(problem, slots, training=training)
 
     monkeypatch.setattr(descent, "SideBySide", side_by_side)
-    together = fit_side_by_side(bench.twins, starts)
+    together = fit_side_by_side(bench.twins, starts, 4)
     assert batches == [2, 1]
     for fitted, single in zip(together, alone, strict=True):
         assert torch.equal(fitted.x, single.x) and torch.equal(fitted.score, single.score)
