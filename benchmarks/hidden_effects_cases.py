@@ -134,7 +134,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "explained": found.explained,
         "floor": float(found.data.floor.square().mean().sqrt()),
         "shares": {effect.name: share for effect, share in found.shares.items()},
-        "ranking": ranking(outcome, problem.joint_names, found.verdict),
+        "ranking": ranking(outcome, problem.joint_names, found.verdict, list(found.shares)),
         "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
         "truth": truth["effects"],

@@ -284,6 +284,8 @@ def test_the_ranking_begins_with_what_was_added_in_any_round():
     outcome = outcome_of([1e-3], [1e-4], [STRIBECK, GAIN], rounds=rounds)
     names = [e["effect"] for e in ranking(outcome, ["hip"])]
     assert names == ["torque_gain", "stribeck_friction", "quadratic_friction"]
+    largest_first = [e["effect"] for e in ranking(outcome, ["hip"], order=[STRIBECK, GAIN])]
+    assert largest_first == ["stribeck_friction", "torque_gain", "quadratic_friction"]
     assert labels(outcome.final.model, ["hip"], [GAIN, STRIBECK])[0].startswith("torque_gain")
 
 

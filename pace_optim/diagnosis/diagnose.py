@@ -46,8 +46,8 @@ class Findings:
     explained: float
     """Part of the error above the floor that the effects found explain."""
     paying: list[str]
-    """Effects of the final model, as ``fit.py --effects`` takes them, in the order in which they were found: with the
-    verdict ``unknown`` all that lower the error, though they are not what is missing."""
+    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
+    ``unknown`` all that lower the error, though they are not what is missing."""
     shares: dict[type[Effect], float]
     """How much of what they explain is due to each, in the same order."""
 
@@ -97,7 +97,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         added=found.added,
         paying=found.paying,
         shares={effect.name: share for effect, share in found.shares.items()},
-        ranking=ranking(found.outcome, problem.joint_names, found.verdict),
+        ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
         joints=_joints(found, problem),
         data=found.data.sentences,
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},

@@ -25,14 +25,14 @@ class Diagnosis:
     explained: float = 1.0
     """Part of the error above the floor that the effects found explain."""
     added: list[str]
-    """Effects that are what is missing, as ``fit.py --effects`` takes them, in the order in which they were found; none
-    unless the verdict is ``effect``."""
+    """Effects that are what is missing, as ``fit.py --effects`` takes them, the largest share first; none unless the
+    verdict is ``effect``."""
     paying: list[str] = field(default_factory=list)
     """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
     shares: dict[str, float] = field(default_factory=dict)
     """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
     ranking: list[dict[str, Any]]
-    """Every effect that was refitted: those added first, then round by round by what they explain."""
+    """Every effect that was refitted: those added first, as in ``added``, then round by round by what they explain."""
     joints: dict[str, dict[str, Any]]
     """For each joint its errors, floor and effects."""
     data: list[str]

@@ -12,15 +12,13 @@ DOMINANT = 0.5
 
 
 def shares(outcome: Outcome) -> dict[type[Effect], float]:
-    """The share of each effect found, in the order in which they were; shares add up to 1.
+    """The share of each effect found, the largest first; shares add up to 1.
 
     Each is left out in turn and the rest is fitted again. What the squared validation error rises by then is due to it;
     effects that can take each other's place share little.
     """
     now = outcome.final
-    order = [effect for this in outcome.rounds for effect in this.chosen]
     found = [(effect, has) for effect, has in zip(now.model.effects, now.model.has, strict=True) if bool(has.any())]
-    found.sort(key=lambda each: order.index(each[0]) if each[0] in order else len(order))
     if len(found) < 2:
         return {effect: 1.0 for effect, _ in found}
     physical = now.model.to_physical(now.x)
@@ -32,4 +30,4 @@ def shares(outcome: Outcome) -> dict[type[Effect], float]:
         for (effect, has), errors in zip(found, after, strict=True)
     }
     whole = max(sum(rise.values()), 1e-30)
-    return {effect: each / whole for effect, each in rise.items()}
+    return {effect: rise[effect] / whole for effect in sorted(rise, key=rise.__getitem__, reverse=True)}

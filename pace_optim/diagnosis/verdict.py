@@ -95,14 +95,18 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
     return result
 
 
-def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effect") -> list[dict[str, Any]]:
+def ranking(
+    outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
+) -> list[dict[str, Any]]:
     """Every effect that was refitted, those that were added first, then round by round by what they explain.
 
     Args:
         outcome: Where the search ended.
         joint_names: The joints.
         decision: The verdict; unless it is ``effect``, nothing counts as added.
+        order: Which of those added comes first; none goes round by round.
     """
+    places = {effect.name: place for place, effect in enumerate(order)}
     entries: list[dict[str, Any]] = []
     for depth, this in enumerate(outcome.rounds):
         effects = dict.fromkeys(t.effect for own in this.trials for t in own)
@@ -144,6 +148,7 @@ def ranking(outcome: Outcome, joint_names: Sequence[str], decision: str = "effec
         entries,
         key=lambda e: (
             not e["added"],
+            places.get(e["effect"], len(places)) if e["added"] else 0,
             e["round"],
             -e["validation_rmse_before"] / max(e["validation_rmse_after"], 1e-12),
         ),
