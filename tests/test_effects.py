@@ -276,7 +276,9 @@ def test_limits_of_the_drive():
     values = {"torque_speed_limit.velocity": 10.0, "torque_speed_limit.effort": 20.0}
     drive = Drive(["torque_speed_limit"], values, damping=0.0)
     assert drive.one(1.0, v=4.0) == pytest.approx(20 * (1 - 4 / 10))
-    assert drive.one(-1.0, v=4.0) == pytest.approx(-20.0)
+    assert drive.one(1.0) == pytest.approx(20.0)
+    assert drive.one(1.0, v=12.0) == 0.0
+    assert drive.one(-1.0, v=4.0) == pytest.approx(-100.0)  # it brakes with all it is asked for
 
 
 def test_gains_torques_and_encoders():

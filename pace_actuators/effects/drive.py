@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from pace_actuators.dc_motor import clip_effort
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter
 from pace_actuators.effects.registry import register_effect
@@ -122,7 +121,10 @@ class TorqueLimit(Effect):
 
 @register_effect
 class TorqueSpeedLimit(Effect):
-    """The torque falls with the speed: τ <= τ_stall (1 - v/v_0) where the motor drives, as Isaac Lab's ``DCMotor``."""
+    """The torque falls with the speed where the motor drives; braking is not limited.
+
+        |τ| <= τ_stall (1 - |v|/v_0)   where τ v >= 0, and no less than 0
+    """
 
     name = "torque_speed_limit"
     stage = "drive"
@@ -159,7 +161,8 @@ class TorqueSpeedLimit(Effect):
 
     def drive(self, s: DriveState) -> None:
         """Clip by quadrant."""
-        clipped = clip_effort(s.effort, s.motor_vel, self._stall, self.effort, self.velocity)
-        on_the_line = self._on & (clipped != s.effort) & (clipped.abs() < self.effort)
-        s.speed_slope = torch.where(on_the_line, self._stall / self.velocity, s.speed_slope)
-        s.effort = torch.where(self._on, clipped, s.effort)
+        fall = self._stall / self.velocity
+        most = (self._stall - fall * s.motor_vel.abs()).clamp_(min=0.0)
+        limited = self._on & (s.effort * s.motor_vel >= 0) & (s.effort.abs() > most)
+        s.speed_slope = torch.where(limited & (most > 0), fall, s.speed_slope)
+        s.effort = torch.where(limited, torch.copysign(most, s.effort), s.effort)

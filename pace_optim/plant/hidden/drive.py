@@ -90,9 +90,8 @@ class TorqueSpeedLimit(HiddenEffect):
         """The torque that the voltage leaves [N m]."""
         v = state.motor_vel
         with np.errstate(invalid="ignore"):
-            upper = np.nan_to_num(self.tau_stall * np.maximum(1 - np.maximum(v, 0.0) / self.v_0, 0.0), nan=np.inf)
-            lower = np.nan_to_num(self.tau_stall * np.maximum(1 + np.minimum(v, 0.0) / self.v_0, 0.0), nan=np.inf)
-        return np.clip(torque, -lower, upper)
+            most = np.nan_to_num(self.tau_stall * np.maximum(1 - np.abs(v) / self.v_0, 0.0), nan=np.inf)
+        return np.clip(torque, np.where(v <= 0.0, -most, -np.inf), np.where(v >= 0.0, most, np.inf))
 
 
 @hidden
