@@ -48,6 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", default="effects,clean,outside,pairs,harmonic", help=f"of {', '.join(GROUPS)}")
     parser.add_argument("--seeds", type=int, default=5, help="cases of each kind")
+    parser.add_argument("--first_seed", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--recordings", choices=("battery", "chirp"), default="battery")
     parser.add_argument("--robot", choices=tuple(ROBOTS), default="bench")
     parser.add_argument("--workers", type=int, default=2, help="processes")
@@ -61,7 +62,7 @@ def main() -> None:
         try:
             jobs = make_jobs(
                 args.cases.split(","),
-                args.seeds,
+                range(args.first_seed, args.first_seed + args.seeds),
                 args.robot,
                 args.recordings,
                 args.folder / f"{args.robot}_{args.recordings}",

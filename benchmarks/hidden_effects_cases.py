@@ -56,7 +56,7 @@ class Job:
 
 
 def make_jobs(
-    groups: Sequence[str], seeds: int, robot: str, recordings: str, folder: Path, **settings: Any
+    groups: Sequence[str], seeds: Sequence[int], robot: str, recordings: str, folder: Path, **settings: Any
 ) -> list[Job]:
     """All cases of some groups.
 
@@ -77,7 +77,7 @@ def make_jobs(
         "harmonic": [()],
     }
     jobs = []
-    for seed in range(seeds):
+    for seed in seeds:
         for group in groups:
             for effects in hidden[group]:
                 case = Case(effects=effects, seed=seed, task=task, kind=recordings, joints=joints)  # type: ignore[arg-type]

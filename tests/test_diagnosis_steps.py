@@ -290,6 +290,6 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
 @pytest.mark.parametrize(("elastic", "chosen"), [(1.01, ELASTICITY), (1.04, BACKLASH), (0.99, ELASTICITY)])
 def test_of_two_effects_that_are_as_good_the_one_with_fewer_numbers_is_taken(elastic, chosen):
     (taken,), ((other,),) = one_round._choose(
-        [[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]]
+        [[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]], [{}]
     )
     assert {taken, other} == {BACKLASH, ELASTICITY} and taken is chosen

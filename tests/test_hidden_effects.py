@@ -38,10 +38,11 @@ FALSE_ALARM = line("clean", [], "effect", ["quadratic_friction"])
 
 
 def test_every_group_has_its_cases_and_no_two_share_a_name():
-    jobs = make_jobs(hidden_effects_cases.GROUPS, 2, "bench", "battery", Path("x"))
+    jobs = make_jobs(hidden_effects_cases.GROUPS, range(3, 5), "bench", "battery", Path("x"))
     effects = len(library_effects())
     assert len(jobs) == 2 * (2 * effects + len(outside_effects()) + 3 + 2)
     assert len({job.case.name for job in jobs}) == len(jobs) == len({job.folder for job in jobs})
+    assert {job.case.seed for job in jobs} == {3, 4}
     assert all(job.case.background > 0 for job in jobs if job.group == "background")
 
 
@@ -50,7 +51,7 @@ def test_every_group_has_its_cases_and_no_two_share_a_name():
 )
 def test_unknown_groups_and_robots_are_named(groups, robot, message):
     with pytest.raises(ValueError, match=message):
-        make_jobs(groups, 1, robot, "battery", Path("x"))
+        make_jobs(groups, range(1), robot, "battery", Path("x"))
 
 
 def test_a_twin_counts_for_the_declared_set_and_not_as_named():

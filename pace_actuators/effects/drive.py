@@ -123,7 +123,7 @@ class TorqueLimit(Effect):
 class TorqueSpeedLimit(Effect):
     """The torque falls with the speed where the motor drives; braking is not limited.
 
-        |τ| <= τ_stall (1 - |v|/v_0)   where τ v >= 0, and no less than 0
+    |τ| <= max(0, τ_stall (1 - |v|/v_0)) where τ v >= 0.
     """
 
     name = "torque_speed_limit"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.acceptance import FIRST_RATIO, BlockErrors
 from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.evidence import log_evidence
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.trials import ALIKE, RIVAL, Round, Trial
+from pace_optim.diagnosis.trials import ALIKE, FAR, RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -28,6 +30,9 @@ FROM_SCREENING = 2
 """How many of the best screened go on in any case, where refits began with all effects."""
 _PART, _ITERATIONS = 0.7, 6
 """Of each window, and how far, where refits begin: after four, what needs another derivative gain too is far behind."""
+CONTENDERS = 1.15
+"""Where more than one effect is missing, the main one may be any whose validation RMSE is within this factor of the
+best."""
 FAR_FROM_FLOOR = 50.0
 """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
 do for the first one."""
@@ -91,7 +96,13 @@ def try_effects(
             )
             trials[j].append(trial.judged(errors, after, tried, first))
         keep[effect] = chosen
-    chosen_effects, rivals = _choose(trials)
+    contenders = _contenders(trials, floor)
+    if weighed := list(dict.fromkeys(effect for own in contenders for effect in own)):
+        say(f"weighing {_names(weighed)}")
+        evidence = log_evidence(problem, {effect: keep[effect] for effect in weighed}, effects, effort)
+    chosen_effects, rivals = _choose(
+        trials, [{effect: float(evidence[effect][j]) for effect in own} for j, own in enumerate(contenders)]
+    )
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)
 
 
@@ -178,27 +189,62 @@ def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted
     return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
 
 
-def _choose(trials: list[list[Trial]]) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
-    """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest."""
+def _contenders(trials: Sequence[Sequence[Trial]], floor: torch.Tensor) -> list[list[type[Effect]]]:
+    """Of each joint, effects between which the error alone does not decide: near to each other, and far from the floor.
+
+    Args:
+        trials: Of each joint.
+        floor: Of each joint, (n,) [rad].
+    """
+    found: list[list[type[Effect]]] = []
+    for own, least in zip(trials, floor.tolist(), strict=True):
+        # where none is significant, what is weighed is not chosen, but told first
+        pool = [trial for trial in own if trial.significant] or [trial for trial in own if trial.ratio >= FIRST_RATIO]
+        near = _near(pool, CONTENDERS)
+        alike = len(near) > 1 and near[0].mse_after > (FAR * least) ** 2
+        found.append([trial.effect for trial in near] if alike else [])
+    return found
+
+
+def _near(trials: Sequence[Trial], factor: float) -> list[Trial]:
+    """A joint's best trials, up to a factor of the best one's RMSE, best first."""
+    ordered = sorted(trials, key=lambda trial: trial.mse_after)
+    return [trial for trial in ordered if trial.mse_after <= ordered[0].mse_after * factor**2]
+
+
+def _choose(
+    trials: list[list[Trial]], evidence: Sequence[Mapping[type[Effect], float]]
+) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
+    """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest.
+
+    Where rivals were weighed, the one with the most evidence in place of the simplest.
+
+    Args:
+        trials: Of each joint; ordered here: those that were weighed by their evidence, then the others by their error.
+        evidence: Of each joint, the log evidence of effects that were weighed.
+    """
     wanted: dict[type[Effect], int] = {}
     near: list[list[Trial]] = []
     refused = _worse_for_the_robot(trials)
-    for own in trials:
-        own.sort(key=lambda t: t.mse_after)
+    for own, known in zip(trials, evidence, strict=True):
+        own.sort(key=lambda t: (-known.get(t.effect, -math.inf), t.mse_after))
         good = [t for t in own if t.significant and t.effect not in refused]
-        close = [t for t in good if t.mse_after <= good[0].mse_after * RIVAL**2] if good else []
+        weighed = [t for t in good if t.effect in known]
+        close = weighed if len(weighed) > 1 else _near(good, RIVAL)
         near.append(close)
         for trial in close:
             wanted[trial.effect] = wanted.get(trial.effect, 0) + 1
     chosen: list[type[Effect] | None] = []
     rivals: list[list[type[Effect]]] = []
-    for close in near:
+    for close, known in zip(near, evidence, strict=True):
         if not close:
             chosen.append(None)
             rivals.append([])
             continue
         most = max(wanted[t.effect] for t in close)
-        best = _simplest([t for t in close if wanted[t.effect] == most])
+        left = [t for t in close if wanted[t.effect] == most]
+        are_weighed = all(trial.effect in known for trial in left)
+        best = max(left, key=lambda t: known[t.effect]) if are_weighed else _simplest(left)
         chosen.append(best.effect)
         rivals.append([t.effect for t in close if t.effect is not best.effect])
     return chosen, rivals

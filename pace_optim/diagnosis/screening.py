@@ -62,7 +62,7 @@ def _screened(
     """:func:`screen` in one process; the probes of each effect."""
     if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
-    probes, changes, where = _simulated(problem, now, effects, effort)
+    probes, changes, where = simulated_probes(problem, now, effects, effort)
     scores, sizes = _explained(now.error, free_columns(now), changes, _blocks(where, problem.control_dt))
     result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
@@ -91,7 +91,7 @@ def absorbed_effects(
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
-    probes, changes, _ = _simulated(problem, now, suspects, effort, beside)
+    probes, changes, _ = simulated_probes(problem, now, suspects, effort, beside)
     jacobian = free_columns(now)
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
@@ -113,7 +113,7 @@ def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return together @ together.T
 
 
-def _simulated(
+def simulated_probes(
     problem: TwinProblem,
     now: Fitted,
     effects: Sequence[type[Effect]],

@@ -12,8 +12,8 @@ from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.evenness import unevenness
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.pruning import Without
-from pace_optim.diagnosis.steps import LOOK_AHEAD, Branch, Steps, combined
-from pace_optim.diagnosis.trials import Round, Trial, near_trials
+from pace_optim.diagnosis.steps import Branch, Steps, combined
+from pace_optim.diagnosis.trials import FAR, Round, Trial, near_trials
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
 
@@ -87,7 +87,7 @@ def _at_once(steps: Steps, branch: Branch, found: Round) -> Branch | None:
     Neighbours that all lack the same hide it from each other: while one joint is tried, the others move wrongly. So
     they are judged together, along the motion that the robot then has.
     """
-    far = branch.errors.mse.sqrt() > LOOK_AHEAD * steps.floor
+    far = branch.errors.mse.sqrt() > FAR * steps.floor
     lacking = [j for j in far.nonzero()[:, 0].tolist() if found.chosen[j] is None]
     in_use = [e for e, has in zip(branch.now.model.effects, branch.now.model.has, strict=True) if bool(has.any())]
     in_use.sort(key=branch.fall_with, reverse=True)
@@ -109,7 +109,7 @@ def _guessed(steps: Steps, branch: Branch, found: Round) -> Branch | None:
 
     Where several effects of a size are missing, what one of them brings is uneven: the others cover it here and there.
     """
-    far = branch.errors.mse.sqrt() > LOOK_AHEAD * steps.floor
+    far = branch.errors.mse.sqrt() > FAR * steps.floor
     likely = [next((t.effect for t in own if t.likely), None) for own in found.trials]
     guesses = [effect if yes else None for effect, yes in zip(likely, far.tolist(), strict=True)]
     if not any(guesses) or len(branch.rounds) + 2 > steps.max_effects:
@@ -156,7 +156,7 @@ def _led_on(steps: Steps, branch: Branch, found: Round) -> tuple[Branch, Round |
     """
     first = steps.grown(branch, found)
     ahead = steps.tried(first)
-    ends, enough = first.ends(ahead), (LOOK_AHEAD * steps.floor) ** 2
+    ends, enough = first.ends(ahead), (FAR * steps.floor) ** 2
     unexplained = (first.errors.mse > enough) & (torch.tensor([end.mse for end in ends]) > enough)
     other = _next_choice(found, unexplained)
     if branch.rounds or ahead is None or other is None:

@@ -16,13 +16,10 @@ from pace_optim.diagnosis.one_round import try_effects
 from pace_optim.diagnosis.pruning import pruned, pruned_at_last
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.swapping import exchanged, swapped
-from pace_optim.diagnosis.trials import ALIKE, NEXT_FLOOR, RIVAL, Round
+from pace_optim.diagnosis.trials import ALIKE, FAR, NEXT_FLOOR, RIVAL, Round
 from pace_optim.diagnosis.trimming import fit_trimmed
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.joint_twins.problem import TwinProblem
-
-LOOK_AHEAD = 3.0
-"""A joint is far from the floor above this many times it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,9 +91,9 @@ class Steps:
             missed += torch.tensor([chosen is None for chosen in each.chosen])
         above = branch.errors.mse.sqrt() / self.floor
         # how the neighbours moved may have hidden what is missing: once they are explained, a second try
-        open_joints = missed <= (above > LOOK_AHEAD)
+        open_joints = missed <= (above > FAR)
         # beside a joint that is far from the floor, another's last tenths may come from how that one moves
-        alike = depth == 0 and bool((above <= LOOK_AHEAD).all())
+        alike = depth == 0 and bool((above <= FAR).all())
         open_joints &= above > (1.0 if alike else NEXT_FLOOR)
         untried = [e for e in self.effects if bool((branch.now.model.may_get(e) & open_joints).any())]
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
@@ -112,7 +109,7 @@ class Steps:
             self.effort[open_joints],
             self.floor[open_joints],
             self.say,
-            rough=bool(self._rough(branch.now, branch.errors.mse, LOOK_AHEAD).any()),
+            rough=bool(self._rough(branch.now, branch.errors.mse, FAR).any()),
         )
         return None if found is None else part.round_of_all(found, branch.now)
 

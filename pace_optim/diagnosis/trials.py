@@ -13,6 +13,8 @@ RIVAL = 1.10
 """Effects whose validation RMSE is within this factor of the best one's cannot be told apart from it."""
 ALIKE = 1.02
 """Of effects whose validation RMSE is within this factor of the best, the one with the fewest numbers is taken."""
+FAR = 3.0
+"""A joint is far from the floor above this many times it."""
 NEXT_FLOOR = 1.3
 """Nearer to the floor than this a further effect could not lower the error by as much as it must."""
 _BEHIND = 3.0

@@ -98,7 +98,9 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
 def ranking(
     outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
 ) -> list[dict[str, Any]]:
-    """Every effect that was refitted, those that were added first, then round by round by what they explain.
+    """Every effect that was refitted, those that the model has in the end first.
+
+    The others round by round: those that are the best on some joint, then by what they explain.
 
     Args:
         outcome: Where the search ended.
@@ -107,7 +109,7 @@ def ranking(
         order: Which of those added comes first; none goes round by round.
     """
     places = {effect.name: place for place, effect in enumerate(order)}
-    entries: list[dict[str, Any]] = []
+    entries: list[tuple[tuple, dict[str, Any]]] = []
     for depth, this in enumerate(outcome.rounds):
         effects = dict.fromkeys(t.effect for own in this.trials for t in own)
         for effect in effects:
@@ -129,30 +131,28 @@ def ranking(
                     if effect in rivals and this.chosen[j] is not None
                 }
             )
+            before, after = (_rms(getattr(t, f"mse_{side}") for t in shown) for side in ("before", "after"))
+            is_best = any(trials and trials[0].effect is effect for trials in this.trials)
+            place = places.get(effect.name, len(places)) if added else 0
             entries.append(
-                {
-                    "effect": effect.name,
-                    "round": depth + 1,
-                    "added": bool(added) and decision == "effect",
-                    "joints": [joint_names[t.joint] for t in shown],
-                    "validation_rmse_before": _rms(t.mse_before for t in shown),
-                    "validation_rmse_after": _rms(t.mse_after for t in shown),
-                    "significant": bool(good),
-                    "evidence": _evidence(shown, effect, first=depth == 0),
-                    "confounded_with": confounded,
-                    "screen_score": max(t.screen_score for t in own),
-                    "values": {joint_names[t.joint]: t.values for t in shown},
-                }
+                (
+                    (not added, place, depth, not is_best, -before / max(after, 1e-12)),
+                    {
+                        "effect": effect.name,
+                        "round": depth + 1,
+                        "added": bool(added) and decision == "effect",
+                        "joints": [joint_names[t.joint] for t in shown],
+                        "validation_rmse_before": before,
+                        "validation_rmse_after": after,
+                        "significant": bool(good),
+                        "evidence": _evidence(shown, effect, first=depth == 0),
+                        "confounded_with": confounded,
+                        "screen_score": max(t.screen_score for t in own),
+                        "values": {joint_names[t.joint]: t.values for t in shown},
+                    },
+                )
             )
-    return sorted(
-        entries,
-        key=lambda e: (
-            not e["added"],
-            places.get(e["effect"], len(places)) if e["added"] else 0,
-            e["round"],
-            -e["validation_rmse_before"] / max(e["validation_rmse_after"], 1e-12),
-        ),
-    )
+    return [entry for _, entry in sorted(entries, key=lambda each: each[0])]
 
 
 def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
