@@ -287,6 +287,17 @@ def test_the_ranking_begins_with_what_was_added_in_any_round():
     largest_first = [e["effect"] for e in ranking(outcome, ["hip"], order=[STRIBECK, GAIN])]
     assert largest_first == ["stribeck_friction", "torque_gain", "quadratic_friction"]
     assert labels(outcome.final.model, ["hip"], [GAIN, STRIBECK])[0].startswith("torque_gain")
+    # where that is not what is missing, it is told first nevertheless, and counts for nothing
+    unknown = ranking(outcome, ["hip"], "unknown", [STRIBECK, GAIN])
+    assert [e["effect"] for e in unknown] == largest_first and not any(e["added"] for e in unknown)
+
+
+def test_what_a_joint_s_trials_begin_with_is_told_before_what_leaves_less():
+    """Effects that were weighed stand in the order of their evidence."""
+    weighed = [make_trial(GAIN, 0, 2.1e-4, significant=False), make_trial(QUADRATIC, 0, 2e-4, significant=False)]
+    rounds = [Round(trials=[weighed], chosen=[None], rivals=[[]], models={})]
+    names = [e["effect"] for e in ranking(outcome_of([1e-3], [1e-3], rounds=rounds), ["hip"], "unknown")]
+    assert names == ["torque_gain", "quadratic_friction"]
 
 
 # ------------------------------------------------------------------ from a run's folder

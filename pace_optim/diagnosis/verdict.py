@@ -14,7 +14,7 @@ from pace_optim.diagnosis.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, counts, near_floor, real_effects
-from pace_optim.diagnosis.trials import Trial
+from pace_optim.diagnosis.trials import Round, Trial
 
 EXPLAINED = 0.5
 """Less than this part of the error above the floor, and the effects found are not what is missing."""
@@ -109,50 +109,46 @@ def ranking(
         order: Which of those added comes first; none goes round by round.
     """
     places = {effect.name: place for place, effect in enumerate(order)}
+    model = outcome.final.model
     entries: list[tuple[tuple, dict[str, Any]]] = []
     for depth, this in enumerate(outcome.rounds):
-        effects = dict.fromkeys(t.effect for own in this.trials for t in own)
-        for effect in effects:
-            own = [t for trials in this.trials for t in trials if t.effect is effect]
-            final = outcome.final.model
-            kept = (
-                final.has[final.effects.index(effect)].tolist()
-                if effect in final.effects
-                else [False] * final.has.shape[1]
-            )
-            added = [j for j, chosen in enumerate(this.chosen) if chosen is effect and kept[j]]
-            good = [t for t in own if t.significant]
-            shown = [t for t in own if t.joint in added] or good or own
-            confounded = sorted(
-                {other.name for j in added for other in this.rivals[j]}
-                | {
-                    this.chosen[j].name  # type: ignore[union-attr]
-                    for j, rivals in enumerate(this.rivals)
-                    if effect in rivals and this.chosen[j] is not None
-                }
-            )
-            before, after = (_rms(getattr(t, f"mse_{side}") for t in shown) for side in ("before", "after"))
-            is_best = any(trials and trials[0].effect is effect for trials in this.trials)
+        for effect in dict.fromkeys(t.effect for own in this.trials for t in own):
+            kept = model.has[model.effects.index(effect)].tolist() if effect in model.effects else []
+            added = [j for j, yes in enumerate(kept) if yes and this.chosen[j] is effect]
+            entry = {
+                "effect": effect.name,
+                "round": depth + 1,
+                "added": bool(added) and decision == "effect",
+                **_told(this, effect, added, joint_names, first=depth == 0),
+            }
+            is_best = any(own and own[0].effect is effect for own in this.trials)
+            ratio = entry["validation_rmse_before"] / max(entry["validation_rmse_after"], 1e-12)
             place = places.get(effect.name, len(places)) if added else 0
-            entries.append(
-                (
-                    (not added, place, depth, not is_best, -before / max(after, 1e-12)),
-                    {
-                        "effect": effect.name,
-                        "round": depth + 1,
-                        "added": bool(added) and decision == "effect",
-                        "joints": [joint_names[t.joint] for t in shown],
-                        "validation_rmse_before": before,
-                        "validation_rmse_after": after,
-                        "significant": bool(good),
-                        "evidence": _evidence(shown, effect, first=depth == 0),
-                        "confounded_with": confounded,
-                        "screen_score": max(t.screen_score for t in own),
-                        "values": {joint_names[t.joint]: t.values for t in shown},
-                    },
-                )
-            )
+            entries.append(((not added, place, depth, not is_best, -ratio), entry))
     return [entry for _, entry in sorted(entries, key=lambda each: each[0])]
+
+
+def _told(
+    this: Round, effect: type[Effect], added: Sequence[int], joint_names: Sequence[str], first: bool
+) -> dict[str, Any]:
+    """What a round tells of an effect: on the joints that have it in the end, or else where it counts, or anywhere."""
+    own = [t for trials in this.trials for t in trials if t.effect is effect]
+    good = [t for t in own if t.significant]
+    shown = [t for t in own if t.joint in added] or good or own
+    confounded = {other.name for j in added for other in this.rivals[j]}
+    for chosen, rivals in zip(this.chosen, this.rivals, strict=True):
+        if chosen is not None and effect in rivals:
+            confounded.add(chosen.name)
+    return {
+        "joints": [joint_names[t.joint] for t in shown],
+        "validation_rmse_before": _rms(t.mse_before for t in shown),
+        "validation_rmse_after": _rms(t.mse_after for t in shown),
+        "significant": bool(good),
+        "evidence": _evidence(shown, effect, first),
+        "confounded_with": sorted(confounded),
+        "screen_score": max(t.screen_score for t in own),
+        "values": {joint_names[t.joint]: t.values for t in shown},
+    }
 
 
 def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
