@@ -10,12 +10,12 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.acceptance import FIRST_RATIO, BlockErrors
 from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.evidence import log_evidence
 from pace_optim.diagnosis.far_starts import far_starts
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.trials import ALIKE, FAR, RIVAL, Round, Trial
 from pace_optim.diagnosis.validation import validation_errors
+from pace_optim.diagnosis.weighing import log_evidence
 from pace_optim.joint_twins.problem import TwinProblem
 
 SCREEN_THRESHOLD = 0.03
