@@ -11,6 +11,8 @@ from multiprocessing.queues import SimpleQueue
 
 import torch
 
+from pace_optim.diagnosis.processes import end_with_parent
+
 
 @contextmanager
 def pinned_pool(workers: int) -> Iterator[Pool]:
@@ -29,5 +31,6 @@ def pinned_pool(workers: int) -> Iterator[Pool]:
 
 
 def _start(shares: SimpleQueue[list[int]]) -> None:
+    end_with_parent()
     os.sched_setaffinity(0, shares.get())
     torch.set_num_threads(1)

@@ -149,7 +149,7 @@ class _Other:
 
 
 def _run(work: Callable, share: list, processors: set[int], sender: Connection) -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)  # where the first process dies, this one does too
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process is interrupted and ends the others
     os.sched_setaffinity(0, processors)
     torch.set_num_threads(1)  # threads of the first process did not come along
@@ -158,6 +158,12 @@ def _run(work: Callable, share: list, processors: set[int], sender: Connection) 
     except Exception as error:
         content = _dumped(_portable(error))
     sender.send_bytes(content)
+
+
+def end_with_parent() -> None:
+    """Let this process die where the one that started it dies; on Linux only."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _dumped(value: object) -> bytes:
