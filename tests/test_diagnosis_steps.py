@@ -293,3 +293,11 @@ def test_of_two_effects_that_are_as_good_the_one_with_fewer_numbers_is_taken(ela
         [[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]], [{}]
     )
     assert {taken, other} == {BACKLASH, ELASTICITY} and taken is chosen
+
+
+def test_a_rival_that_is_chosen_makes_the_one_before_its_rival_and_is_none_of_its_own():
+    this = Round(trials=[[], [], []], chosen=[GAIN, GAIN, None], rivals=[[STRIBECK, QUADRATIC], [STRIBECK], []])
+    other = this.choosing([STRIBECK, QUADRATIC, GAIN])
+    assert other.chosen == [STRIBECK, QUADRATIC, GAIN]
+    assert other.rivals == [[QUADRATIC, GAIN], [STRIBECK], []]
+    assert this.chosen == [GAIN, GAIN, None] and this.rivals == [[STRIBECK, QUADRATIC], [STRIBECK], []]

@@ -96,7 +96,7 @@ def _at_once(steps: Steps, branch: Branch, found: Round) -> Branch | None:
         while joints:
             steps.say(f"trying {effect.name} on {len(joints)} more joint{'' if len(joints) == 1 else 's'} at once")
             chosen = [effect if j in joints else old for j, old in enumerate(found.chosen)]
-            grown = steps.grown(branch, replace(found, chosen=chosen))
+            grown = steps.grown(branch, found.choosing(chosen))
             trials = _judged_again(steps, effect, joints, found, grown)
             if all(trial.significant for trial in trials.values()):
                 return replace(grown, rounds=[*grown.rounds[:-1], grown.rounds[-1].with_trials(trials)])
@@ -116,7 +116,7 @@ def _guessed(steps: Steps, branch: Branch, found: Round) -> Branch | None:
         return None
     wanted = list(dict.fromkeys(effect for effect in guesses if effect is not None))
     steps.say(f"looking beyond what is likely: {', '.join(effect.name for effect in wanted)}")
-    one = steps.grown(branch, replace(found, chosen=guesses))
+    one = steps.grown(branch, found.choosing(guesses))
     ahead = steps.tried(one)
     if ahead is None or not any(ahead.chosen):
         return None
@@ -171,7 +171,7 @@ def _led_on(steps: Steps, branch: Branch, found: Round) -> tuple[Branch, Round |
     if not any(better):
         return first, ahead
     chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
-    taken = steps.grown(branch, replace(found, chosen=chosen))
+    taken = steps.grown(branch, found.choosing(chosen))
     return taken, beyond if _is_same(taken, way) else steps.tried(taken)
 
 
@@ -188,4 +188,4 @@ def _next_choice(found: Round, unexplained: torch.Tensor) -> Round | None:
         if (best := found.chosen[j]) is not None:
             near = [trial.effect for trial in near_trials(found.trials[j], best) if trial.significant]
             chosen[j] = near[0] if near else best
-    return None if chosen == found.chosen else replace(found, chosen=chosen)
+    return None if chosen == found.chosen else found.choosing(chosen)

@@ -53,7 +53,7 @@ def swapped(
     for j, effect in chosen.items():
         (old, this), here = exchanges[effect][j], torch.arange(model.num_joints) == j
         model, physical = exchanged(model, physical, here, [old], models[effect], effect, now.model.size)
-        _note(this, j, old, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
+        this.exchange(j, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
     return fit_side_by_side(problem.in_windows(), [Fitted.start(model, physical)], max_iteration=6)[0]
 
 
@@ -137,10 +137,3 @@ def _choose(
     used = {effect: int(has.sum()) for effect, has in zip(model.effects, model.has, strict=True)}
     best = {j: min(options, key=lambda e: (-wanted[e], -used.get(e, 0), total[e])) for j, options in near.items()}
     return {j: effect for j, effect in best.items() if j in exchanges.get(effect, {})}
-
-
-def _note(this: Round, joint: int, old: type[Effect], new: type[Effect], tie: bool) -> None:
-    """Write the exchange into the round that had chosen the old effect."""
-    this.chosen[joint] = new
-    others = [effect for effect in this.rivals[joint] if effect is not new]
-    this.rivals[joint] = [*others, old] if tie else others

@@ -67,6 +67,20 @@ class Round:
         """The same, whose choices can change by themselves."""
         return replace(self, chosen=list(self.chosen), rivals=[list(each) for each in self.rivals])
 
+    def choosing(self, chosen: Sequence[type[Effect] | None]) -> Round:
+        """The same with other choices: where joints chose a rival, what they had is a rival in turn."""
+        result = self.copy()
+        for j, (old, new) in enumerate(zip(self.chosen, chosen, strict=True)):
+            if new is not old:
+                result.exchange(j, new, tie=new in self.rivals[j])
+        return result
+
+    def exchange(self, joint: int, new: type[Effect] | None, tie: bool) -> None:
+        """Choose another effect on a joint; with ``tie`` what it had becomes its rival."""
+        old, others = self.chosen[joint], [effect for effect in self.rivals[joint] if effect is not new]
+        self.chosen[joint] = new
+        self.rivals[joint] = others if old is None or not tie else [*others, old]
+
     def with_trials(self, judged: Mapping[int, Trial]) -> Round:
         """The same with a joint's trial of an effect in place of what it was, best first."""
         trials = [list(each) for each in self.trials]
