@@ -96,7 +96,7 @@ def try_effects(
             )
             trials[j].append(trial.judged(errors, after, tried, first))
         keep[effect] = chosen
-    contenders = _contenders(trials, floor)
+    contenders, evidence = _contenders(trials, floor), {}
     if weighed := list(dict.fromkeys(effect for own in contenders for effect in own)):
         say(f"weighing {_names(weighed)}")
         evidence = log_evidence(problem, {effect: keep[effect] for effect in weighed}, effects, effort)
@@ -246,7 +246,8 @@ def _choose(
         are_weighed = all(trial.effect in known for trial in left)
         best = max(left, key=lambda t: known[t.effect]) if are_weighed else _simplest(left)
         chosen.append(best.effect)
-        rivals.append([t.effect for t in close if t.effect is not best.effect])
+        most_alike = RIVAL**2 * best.mse_after
+        rivals.append([t.effect for t in close if t.effect is not best.effect and t.mse_after <= most_alike])
     return chosen, rivals
 
 
