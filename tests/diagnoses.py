@@ -49,13 +49,14 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         entry("presliding_friction", 4.2e-4, significant=known, confounded_with=["stribeck_friction"]),
         entry("quadratic_friction", 3.9e-3, joints=["knee"]),
     ]
-    variables = {"q": 0.2, "v": 0.1, "q·sgn v": 0.8, "|τ|·sgn v": 0.3, "τ": 0.1, "t": -0.1}
+    explained = {"torque_over_position": 0.2, "friction_over_position": 0.8, "torque_over_time": -0.1}
     curve = {"at": [-0.4, -0.2, 0.0, 0.2, 0.4], "torque": [-0.2, 0.1, 0.0, -0.1, 0.2]}
     carried = {
-        "r2": variables,
-        "best": "q·sgn v",
-        "best_label": "position × sign of speed [rad]",
-        "sentence": "80 % of it follows position × sign of speed.",
+        "explained": explained,
+        "best": "friction_over_position",
+        "best_label": "position [rad]",
+        "kind": "friction",
+        "sentence": "a curve of friction over position explains 80 % of it.",
         "curve": curve,
     }
     return {
@@ -84,7 +85,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         "physics_dt": 0.00125,
         "ladder": [{"model": "base model", "validation_rmse": 4.3e-3}]
         + [{"model": "stribeck_friction", "validation_rmse": 4e-4}] * known,
-        "error_map": {"sentence": "It follows q·sgn v.", "joints": dict.fromkeys(JOINTS, carried)},
+        "error_map": {"sentence": "It goes with the position.", "joints": dict.fromkeys(JOINTS, carried)},
         "wall_time_s": 12.0,
     }
 

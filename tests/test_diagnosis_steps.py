@@ -3,17 +3,14 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
-from diagnoses import errors_of, hidden_run, joint_alone, make_trial, outcome_of, with_effects
+from diagnoses import errors_of, joint_alone, make_trial, outcome_of, with_effects
 from problems import DT
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import next_experiment, one_for_several, one_round, search, some_joints, swapping
-from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.descent import fit_side_by_side
-from pace_optim.diagnosis.error_map import error_map
 from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
@@ -142,20 +139,6 @@ def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
     fitted.jacobian.normal_()  # as rough as a narrow step sees joints that stick
     rough = absorbed_effects(bench.twins.with_physics_dt(DT), fitted, effects, torch.tensor([5.0], dtype=torch.float64))
     assert [effect.name for effect in rough] == ["measurement_delay", "com_offset"]
-
-
-def test_an_error_map_names_the_variable_that_friction_depends_on(tmp_path):
-    run = hidden_run(tmp_path, "friction_map", seed=1, duration=5.0)
-    problem = run.problem
-    twins, base, _ = fit_base(problem, problem.space.to_physical(problem.space.start))
-    found = error_map(twins, base, torch.zeros(1))
-    joint = found["joints"]["servo"]
-    assert joint["best"] == "q·sgn v" and joint["r2"]["q·sgn v"] > 0.15
-    assert "position, times the sign of speed" in found["sentence"]
-    # friction resists: the torque that is missing has the other sign than speed
-    assert np.mean(joint["curve"]["torque"]) == pytest.approx(0.0, abs=2.0)
-    assert len(joint["curve"]["at"]) == len(joint["curve"]["torque"]) > 10
-    assert error_map(twins, base, torch.ones(1)) == {}
 
 
 @pytest.fixture

@@ -13,6 +13,13 @@ from pace_actuators.effects import EffectCfg, get_effect
 MOVING = chirp(1.0, high=8.0, amplitude=0.7)
 HEAVY = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.33}
 FAST = ("joint_elasticity", "backlash", "presliding_friction", "mount_compliance", "creeping_friction", "soft_friction")
+
+
+def jagged(count, reach, effort):
+    """A curve that goes up and down between its knots."""
+    return {f"effort_{i}": effort * (-1) ** i for i in range(count)} | {"reach": reach}
+
+
 ENERGY = {
     "stribeck_friction": [{"effort": 4.0, "velocity": 0.01}, {"effort": 1.0, "velocity": 0.3}],
     "load_dependent_friction": [{"coefficient": 0.5}, {"coefficient": 0.05}],
@@ -21,16 +28,30 @@ ENERGY = {
     "presliding_friction": [{"stiffness": k} for k in (10.0, 300.0, 3000.0)],
     "creeping_friction": [{"velocity": v} for v in (1e-4, 0.01, 0.5)],
     "soft_friction": [{"time_constant": t} for t in (1e-3, 0.02, 0.2)],
+    "friction_over_speed": [jagged(8, 5.0, effort) for effort in (0.3, -10.0)],
+    "friction_over_position": [
+        {f"effort_{i}": e * (-1) ** i for i in range(17)} | {"reach": 1.5} for e in (0.3, -10.0)
+    ],
+    "friction_over_load": [jagged(8, 10.0, effort) for effort in (0.3, -10.0)],
     "joint_elasticity": [{"stiffness": k, "damping": c} for k in (80.0, 1e3, 2e4) for c in (0.0, 0.5, 20.0)],
     "backlash": [{"gap": g, "stiffness": k, "damping": 0.0} for g in (0.004, 0.05) for k in (300.0, 2e4)],
 }
 """Friction and transmission effects that only store or spend energy; the others are torques of their own."""
 
 
+def at_knot(name, parameter):
+    """Whether it is one of a curve's values."""
+    return get_effect(name).free_form and parameter.null is not None
+
+
 def bounds_corners(name):
-    """All combinations of lower and upper bounds, {parameter: (corners,)}."""
+    """All combinations of lower and upper bounds, {parameter: (corners,)}; of a curve's values flat and jagged ones."""
     parameters = get_effect(name).parameters
-    corners = list(itertools.product(*((p.lower, p.upper) for p in parameters)))
+    corners = list(itertools.product(*((p.lower, p.upper) for p in parameters if not at_knot(name, p))))
+    if get_effect(name).free_form:
+        count = sum(at_knot(name, p) for p in parameters)
+        curves = [[10.0 * sign * (-1) ** (i * jagged) for i in range(count)] for sign in (-1, 1) for jagged in (0, 1)]
+        corners = [(*curve, *shape) for curve in curves for shape in corners]
     return {f"{name}.{p.name}": [c[i] for c in corners] for i, p in enumerate(parameters)}, len(corners)
 
 

@@ -19,6 +19,10 @@ controller, drive, friction, transmission; `model` changes the rigid body, `reco
 `joint_elasticity` and `backlash`, give a joint one: a backlash has an elasticity of its own. Friction then acts on the
 motor, other torques on the link.
 
+Of the last six each is a curve of any form, straight from knot to knot, at `center + reach · knot`, and constant beyond
+the last. They say what is missing and not why: `scripts/diagnose.py` does not look for them, but holds them against the
+effects that it found, and takes one where none of them explains the error.
+
 This page is made by `python -m pace_actuators.effects > docs/effects.md`. An effect of your own:
 [your_own_effect.md](your_own_effect.md).
 
@@ -69,7 +73,7 @@ def page() -> str:
     effects = [get_effect(name) for name in available_effects()]
     effects = [effect for effect in effects if effect.__module__.startswith("pace_actuators.")]
     parts = [_HEAD, *(_row(f"`{e.name}`", e.stage, f"`{e.equation}`", e.source) for e in effects)]
-    parts += [_PARAMETERS, *(_parameter(e, p) for e in effects for p in e.parameters)]
+    parts += [_PARAMETERS, *(_parameter(e, p) for e in effects for p in e.parameters if not _is_told(e, p))]
     parts += [_LOOKS, *(_row(f"`{e.name}`", e.looks, e.separates) for e in effects)]
     twins = [
         _row(f"`{e.name}`", ", ".join(f"`{like}`" for like in (*e.twins, e.absorbed_by) if like), e.separates)
@@ -82,7 +86,16 @@ def page() -> str:
 def _parameter(effect: type[Effect], p: EffectParameter) -> str:
     bounds = f"{p.lower:g} to {p.upper:g}" + (", log" if p.scale == "log" else "")
     null = "none" if p.null is None else f"{p.null:g}"
-    return _row(f"`{effect.name}`", f"`{p.name}`", p.meaning, p.unit, bounds, null)
+    name, meaning = f"`{p.name}`", p.meaning
+    if effect.free_form and p is effect.parameters[0]:
+        last = sum(q.null is not None for q in effect.parameters) - 1
+        name, meaning = f"`{p.name}` … `effort_{last}`", "f at each knot"
+    return _row(f"`{effect.name}`", name, meaning, p.unit, bounds, null)
+
+
+def _is_told(effect: type[Effect], p: EffectParameter) -> bool:
+    """Whether the row of a curve's first value tells of it too."""
+    return effect.free_form and p.null is not None and p is not effect.parameters[0]
 
 
 def _row(*cells: str) -> str:

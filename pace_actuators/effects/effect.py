@@ -103,6 +103,8 @@ class Effect:
     smooths_friction: ClassVar[bool] = False
     """Whether it only smooths Coulomb friction at standstill, as simulators do: a little of it alone is nothing
     missing."""
+    free_form: ClassVar[bool] = False
+    """Whether it is a curve of any form: it says what is missing and not why, and no diagnosis looks for it."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     absorbed_by: ClassVar[str] = ""

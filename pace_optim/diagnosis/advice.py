@@ -33,7 +33,8 @@ def advise(
     ]
     if decision == "unknown":
         result.append(
-            "None of the known effects explains the error. The error map says which variable carries it: write an "
-            "effect of your own (docs/your_own_effect.md) and diagnose again with --effects module:Class."
+            "None of the known effects explains the error. The error map says which variable carries it, and how: find "
+            "what it is, write an effect of your own (docs/your_own_effect.md) and diagnose again with --effects "
+            "module:Class."
         )
     return result

@@ -15,7 +15,7 @@ from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
 from pace_optim.diagnosis.denormals import flushed_denormals
-from pace_optim.diagnosis.error_map import error_map
+from pace_optim.diagnosis.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.model import whole_values
 from pace_optim.diagnosis.one_delay import hold_late_joints
 from pace_optim.diagnosis.own_motion import OwnMotion
@@ -25,7 +25,7 @@ from pace_optim.diagnosis.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.shares import DOMINANT, shares
 from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, stand_ins, varying
+from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, curves_in, stand_ins, varying
 from pace_optim.diagnosis.verdict import explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.fit_result import FitResult
@@ -50,6 +50,13 @@ class Findings:
     ``unknown`` all that lower the error, though they are not what is missing."""
     shares: dict[type[Effect], float]
     """How much of what they explain is due to each, in the same order."""
+    curves: Curves | None = None
+    """Which variable carries what is missing; ``None`` where the effects found leave little."""
+
+    @property
+    def free_form(self) -> bool:
+        """Whether curves stand where an effect is not known."""
+        return bool(curves_in(self.outcome.final.model).any())
 
     @property
     def added(self) -> list[str]:
@@ -97,6 +104,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         added=found.added,
         paying=found.paying,
         shares={effect.name: share for effect, share in found.shares.items()},
+        free_form=found.free_form,
         ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
         joints=_joints(found, problem),
         data=found.data.sentences,
@@ -106,7 +114,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
         ladder=_ladder(found),
-        error_map=error_map(found.outcome.problem, found.outcome.final, found.data.floor),
+        error_map=error_map(found.curves, found.outcome, problem.joint_names),
         wall_time_s=time.monotonic() - begin,
     )
     diagnosis.save(folder)
@@ -143,7 +151,7 @@ def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[
     """What is tried: all registered effects and the user's, or only the user's."""
     own = [get_effect(name) for name in extra]
     every = [] if only else [get_effect(name) for name in available_effects()]
-    return list(dict.fromkeys([*every, *own]))
+    return list(dict.fromkeys([*(effect for effect in every if not effect.free_form), *own]))
 
 
 @flushed_denormals()
@@ -180,6 +188,8 @@ def search_effects(
     follow = OwnMotion(problem=problem, candidates=candidates, enough=floor, say=say).follow
     outcome = add_effects(twins, base, candidates, effort, floor, max_effects, say, follow)
     share(outcome)
+    if (curves := fit_curves(outcome, data.floor, say)) is not None:
+        take_curves(outcome, curves)
     decision, explained = verdict(outcome, data.floor)
     if decision != "unknown":
         keep_on(outcome, explained_joints(outcome, data.floor) & (decision == "effect"))
@@ -192,6 +202,7 @@ def search_effects(
         explained=explained,
         paying=labels(outcome.final.model, problem.joint_names, list(each)),
         shares=each,
+        curves=curves,
     )
 
 
@@ -207,11 +218,10 @@ def summary_of(found: Findings, problem: Problem) -> str:
             f"floor of noise and numerics {floor:.3g} mrad."
         )
     if found.verdict == "unknown":
-        shares = f"what pays, {', '.join(found.paying)}, explains" if found.paying else "the effects tried explain"
         text = (
             f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
-            f"mrad, the floor {floor:.3g} mrad, and {shares} {100 * max(0.0, found.explained):.0f} % of what lies "
-            "between."
+            f"mrad, the floor {floor:.3g} mrad, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
+            "what lies between."
         )
         return " ".join([text, *stand_ins(*about), *varying(*about)])
     summary = (
@@ -221,6 +231,15 @@ def summary_of(found: Findings, problem: Problem) -> str:
     if after > UNKNOWN_RATIO * floor:
         summary += " Something else is missing too, which no known effect explains."
     return " ".join([summary, *varying(*about)])
+
+
+def _what_pays(found: Findings) -> str:
+    """What lowers the error without being what is missing."""
+    if not found.paying:
+        return "the effects tried explain"
+    if found.free_form:
+        return f"a curve in its place, {', '.join(found.paying)}, explains"
+    return f"what pays, {', '.join(found.paying)}, explains"
 
 
 def _missing(found: Findings) -> str:

@@ -29,6 +29,8 @@ class Diagnosis:
     verdict is ``effect``."""
     paying: list[str] = field(default_factory=list)
     """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
+    free_form: bool = False
+    """Whether curves of any form are among those in ``paying``, where no effect is known."""
     shares: dict[str, float] = field(default_factory=dict)
     """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
     ranking: list[dict[str, Any]]
@@ -50,7 +52,8 @@ class Diagnosis:
     ladder: list[dict[str, Any]] = field(default_factory=list)
     """Validation RMSE of all joints from the base model to the last effect [rad]."""
     error_map: dict[str, Any] = field(default_factory=dict)
-    """Which variable carries what is left, joint by joint."""
+    """Which variable carries what is missing, on each joint whose error effects do not explain: what part of it each
+    curve explains by itself, and the best curve."""
     wall_time_s: float = 0.0
 
     def save(self, folder: str | Path) -> Path:

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 import torch
 
+from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
 
+EXPLAINED = 0.5
+"""Less than this part of the error above the floor, and the effects found are not what is missing."""
 UNKNOWN_RATIO = 3.0
 """An unexplained error above this many times the floor is a finding of its own."""
 DOMINANT = 0.9
@@ -38,14 +41,20 @@ def near_floor(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
 
 def real_effects(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Effects that do not stand in for something else, (effects, n) bool."""
-    return outcome.final.model.has & ~_at_bounds(outcome) & ~_uneven(outcome, floor)
+    model = outcome.final.model
+    return model.has & ~curves_in(model) & ~_at_bounds(outcome) & ~_uneven(outcome, floor)
+
+
+def curves_in(model: JointModel) -> torch.Tensor:
+    """Curves of any form that stand where an effect is not known, (effects, n) bool."""
+    return model.has & torch.tensor([effect.free_form for effect in model.effects], dtype=torch.bool)[:, None]
 
 
 def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    """Effects that count as missing, (effects, n) bool: not those that smooth friction where it hardly shows."""
+    """Effects that count as missing, (effects, n) bool: no curves, no smoothing of friction where it hardly shows."""
     model = outcome.final.model
     smooths = torch.tensor([effect.smooths_friction for effect in model.effects], dtype=torch.bool)[:, None]
-    return model.has & ~(smooths & (outcome.base_errors.mse.sqrt() <= UNKNOWN_RATIO * floor))
+    return model.has & ~curves_in(model) & ~(smooths & (outcome.base_errors.mse.sqrt() <= UNKNOWN_RATIO * floor))
 
 
 def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
@@ -59,7 +68,7 @@ def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> li
 
 def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects of the right form whose size differs between recordings, in a sentence."""
-    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
+    said = _said(outcome, names, much_left(outcome, floor) & (outcome.unevenness >= VARYING))
     return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
 
 
@@ -73,15 +82,16 @@ def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
 
 
 def _at_bounds(outcome: Outcome) -> torch.Tensor:
-    return outcome.final.model.at_bounds(outcome.final.x)
+    model = outcome.final.model
+    return model.at_bounds(outcome.final.x) & ~curves_in(model)
 
 
 def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     share = outcome.unevenness
-    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
+    return much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
 
 
-def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+def much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
     before, after = above_floor(outcome, floor)
     return (after > (1 - DOMINANT) * before) & ~near_floor(outcome, floor)

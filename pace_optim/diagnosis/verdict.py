@@ -13,11 +13,17 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.model import JointModel
 from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, above_floor, counts, near_floor, real_effects
+from pace_optim.diagnosis.stand_ins import (
+    EXPLAINED,
+    UNKNOWN_RATIO,
+    above_floor,
+    counts,
+    curves_in,
+    near_floor,
+    real_effects,
+)
 from pace_optim.diagnosis.trials import Round, Trial
 
-EXPLAINED = 0.5
-"""Less than this part of the error above the floor, and the effects found are not what is missing."""
 SHARE = 0.2
 """Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
 
@@ -35,7 +41,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
         good = explained_joints(outcome, floor)
         if float(excess[good].sum()) >= SHARE * float(excess.sum()):
             return "effect", explained
-    if float((outcome.final_errors.mse.sqrt() / floor).max()) > UNKNOWN_RATIO:
+    far = float((outcome.final_errors.mse.sqrt() / floor).max()) > UNKNOWN_RATIO
+    if far or bool(curves_in(outcome.final.model).any()):
         return "unknown", explained
     return "nothing_missing", explained
 

@@ -73,12 +73,31 @@ class ReferencePath:
         Args:
             armature: (n,) [kg m²].
         """
-        q = self.position
-        span = max(1, min(round(_SPAN / self.control_dt), (len(q) - 1) // 2))
+        return self.effort(armature).square().mean(dim=(0, 1)).sqrt()
+
+    def effort(self, armature: torch.Tensor) -> torch.Tensor:
+        """Torque that moves each joint and holds its load, (T', R, n) [N m]; the first and last steps are left out.
+
+        Args:
+            armature: (n,) [kg m²].
+        """
+        q, span = self.position, self._span
         acceleration = (q[2 * span :] - 2 * q[span:-span] + q[: -2 * span]) / (span * self.control_dt) ** 2
         inertia, torque = (each[span : span + len(acceleration)] for each in (self.feel.inertia, self.feel.torque))
-        effort = (inertia + armature) * acceleration - torque
-        return effort.square().mean(dim=(0, 1)).sqrt()
+        return (inertia + armature) * acceleration - torque
+
+    def speed(self) -> torch.Tensor:
+        """At the same steps, (T', R, n) [rad/s]."""
+        return (self.position[2 * self._span :] - self.position[: -2 * self._span]) / (2 * self._span * self.control_dt)
+
+    def load(self) -> torch.Tensor:
+        """What the drives are told of their load at the same steps, (T', R, n) [N m]."""
+        return self.feel.load[self._span : len(self.position) - self._span]
+
+    @property
+    def _span(self) -> int:
+        """Steps over which differences are taken."""
+        return max(1, min(round(_SPAN / self.control_dt), (len(self.position) - 1) // 2))
 
     def on_joints(self, joints: Sequence[int]) -> ReferencePath:
         """Of some of the joints, by index."""

@@ -21,8 +21,6 @@ _PARTLY = 0.8
 """Effects that explain less than this part of the error above the floor are not all that is missing."""
 _SHOWN = 10
 """Effects in the chart, at most."""
-_VARIABLES = 6
-"""Variables of an error map in the table, at most."""
 _COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py )")
 
 
@@ -46,7 +44,9 @@ def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
     """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content["added"] or content.get("paying", []), content.get("explained", 1.0)
-    if content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
+    if content.get("free_form"):
+        heading = "Something is missing that is none of the known effects; a curve takes its place"
+    elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
     add = ""
     if effects and set(effects) == set(had):
@@ -176,36 +176,41 @@ def _joints(content: dict[str, Any]) -> str:
 
 
 def _error_map(content: dict[str, Any]) -> str:
-    """Which variable carries what is left; only where no known effect explains it."""
+    """Which variable carries what is missing; only where no known effect explains it."""
     found = content.get("error_map") or {}
     if content["verdict"] != "unknown" or not found.get("joints"):
         return ""
     joints = found["joints"]
-    variables = list(next(iter(joints.values()))["r2"])[:_VARIABLES]
+    curves = list(next(iter(joints.values()))["explained"])
     rows = [
-        [f"<b>{esc(name)}</b>", *(f"{100 * max(0.0, joint['r2'][v]):.0f} %" for v in variables), esc(joint["sentence"])]
+        [
+            f"<b>{esc(name)}</b>",
+            *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves),
+            esc(joint["sentence"]),
+        ]
         for name, joint in joints.items()
     ]
-    worst = max(joints, key=lambda name: joints[name]["r2"][joints[name]["best"]])
-    curve = joints[worst]["curve"]
+    worst = max(joints, key=lambda name: joints[name]["explained"][joints[name]["best"]])
+    best = joints[worst]
     trace = {
         "type": "scatter",
         "mode": "lines+markers",
         "name": worst,
-        "x": curve["at"],
-        "y": curve["torque"],
+        "x": best["curve"]["at"],
+        "y": best["curve"]["torque"],
         "line": {"color": "var(--simulated)", "width": 2},
         "hovertemplate": "%{x:.3g}: %{y:.3g} N m<extra></extra>",
     }
     layout = {
-        "xaxis": {"title": {"text": joints[worst]["best_label"]}},
-        "yaxis": {"title": {"text": f"missing torque of {worst} [N m]"}},
+        "xaxis": {"title": {"text": best["best_label"]}},
+        "yaxis": {"title": {"text": f"missing {best['kind']} of {worst} [N m]"}},
         "showlegend": False,
     }
     return (
-        "<h3>What carries the error<small>part of the missing torque that a map of one variable explains</small></h3>"
+        "<h3>What carries the error<small>part of the squared error above the floor that a curve of any form explains "
+        "by itself, on top of the base model</small></h3>"
         f"{bullets([found['sentence']], 'notes')}{figure('error-map', [trace], layout, height=300)}"
-        f"{table(['joint', *variables, ''], rows)}"
+        f"{table(['joint', *(in_words(curve) for curve in curves), ''], rows)}"
     )
 
 
