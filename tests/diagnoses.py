@@ -85,7 +85,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         "physics_dt": 0.00125,
         "ladder": [{"model": "base model", "validation_rmse": 4.3e-3}]
         + [{"model": "stribeck_friction", "validation_rmse": 4e-4}] * known,
-        "error_map": {"sentence": "It goes with the position.", "joints": dict.fromkeys(JOINTS, carried)},
+        "error_map": dict.fromkeys(JOINTS, carried),
         "wall_time_s": 12.0,
     }
 

@@ -93,12 +93,11 @@ def curves(fitted):
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
-    said = error_map(curves, ended(fitted, 1.0), ["servo"])
-    joint = said["joints"]["servo"]
+    joint = error_map(curves, ended(fitted, 1.0), ["servo"])["servo"]
     assert joint["best"] == "friction_over_position" and joint["best_label"] == "position [rad]"
     others = [part for name, part in joint["explained"].items() if name != joint["best"]]
     assert joint["explained"]["friction_over_position"] > 0.9 and max(others) < 0.5
-    assert "servo: a curve of friction over position explains" in said["sentence"] and "mrad" in said["sentence"]
+    assert joint["sentence"].startswith("a curve of friction over position explains 9") and "mrad" in joint["sentence"]
     assert len(joint["curve"]["at"]) == len(joint["curve"]["torque"]) == 17
     assert error_map(None, ended(fitted, 1.0), ["servo"]) == {}
 
@@ -111,7 +110,6 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     assert 0.5 * 0.04 < left < 0.5 * 0.3
     refitted = "pace_optim.diagnosis.free_curves.SomeJoints.refitted"
     monkeypatch.setattr(refitted, lambda *_: (curves.models, curves.errors))
-    monkeypatch.setattr("pace_optim.diagnosis.stand_ins.DOMINANT", 0.99)
     found = fit_curves(outcome, FLOOR)
     assert found.instead.tolist() == [instead]
     take_curves(outcome, found)
@@ -129,8 +127,7 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     )
 
 
-def test_no_curve_is_fitted_where_effects_leave_little(fitted):
-    assert fit_curves(ended(fitted, 0.09), FLOOR) is None
+def test_no_curve_is_fitted_near_the_floor(fitted):
     near = (fitted[2].mse.sqrt() / 2.5).double()
     assert fit_curves(ended(fitted, 1.0), near) is None
 

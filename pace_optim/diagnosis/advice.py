@@ -33,7 +33,7 @@ def advise(
     ]
     if decision == "unknown":
         result.append(
-            "None of the known effects explains the error. The error map says which variable carries it, and how: find "
+            "None of the known effects explains the error. The report says which variable carries it, and how: find "
             "what it is, write an effect of your own (docs/your_own_effect.md) and diagnose again with --effects "
             "module:Class."
         )

@@ -15,7 +15,7 @@ from pace_optim.diagnosis.fitted import Fitted
 from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.some_joints import SomeJoints
-from pace_optim.diagnosis.stand_ins import EXPLAINED, above_floor, much_left, near_floor
+from pace_optim.diagnosis.stand_ins import EXPLAINED, above_floor, near_floor
 from pace_optim.joint_twins.problem import TwinProblem
 
 _BETTER = 0.5
@@ -27,7 +27,7 @@ _WORTH_A_WORD = 0.1
 
 @dataclass(kw_only=True, eq=False)
 class Curves:
-    """Each curve by itself on top of the base model, on the joints where effects leave much."""
+    """Each curve by itself on top of the base model, on the joints that effects leave far from the floor."""
 
     joints: torch.Tensor
     """On which joints they were fitted, (n,) bool."""
@@ -58,8 +58,7 @@ def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None]
         floor: Of each joint, (n,) [rad].
         say: Shows how far it is.
     """
-    nothing_found = ~outcome.final.model.has.any(dim=0)
-    joints = ~near_floor(outcome, floor) & (nothing_found | much_left(outcome, floor))
+    joints = ~near_floor(outcome, floor)
     if not bool(joints.any()):
         return None
     say("fitting curves of any form in place of effects")
@@ -104,7 +103,7 @@ def take_curves(outcome: Outcome, curves: Curves) -> None:
     outcome.final_errors = replace(errors, square=square)
 
 
-def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str]) -> dict[str, Any]:
+def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
     Args:
@@ -114,7 +113,7 @@ def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str
     """
     if curves is None:
         return {}
-    joints: dict[str, dict[str, Any]] = {}
+    joints = {}
     for j in curves.joints.nonzero()[:, 0].tolist():
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
@@ -127,8 +126,7 @@ def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str
             "sentence": _sentence(effect, part, before, after),
             "curve": _curve(curves.models[k], effect, j),
         }
-    worst = max(joints, key=lambda name: max(joints[name]["explained"].values()))
-    return {"sentence": f"{worst}: {joints[worst]['sentence']}", "joints": joints}
+    return joints
 
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:

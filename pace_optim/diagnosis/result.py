@@ -51,7 +51,7 @@ class Diagnosis:
     """Physics step of the diagnosis [s]."""
     ladder: list[dict[str, Any]] = field(default_factory=list)
     """Validation RMSE of all joints from the base model to the last effect [rad]."""
-    error_map: dict[str, Any] = field(default_factory=dict)
+    error_map: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Which variable carries what is missing, on each joint whose error effects do not explain: what part of it each
     curve explains by itself, and the best curve."""
     wall_time_s: float = 0.0

@@ -68,7 +68,7 @@ def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> li
 
 def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects of the right form whose size differs between recordings, in a sentence."""
-    said = _said(outcome, names, much_left(outcome, floor) & (outcome.unevenness >= VARYING))
+    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
     return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
 
 
@@ -88,10 +88,10 @@ def _at_bounds(outcome: Outcome) -> torch.Tensor:
 
 def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     share = outcome.unevenness
-    return much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
+    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
 
 
-def much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
     before, after = above_floor(outcome, floor)
     return (after > (1 - DOMINANT) * before) & ~near_floor(outcome, floor)

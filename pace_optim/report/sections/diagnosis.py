@@ -32,8 +32,8 @@ def diagnosis(run: RunData) -> Section | None:
     parts = [
         _verdict(content, run.result.effects),
         _ladder(content),
-        _ranking(content),
         _error_map(content),
+        _ranking(content),
         _joints(content),
     ]
     parts += [_advice(content), _data(content)]
@@ -177,17 +177,12 @@ def _joints(content: dict[str, Any]) -> str:
 
 def _error_map(content: dict[str, Any]) -> str:
     """Which variable carries what is missing; only where no known effect explains it."""
-    found = content.get("error_map") or {}
-    if content["verdict"] != "unknown" or not found.get("joints"):
+    joints = content.get("error_map") or {}
+    if content["verdict"] != "unknown" or not joints:
         return ""
-    joints = found["joints"]
     curves = list(next(iter(joints.values()))["explained"])
     rows = [
-        [
-            f"<b>{esc(name)}</b>",
-            *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves),
-            esc(joint["sentence"]),
-        ]
+        [f"<b>{esc(name)}</b>", *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
         for name, joint in joints.items()
     ]
     worst = max(joints, key=lambda name: joints[name]["explained"][joints[name]["best"]])
@@ -206,11 +201,12 @@ def _error_map(content: dict[str, Any]) -> str:
         "yaxis": {"title": {"text": f"missing {best['kind']} of {worst} [N m]"}},
         "showlegend": False,
     }
+    said = [f"{name}: {joint['sentence']}" for name, joint in joints.items()]
     return (
         "<h3>What carries the error<small>part of the squared error above the floor that a curve of any form explains "
         "by itself, on top of the base model</small></h3>"
-        f"{bullets([found['sentence']], 'notes')}{figure('error-map', [trace], layout, height=300)}"
-        f"{table(['joint', *(in_words(curve) for curve in curves), ''], rows)}"
+        f"{bullets(said, 'notes')}{figure('error-map', [trace], layout, height=300)}"
+        f"{table(['joint', *(in_words(curve) for curve in curves)], rows)}"
     )
 
 
