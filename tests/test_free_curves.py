@@ -1,18 +1,24 @@
 """Curves of any form: what they are, and where they take the place of effects that do not explain the error."""
 
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from diagnoses import hidden_run
-from problems import BENCH
+from problems import BENCH, CALM
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
-from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose
+from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
+from pace_optim.diagnosis.acceptance import BlockErrors
 from pace_optim.diagnosis.base_fit import fit_base
+from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.diagnose import summary_of
 from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.free_curves import error_map, fit_curves, take_curves
+from pace_optim.diagnosis.free_curves import Curves, error_map, fit_curves, take_curves
+from pace_optim.diagnosis.model import BASE, JointModel
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.validation import validation_errors
 from pace_optim.diagnosis.verdict import labels, verdict
@@ -51,10 +57,11 @@ def test_a_curve_is_straight_between_its_knots_and_constant_beyond_them():
     assert points["torque"] == pytest.approx(values_at(odd, *points["at"])) and len(points["at"]) == 13
 
 
-def test_no_diagnosis_looks_for_curves_unless_it_is_told_to():
+def test_no_diagnosis_looks_for_curves():
     assert len(CURVES) == 6 and all(issubclass(get_effect(name), FreeForm) for name in CURVES)
     assert not any(effect.free_form for effect in candidate_effects())
-    assert candidate_effects(["friction_over_speed"])[-1] is get_effect("friction_over_speed")
+    with pytest.raises(ValueError, match="a diagnosis holds it against the effects"):
+        candidate_effects(["torque_gain", "friction_over_speed"])
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +100,14 @@ def curves(fitted):
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
-    joint = error_map(curves, ended(fitted, 1.0), ["servo"])["servo"]
+    joint = error_map(curves, ["servo"])["servo"]
     assert joint["best"] == "friction_over_position" and joint["best_label"] == "position [rad]"
     others = [part for name, part in joint["explained"].items() if name != joint["best"]]
     assert joint["explained"]["friction_over_position"] > 0.9 and max(others) < 0.5
     assert joint["sentence"].startswith("a curve of friction over position explains 9") and "mrad" in joint["sentence"]
     assert len(joint["curve"]["at"]) == len(joint["curve"]["torque"]) == 17
-    assert error_map(None, ended(fitted, 1.0), ["servo"]) == {}
+    assert min(joint["curve"]["torque"]) >= 0.0 and joint["kind"] == "friction"  # all of it, and none pushes
+    assert error_map(None, ["servo"]) == {}
 
 
 @pytest.mark.parametrize(("part", "instead"), [(1.0, True), (0.3, True), (0.04, False)])
@@ -108,8 +116,8 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     before = outcome.final
     left = 1 - float(curves.explained.max())
     assert 0.5 * 0.04 < left < 0.5 * 0.3
-    refitted = "pace_optim.diagnosis.free_curves.SomeJoints.refitted"
-    monkeypatch.setattr(refitted, lambda *_: (curves.models, curves.errors))
+    fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
+    monkeypatch.setattr("pace_optim.diagnosis.free_curves.SomeJoints.refitted", lambda *_: fits)
     found = fit_curves(outcome, FLOOR)
     assert found.instead.tolist() == [instead]
     take_curves(outcome, found)
@@ -132,11 +140,65 @@ def test_no_curve_is_fitted_near_the_floor(fitted):
     assert fit_curves(ended(fitted, 1.0), near) is None
 
 
+def errors_of(*rmse):
+    return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
+
+
+def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeypatch):
+    """A spring explains joint a, a curve joint b; c is far from the floor, d is at it."""
+    spring, curve = get_effect("parallel_spring"), get_effect("friction_over_speed")
+    one, four = JointModel.base(run.problem), torch.arange(4)
+    model = replace(
+        one, has=torch.zeros(0, 4, dtype=torch.bool), lower=one.lower.expand(4, -1), upper=one.upper.expand(4, -1)
+    )
+    values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
+    with_curve = model.extended(values, curve, four < 3, torch.full((4, len(curve.parameters)), 0.1).double())
+    with_spring = model.extended(values, spring, four == 0, torch.tensor([[2.0, 0.1]]).double().expand(4, -1))
+    outcome = Outcome(
+        problem=None,
+        base=Fitted.start(model, values),
+        base_errors=errors_of(6e-3, 3e-3, 1e-3, 1e-4),
+        final=Fitted.start(*with_spring),
+        final_errors=errors_of(1e-4, 3e-3, 1e-3, 1e-4),
+        unevenness=torch.zeros(1, 4),
+    )
+    curves = Curves(
+        joints=(four == 1) | (four == 2),
+        effects=[curve],
+        models=[Fitted.start(*with_curve)],
+        errors=[errors_of(6e-3, 2e-4, 9e-4, 1e-4)],
+        base_errors=outcome.base_errors,
+        explained=torch.tensor([[0.0, 0.996, 0.2, 0.0]]),
+        instead=four == 1,
+    )
+    floor = FLOOR.expand(4)
+    twins = SimpleNamespace(with_physics_dt=lambda _: None, control_dt=0.0025)
+    for name, result in (
+        ("fit_base", (twins, outcome.base, FLOOR)),
+        ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
+        ("absorbed_effects", {}),
+        ("add_effects", outcome),
+        ("share", None),
+        ("fit_curves", curves),
+        ("shares", {spring: 0.8, curve: 0.2}),
+    ):
+        monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result: result)
+    robot = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=0.0025)
+    found = search_effects(robot, None, [spring], 3)
+    assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]
+    assert found.added == ["parallel_spring@a"] and found.free_form == ["friction_over_speed@b"]
+    assert found.explained == pytest.approx(1 - 1e-6 / 46e-6, abs=0.01)
+    said = summary_of(found, robot)
+    assert said.startswith("Missing: parallel_spring@a. With it")
+    assert said.endswith("On other joints no known effect does; a curve takes its place: friction_over_speed@b.")
+    assert list(error_map(curves, robot.joint_names)) == ["b", "c"]
+
+
 @pytest.mark.slow
 def test_an_unknown_effect_gets_a_curve_and_the_robot_is_fitted_with_it(run):
     found = diagnose(DiagnosisSettings(run=run.folder, effects=["torque_gain"], only=True))
-    assert found.verdict == "unknown" and found.added == [] and found.free_form
-    assert found.paying == ["friction_over_position"]
+    assert found.verdict == "unknown" and found.added == []
+    assert found.paying == found.free_form == ["friction_over_position"]
     assert "a curve in its place, friction_over_position," in found.summary
     refit = FitResult.load(found.runs[-1])
     assert refit.task == BENCH and refit.effects == ["friction_over_position"]

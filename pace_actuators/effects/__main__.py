@@ -19,9 +19,9 @@ controller, drive, friction, transmission; `model` changes the rigid body, `reco
 `joint_elasticity` and `backlash`, give a joint one: a backlash has an elasticity of its own. Friction then acts on the
 motor, other torques on the link.
 
-Of the last six each is a curve of any form, straight from knot to knot, at `center + reach · knot`, and constant beyond
-the last. They say what is missing and not why: `scripts/diagnose.py` does not look for them, but holds them against the
-effects that it found, and takes one where none of them explains the error.
+The last six, `torque_over_…` and `friction_over_…`, are curves of any form: straight from knot to knot, at `center +
+reach · knot`, and constant beyond the last. They say what is missing and not why: `scripts/diagnose.py` does not look
+for them, but holds them against the effects that it found, and takes one where none of them explains the error.
 
 This page is made by `python -m pace_actuators.effects > docs/effects.md`. An effect of your own:
 [your_own_effect.md](your_own_effect.md).
@@ -72,6 +72,7 @@ def page() -> str:
     """The page, of all effects that come with the package."""
     effects = [get_effect(name) for name in available_effects()]
     effects = [effect for effect in effects if effect.__module__.startswith("pace_actuators.")]
+    effects.sort(key=lambda effect: effect.free_form)
     parts = [_HEAD, *(_row(f"`{e.name}`", e.stage, f"`{e.equation}`", e.source) for e in effects)]
     parts += [_PARAMETERS, *(_parameter(e, p) for e in effects for p in e.parameters if not _is_told(e, p))]
     parts += [_LOOKS, *(_row(f"`{e.name}`", e.looks, e.separates) for e in effects)]

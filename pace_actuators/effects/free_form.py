@@ -33,10 +33,15 @@ def _parameters(
         replace(value, name=f"effort_{i}", meaning=f"f at the knot {knot:g}")
         for i, knot in enumerate(knot for knot in knots if knot != zero)
     ]
-    shape = [EffectParameter(name="reach", unit=unit, lower=lower, upper=upper, null=None, start=start, scale="log")]
-    if center:
-        shape.append(EffectParameter(name="center", unit=unit, lower=-center, upper=center, null=None, start=0.0))
-    return (*values, *shape)
+    shape = EffectParameter(
+        name="reach", unit=unit, lower=lower, upper=upper, null=None, start=start, scale="log", meaning="of the knot 1"
+    )
+    if not center:
+        return (*values, shape)
+    middle = EffectParameter(
+        name="center", unit=unit, lower=-center, upper=center, null=None, start=0.0, meaning="where the knot 0 is"
+    )
+    return (*values, replace(shape, meaning="from the knot 0 to the knot 1"), middle)
 
 
 class FreeForm(Effect):
@@ -165,15 +170,16 @@ class FrictionOverSpeed(FreeForm):
 
 @register_effect
 class FrictionOverPosition(FreeForm):
-    """Coulomb friction that goes with the position: F_c + f(q)."""
+    """Coulomb friction that goes with the position: F_c + f(q), f = 0 at the center."""
 
     name = "friction_over_position"
     stage = "friction"
     knots = _EVEN
+    zero = 0.0
     variable = "position"
     resists = True
-    parameters = _parameters(knots, None, (0.05, 1.0, 10.0), "rad", center=10.0)
-    equation = "F = F_c + f(q)"
+    parameters = _parameters(knots, zero, (0.05, 1.0, 10.0), "rad", center=10.0)
+    equation = "F = F_c + f(q), f = 0 at the center"
     looks = "the hysteresis loop is wider at some positions than at others"
     separates = "a slow triangle over the whole range"
     center: torch.Tensor

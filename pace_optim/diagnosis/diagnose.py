@@ -54,14 +54,15 @@ class Findings:
     """Which variable carries what is missing; ``None`` where the effects found leave little."""
 
     @property
-    def free_form(self) -> bool:
-        """Whether curves stand where an effect is not known."""
-        return bool(curves_in(self.outcome.final.model).any())
+    def free_form(self) -> list[str]:
+        """Those of them that are curves, where an effect is not known."""
+        names = {e.name for e in self.shares if e.free_form}
+        return [label for label in self.paying if label.partition("@")[0] in names]
 
     @property
     def added(self) -> list[str]:
         """Those that are what is missing."""
-        return self.paying if self.verdict == "effect" else []
+        return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
 
 
 def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) -> Diagnosis:
@@ -114,7 +115,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
         ladder=_ladder(found),
-        error_map=error_map(found.curves, found.outcome, problem.joint_names),
+        error_map=error_map(found.curves, problem.joint_names),
         wall_time_s=time.monotonic() - begin,
     )
     diagnosis.save(folder)
@@ -148,8 +149,18 @@ def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, pr
 
 
 def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
-    """What is tried: all registered effects and the user's, or only the user's."""
+    """What is tried: all registered effects but the curves of any form, and the user's; or only the user's.
+
+    Raises:
+        ValueError: If the user names a curve.
+    """
     own = [get_effect(name) for name in extra]
+    curves = [name for name, effect in zip(extra, own, strict=True) if effect.free_form]
+    if curves:
+        raise ValueError(
+            f"{curves[0]} is a curve of any form: a diagnosis holds it against the effects that it finds without being "
+            f"told to. Leave it out, or fit it: scripts/fit.py --effects {curves[0]}."
+        )
     every = [] if only else [get_effect(name) for name in available_effects()]
     return list(dict.fromkeys([*(effect for effect in every if not effect.free_form), *own]))
 
@@ -192,7 +203,9 @@ def search_effects(
         take_curves(outcome, curves)
     decision, explained = verdict(outcome, data.floor)
     if decision != "unknown":
-        keep_on(outcome, explained_joints(outcome, data.floor) & (decision == "effect"))
+        with_curve = curves_in(outcome.final.model).any(dim=0)
+        keep_on(outcome, with_curve | (explained_joints(outcome, data.floor) & (decision == "effect")))
+        _, explained = verdict(outcome, data.floor)
     each = shares(outcome)
     return Findings(
         outcome=outcome,
@@ -228,7 +241,9 @@ def summary_of(found: Findings, problem: Problem) -> str:
         f"{_missing(found)} With it the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
-    if after > UNKNOWN_RATIO * floor:
+    if found.free_form:
+        summary += f" On other joints no known effect does; a curve takes its place: {', '.join(found.free_form)}."
+    elif after > UNKNOWN_RATIO * floor:
         summary += " Something else is missing too, which no known effect explains."
     return " ".join([summary, *varying(*about)])
 
@@ -237,17 +252,19 @@ def _what_pays(found: Findings) -> str:
     """What lowers the error without being what is missing."""
     if not found.paying:
         return "the effects tried explain"
-    if found.free_form:
+    if len(found.free_form) == len(found.paying):
         return f"a curve in its place, {', '.join(found.paying)}, explains"
-    return f"what pays, {', '.join(found.paying)}, explains"
+    curves = ", with a curve where none is known" if found.free_form else ""
+    return f"what pays{curves}, {', '.join(found.paying)}, explains"
 
 
 def _missing(found: Findings) -> str:
     """The effects found; where there are several, what is due to each, and whether one of them stands out."""
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
-    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
-    if max(found.shares.values()) >= DOMINANT:
+    known = {label: s for label, s in zip(found.paying, found.shares.values(), strict=True) if label in found.added}
+    parts = [f"{label} ({100 * s:.0f} %)" for label, s in known.items()]
+    if max(known.values()) >= DOMINANT:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
 

@@ -12,7 +12,7 @@ from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis.acceptance import BlockErrors, judge
 from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.model import BASE
 from pace_optim.diagnosis.search import Outcome
 from pace_optim.diagnosis.some_joints import SomeJoints
 from pace_optim.diagnosis.stand_ins import EXPLAINED, above_floor, near_floor
@@ -22,7 +22,8 @@ _BETTER = 0.5
 """A curve says more than the effects found where it leaves less than this part of the squared error that they leave."""
 _REACHED = 0.998
 """Quantile of a variable up to which the knots of a curve reach."""
-_WORTH_A_WORD = 0.1
+WORTH_A_WORD = 0.1
+"""With less than this part explained a curve is not told of."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -37,6 +38,8 @@ class Curves:
     """The base model with each, of all joints."""
     errors: list[BlockErrors]
     """Of all joints."""
+    base_errors: BlockErrors
+    """Of the base model, fitted along the same motion."""
     explained: torch.Tensor
     """Part of a joint's squared error above the floor that each explains, (curves, n)."""
     instead: torch.Tensor
@@ -51,32 +54,45 @@ def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None]
     """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
-    one variable that leaves less than half of what all effects found leave says that those are not it.
+    one variable that leaves less than half of what all effects found leave says that those are not it. Joints with an
+    effect that the whole robot shares are left out.
 
     Args:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
         say: Shows how far it is.
     """
+    model = outcome.final.model
     joints = ~near_floor(outcome, floor)
+    for effect, has in zip(model.effects, model.has, strict=True):
+        joints &= ~(has & effect.shared)
     if not bool(joints.any()):
         return None
     say("fitting curves of any form in place of effects")
-    effects = [effect for name in available_effects() if issubclass(effect := get_effect(name), FreeForm)]
     ranges = _ranges(outcome.problem, outcome.base)
-    starts = [_start(outcome.base, effect, joints, ranges) for effect in effects]
+    known = (get_effect(name) for name in available_effects())
+    effects = [each for each in known if issubclass(each, FreeForm) and each.variable in ranges]
+    without = Fitted.start(outcome.base.model, outcome.base.model.to_physical(outcome.base.x))
+    starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
     models, errors = SomeJoints(joints).refitted(outcome.problem, starts, outcome.base_errors)
-    before, with_effects = above_floor(outcome, floor)
-    left = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
-    explained = torch.where(joints, 1 - left / before.clamp(min=1e-30), 0.0)
+    above = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
     found = Curves(
-        joints=joints, effects=effects, models=models, errors=errors, explained=explained, instead=joints.clone()
+        joints=joints,
+        effects=effects,
+        models=models[1:],
+        errors=errors[1:],
+        base_errors=errors[0],
+        explained=torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0),
+        instead=torch.zeros_like(joints),
     )
+    _, left = above_floor(outcome, floor)
+    tried = len(effects) * int(joints.sum())
     for j in joints.nonzero()[:, 0].tolist():
-        k = found.best(j)
-        pays = judge(outcome.base_errors, errors[k], j, len(effects) * len(joints), first=True).significant
-        says_more = float(left[k, j]) < _BETTER * float(with_effects[j])
-        found.instead[j] = pays and says_more and float(explained[k, j]) >= EXPLAINED
+        k, has_effects = found.best(j), bool(model.has[:, j].any())
+        now = outcome.final_errors if has_effects else found.base_errors
+        pays = judge(now, found.errors[k], j, tried, first=not has_effects).significant
+        says_more = not has_effects or float(above[1 + k, j]) < _BETTER * float(left[j])
+        found.instead[j] = pays and says_more and float(found.explained[k, j]) >= EXPLAINED
     return found
 
 
@@ -89,13 +105,12 @@ def take_curves(outcome: Outcome, curves: Curves) -> None:
     square, score = errors.square.clone(), outcome.final.score.clone()
     for j in curves.instead.nonzero()[:, 0].tolist():
         k = curves.best(j)
-        own, values = curves.models[k], curves.models[k].model.to_physical(curves.models[k].x)[j]
+        effect, own = curves.effects[k], curves.models[k]
+        values = own.model.to_physical(own.x)
         here = torch.arange(len(physical)) == j
-        column = own.model.columns(curves.effects[k])
-        values_of_all = values[column].expand(len(physical), -1)
-        model, physical = model.extended(physical, curves.effects[k], here, values_of_all)
-        model = _held(model, curves.effects[k], here, physical)
-        physical[j, : len(BASE)] = values[: len(BASE)]
+        model, physical = model.extended(physical, effect, here, values[:, own.model.columns(effect)])
+        model = model.held(effect, _shape(effect), physical)
+        physical[j, : len(BASE)] = values[j, : len(BASE)]
         square[:, j], score[j] = curves.errors[k].square[:, j], own.score[j]
     more = torch.zeros(len(model.effects) - len(outcome.unevenness), len(physical), dtype=outcome.unevenness.dtype)
     outcome.unevenness = torch.cat([outcome.unevenness, more])
@@ -103,12 +118,11 @@ def take_curves(outcome: Outcome, curves: Curves) -> None:
     outcome.final_errors = replace(errors, square=square)
 
 
-def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
+def error_map(curves: Curves | None, joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
     Args:
         curves: What was fitted.
-        outcome: Where the search ended.
         joint_names: The joints.
     """
     if curves is None:
@@ -117,20 +131,22 @@ def error_map(curves: Curves | None, outcome: Outcome, joint_names: Sequence[str
     for j in curves.joints.nonzero()[:, 0].tolist():
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
-        before, after = (1e3 * float(e.mse[j].sqrt()) for e in (outcome.base_errors, curves.errors[k]))
+        before, after = (float(each.mse[j].sqrt()) for each in (curves.base_errors, curves.errors[k]))
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,
             "best_label": f"{effect.variable} [{effect.parameters[-1].unit}]",
-            "kind": "friction" if effect.resists else "torque",
-            "sentence": _sentence(effect, part, before, after),
+            "kind": "friction" if effect.resists else "missing torque",
+            "validation_rmse_before": before,
+            "validation_rmse_after": after,
+            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after),
             "curve": _curve(curves.models[k], effect, j),
         }
     return joints
 
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
-    if part < _WORTH_A_WORD:
+    if part < WORTH_A_WORD:
         return "no curve over a single variable carries the error."
     kind = "friction" if effect.resists else "torque"
     return (
@@ -140,53 +156,58 @@ def _sentence(effect: type[FreeForm], part: float, before: float, after: float) 
 
 
 def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list[float]]:
-    """Where the knots are, and the torque or friction there beyond the base model [N m]."""
-    values = fitted.model.to_physical(fitted.x)[joint, fitted.model.columns(effect)].tolist()
-    return effect.curve(dict(zip((p.name for p in effect.parameters), values, strict=True)))
+    """Where the knots are, and the torque that is missing there, or all friction that there is [N m]."""
+    physical = fitted.model.to_physical(fitted.x)[joint]
+    names = [p.name for p in effect.parameters]
+    curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
+    if effect.resists:  # what the base model has of it and what the curve has cannot be told apart everywhere
+        level, viscous = (float(physical[BASE.index(name)]) for name in ("friction", "viscous_friction"))
+        slope = viscous if effect.variable == "speed" else 0.0
+        total = (max(0.0, level + more) for more in curve["torque"])
+        curve["torque"] = [each + slope * x for each, x in zip(total, curve["at"], strict=True)]
+    return curve
 
 
-def _start(base: Fitted, effect: type[FreeForm], joints: torch.Tensor, ranges: dict[str, torch.Tensor]) -> Fitted:
-    """The base model with a curve of nothing, its knots where the joints' variable is."""
-    first, last = ranges[effect.variable]
+def _start(base: Fitted, effect: type[FreeForm], joints: torch.Tensor, seen: torch.Tensor) -> Fitted:
+    """The base model with a curve of nothing, its knots where the joints' variable was seen, (2, n)."""
+    first, last = seen
+    has_center = "center" in _shape(effect)
+    shape = {
+        "reach": 0.5 * (last - first) if has_center else torch.maximum(last, -first),
+        "center": 0.5 * (first + last),
+    }
     values = torch.zeros(len(joints), len(effect.parameters), dtype=torch.float64)
     for column, p in enumerate(effect.parameters):
-        if p.name == "reach":
-            values[:, column] = 0.5 * (last - first) if _has_center(effect) else torch.maximum(last, -first)
-        elif p.name == "center":
-            values[:, column] = 0.5 * (first + last)
-        values[:, column] = values[:, column].clamp(p.lower, p.upper)
+        if p.name in shape:
+            values[:, column] = shape[p.name].clamp(p.lower, p.upper)
     model, physical = base.model.extended(base.model.to_physical(base.x), effect, joints, values)
-    return Fitted.start(_held(model, effect, joints, physical), physical, tried=effect)
+    return Fitted.start(model.held(effect, _shape(effect), physical), physical, tried=effect)
 
 
-def _has_center(effect: type[FreeForm]) -> bool:
-    return any(p.name == "center" for p in effect.parameters)
-
-
-def _held(model: JointModel, effect: type[FreeForm], joints: torch.Tensor, physical: torch.Tensor) -> JointModel:
-    """The model with a curve's knots held where they are."""
-    lower, upper = model.lower.clone(), model.upper.clone()
-    for column, p in enumerate(effect.parameters, start=model.columns(effect).start):
-        if p.null is None:
-            lower[joints, column] = upper[joints, column] = physical[joints, column]
-    return replace(model, lower=lower, upper=upper)
+def _shape(effect: type[FreeForm]) -> list[str]:
+    """Parameters that say where the knots are."""
+    return [p.name for p in effect.parameters if p.null is None]
 
 
 def _ranges(problem: TwinProblem, base: Fitted) -> dict[str, torch.Tensor]:
-    """From where to where each variable goes, (2, n) by its name."""
-    path = problem.path
+    """From where to where each variable goes in what is trained on, (2, n) by its name."""
+    path, data = problem.path, problem.dataset
     effort, load = path.effort(base.model.to_physical(base.x)[:, BASE.index("armature")]), path.load()
     # what holds a load has its size, and pulls the other way
     seen = {"position": path.position, "torque": effort, "speed": path.speed(), "load on the gear": effort - load}
-    steps = len(path.position) * problem.control_dt
-    end = float(problem.dataset.session_start.max()) + steps
-    result = {name: _quantiles(values) for name, values in seen.items()}
-    n = path.position.shape[-1]
-    result["time"] = torch.stack([torch.zeros(n), torch.full((n,), end)]).double()
-    return result
+    time = data.session_start + problem.control_dt * torch.arange(len(path.position))[:, None]
+    seen["time"] = time[..., None].expand(path.position.shape)
+    return {name: _quantiles(values, data.train) for name, values in seen.items()}
 
 
-def _quantiles(values: torch.Tensor) -> torch.Tensor:
-    flat = values.flatten(0, 1).double().sort(dim=0).values
+def _quantiles(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """Almost the smallest and the largest, (2, n), of (T', R, n) that leave out as many steps at the end as before.
+
+    Args:
+        values: The values.
+        where: Which steps count, (T, R) bool.
+    """
+    left_out = (len(where) - len(values)) // 2
+    flat = values[where[left_out : left_out + len(values)]].double().sort(dim=0).values
     last = len(flat) - 1
-    return torch.stack([flat[round((1 - _REACHED) * last)], flat[round(_REACHED * last)]])
+    return flat[[round((1 - _REACHED) * last), round(_REACHED * last)]]

@@ -151,10 +151,21 @@ class JointModel:
         """
         if not effect.structural:
             return self
-        place = [parameter.name for parameter in effect.parameters].index(effect.structural)
-        column, has = self.columns(effect).start + place, self.has[self.effects.index(effect)]
+        return self.held(effect, [effect.structural], physical)
+
+    def held(self, effect: type[Effect], names: Sequence[str], physical: torch.Tensor) -> JointModel:
+        """The same with parameters of an effect held where they are, on the joints that have it.
+
+        Args:
+            effect: The effect.
+            names: Its parameters.
+            physical: Of this model, (n, P).
+        """
+        has, start = self.has[self.effects.index(effect)], self.columns(effect).start
         lower, upper = self.lower.clone(), self.upper.clone()
-        lower[has, column] = upper[has, column] = physical[has, column]
+        for column, parameter in enumerate(effect.parameters, start=start):
+            if parameter.name in names:
+                lower[has, column] = upper[has, column] = physical[has, column]
         return replace(self, lower=lower, upper=upper)
 
     def may_get(self, effect: type[Effect]) -> torch.Tensor:

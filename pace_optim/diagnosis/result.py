@@ -29,8 +29,8 @@ class Diagnosis:
     verdict is ``effect``."""
     paying: list[str] = field(default_factory=list)
     """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
-    free_form: bool = False
-    """Whether curves of any form are among those in ``paying``, where no effect is known."""
+    free_form: list[str] = field(default_factory=list)
+    """Those in ``paying`` that are curves of any form, where no effect is known."""
     shares: dict[str, float] = field(default_factory=dict)
     """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
     ranking: list[dict[str, Any]]

@@ -19,6 +19,8 @@ _HEADINGS = {
 }
 _PARTLY = 0.8
 """Effects that explain less than this part of the error above the floor are not all that is missing."""
+_SHOWN_CURVE = 0.1
+"""A curve that explains less than this part of a joint's error is not drawn."""
 _SHOWN = 10
 """Effects in the chart, at most."""
 _COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py )")
@@ -43,8 +45,8 @@ def diagnosis(run: RunData) -> Section | None:
 def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
     """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
-    effects, part = content["added"] or content.get("paying", []), content.get("explained", 1.0)
-    if content.get("free_form"):
+    effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
+    if content.get("free_form") and not content["added"]:
         heading = "Something is missing that is none of the known effects; a curve takes its place"
     elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
@@ -176,16 +178,33 @@ def _joints(content: dict[str, Any]) -> str:
 
 
 def _error_map(content: dict[str, Any]) -> str:
-    """Which variable carries what is missing; only where no known effect explains it."""
-    joints = content.get("error_map") or {}
-    if content["verdict"] != "unknown" or not joints:
+    """Which variable carries what is missing, on joints that effects leave far from the floor."""
+    joints = {name: each for name, each in content.get("error_map", {}).items() if "explained" in each}
+    if not joints:
         return ""
     curves = list(next(iter(joints.values()))["explained"])
     rows = [
         [f"<b>{esc(name)}</b>", *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
         for name, joint in joints.items()
     ]
-    worst = max(joints, key=lambda name: joints[name]["explained"][joints[name]["best"]])
+    said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
+    return (
+        "<h3>What carries the error<small>part of the squared error above the floor that a curve of any form explains "
+        "by itself, on top of the base model</small></h3>"
+        f"{said}{_curve(joints)}{table(['joint', *(in_words(curve) for curve in curves)], rows)}"
+    )
+
+
+def _curve(joints: dict[str, dict[str, Any]]) -> str:
+    """The curve that takes most away of the squared error."""
+    squares = {
+        name: joint["validation_rmse_before"] ** 2 - joint["validation_rmse_after"] ** 2
+        for name, joint in joints.items()
+        if joint["explained"][joint["best"]] >= _SHOWN_CURVE
+    }
+    if not squares:
+        return ""
+    worst = max(squares, key=squares.__getitem__)
     best = joints[worst]
     trace = {
         "type": "scatter",
@@ -198,16 +217,10 @@ def _error_map(content: dict[str, Any]) -> str:
     }
     layout = {
         "xaxis": {"title": {"text": best["best_label"]}},
-        "yaxis": {"title": {"text": f"missing {best['kind']} of {worst} [N m]"}},
+        "yaxis": {"title": {"text": f"{best['kind']} of {worst} [N m]"}},
         "showlegend": False,
     }
-    said = [f"{name}: {joint['sentence']}" for name, joint in joints.items()]
-    return (
-        "<h3>What carries the error<small>part of the squared error above the floor that a curve of any form explains "
-        "by itself, on top of the base model</small></h3>"
-        f"{bullets(said, 'notes')}{figure('error-map', [trace], layout, height=300)}"
-        f"{table(['joint', *(in_words(curve) for curve in curves)], rows)}"
-    )
+    return figure("error-map", [trace], layout, height=300)
 
 
 def _advice(content: dict[str, Any]) -> str:
