@@ -29,9 +29,7 @@ ENERGY = {
     "creeping_friction": [{"velocity": v} for v in (1e-4, 0.01, 0.5)],
     "soft_friction": [{"time_constant": t} for t in (1e-3, 0.02, 0.2)],
     "friction_over_speed": [jagged(8, 5.0, effort) for effort in (0.3, -10.0)],
-    "friction_over_position": [
-        {f"effort_{i}": e * (-1) ** i for i in range(17)} | {"reach": 1.5} for e in (0.3, -10.0)
-    ],
+    "friction_over_position": [jagged(16, 1.5, effort) for effort in (0.3, 10.0)],
     "friction_over_load": [jagged(8, 10.0, effort) for effort in (0.3, -10.0)],
     "joint_elasticity": [{"stiffness": k, "damping": c} for k in (80.0, 1e3, 2e4) for c in (0.0, 0.5, 20.0)],
     "backlash": [{"gap": g, "stiffness": k, "damping": 0.0} for g in (0.004, 0.05) for k in (300.0, 2e4)],
