@@ -110,12 +110,15 @@ def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
     assert error_map(None, ["servo"]) == {}
 
 
-@pytest.mark.parametrize(("part", "instead"), [(1.0, True), (0.3, True), (0.04, False)])
-def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted, curves, monkeypatch, part, instead):
-    outcome = ended(fitted, part)
-    before = outcome.final
+@pytest.mark.parametrize(("times", "instead"), [(None, True), (2.4, True), (1.75, False)])
+def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted, curves, monkeypatch, times, instead):
     left = 1 - float(curves.explained.max())
-    assert 0.5 * 0.04 < left < 0.5 * 0.3
+    outcome = ended(fitted, 1.0 if times is None else times * left)
+    before = outcome.final
+    if times is not None:  # as evenly as the curve
+        outcome.final_errors = replace(
+            curves.errors[curves.best(0)], square=times * curves.errors[curves.best(0)].square
+        )
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
     monkeypatch.setattr("pace_optim.diagnosis.free_curves.SomeJoints.refitted", lambda *_: fits)
     found = fit_curves(outcome, FLOOR)
@@ -129,6 +132,8 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     assert labels(outcome.final.model, ["servo"]) == ["friction_over_position"]
     decision, explained = verdict(outcome, FLOOR)
     assert decision == "unknown" and explained == pytest.approx(1 - left, abs=0.01)
+    at_floor = replace(outcome, final_errors=replace(outcome.final_errors, square=0.0 * outcome.final_errors.square))
+    assert verdict(at_floor, FLOOR)[0] == "unknown"
     # what it says of its errors is what its model leaves
     assert validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
         outcome.final_errors.mse.tolist(), rel=1e-3
@@ -140,12 +145,16 @@ def test_no_curve_is_fitted_near_the_floor(fitted):
     assert fit_curves(ended(fitted, 1.0), near) is None
 
 
+def test_a_joint_keeps_what_the_whole_robot_shares(fitted):
+    assert fit_curves(ended(fitted, 0.9, "clock_skew"), FLOOR) is None
+
+
 def errors_of(*rmse):
     return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
 
 
 def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeypatch):
-    """A spring explains joint a, a curve joint b; c is far from the floor, d is at it."""
+    """A spring explains joint a and little of c, a curve joint b; d is at the floor."""
     spring, curve = get_effect("parallel_spring"), get_effect("friction_over_speed")
     one, four = JointModel.base(run.problem), torch.arange(4)
     model = replace(
@@ -153,20 +162,22 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     )
     values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
     with_curve = model.extended(values, curve, four < 3, torch.full((4, len(curve.parameters)), 0.1).double())
-    with_spring = model.extended(values, spring, four == 0, torch.tensor([[2.0, 0.1]]).double().expand(4, -1))
+    with_spring = model.extended(
+        values, spring, (four == 0) | (four == 2), torch.tensor([[2.0, 0.1]]).double().expand(4, -1)
+    )
     outcome = Outcome(
         problem=None,
         base=Fitted.start(model, values),
-        base_errors=errors_of(6e-3, 3e-3, 1e-3, 1e-4),
+        base_errors=errors_of(6e-3, 3e-3, 3e-3, 1e-4),
         final=Fitted.start(*with_spring),
-        final_errors=errors_of(1e-4, 3e-3, 1e-3, 1e-4),
+        final_errors=errors_of(1e-4, 3e-3, 2.4e-3, 1e-4),
         unevenness=torch.zeros(1, 4),
     )
     curves = Curves(
         joints=(four == 1) | (four == 2),
         effects=[curve],
         models=[Fitted.start(*with_curve)],
-        errors=[errors_of(6e-3, 2e-4, 9e-4, 1e-4)],
+        errors=[errors_of(6e-3, 2e-4, 2.9e-3, 1e-4)],
         base_errors=outcome.base_errors,
         explained=torch.tensor([[0.0, 0.996, 0.2, 0.0]]),
         instead=four == 1,
@@ -187,11 +198,15 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     found = search_effects(robot, None, [spring], 3)
     assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]
     assert found.added == ["parallel_spring@a"] and found.free_form == ["friction_over_speed@b"]
-    assert found.explained == pytest.approx(1 - 1e-6 / 46e-6, abs=0.01)
+    assert found.explained == pytest.approx(1 - 9 / 54, abs=0.01)  # with what is kept
     said = summary_of(found, robot)
     assert said.startswith("Missing: parallel_spring@a. With it")
     assert said.endswith("On other joints no known effect does; a curve takes its place: friction_over_speed@b.")
-    assert list(error_map(curves, robot.joint_names)) == ["b", "c"]
+    told = error_map(curves, robot.joint_names)
+    assert list(told) == ["b", "c"]
+    first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
+    assert first == pytest.approx(CALM["friction"])
+    assert last == pytest.approx(CALM["friction"] + 0.1 + 0.1 * CALM["viscous_friction"])
 
 
 @pytest.mark.slow
