@@ -200,8 +200,10 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     assert found.added == ["parallel_spring@a"] and found.free_form == ["friction_over_speed@b"]
     assert found.explained == pytest.approx(1 - 9 / 54, abs=0.01)  # with what is kept
     said = summary_of(found, robot)
-    assert said.startswith("Missing: parallel_spring@a. With it")
-    assert said.endswith("On other joints no known effect does; a curve takes its place: friction_over_speed@b.")
+    assert said.startswith(
+        "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
+        "friction_over_speed@b. With all of it"
+    )
     told = error_map(curves, robot.joint_names)
     assert list(told) == ["b", "c"]
     first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
@@ -220,4 +222,4 @@ def test_an_unknown_effect_gets_a_curve_and_the_robot_is_fitted_with_it(run):
     before, after = (step["validation_rmse"] for step in found.ladder)
     assert refit.rmse["validation"]["all"] == pytest.approx(after, rel=0.5) and after < 0.3 * before
     page = write_report(found.runs[-1]).read_text("utf-8")
-    assert "a curve takes its place" in page and "error-map" in page
+    assert "it is none of the known effects: a curve takes the place" in page and "error-map" in page

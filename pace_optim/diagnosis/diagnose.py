@@ -237,13 +237,12 @@ def summary_of(found: Findings, problem: Problem) -> str:
             "what lies between."
         )
         return " ".join([text, *stand_ins(*about), *varying(*about)])
+    all_of_it = "all of it" if found.free_form else "it"
     summary = (
-        f"{_missing(found)} With it the validation error falls from {before:.3g} to {after:.3g} mrad "
+        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} mrad "
         f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
-    if found.free_form:
-        summary += f" On other joints no known effect does; a curve takes its place: {', '.join(found.free_form)}."
-    elif after > UNKNOWN_RATIO * floor:
+    if after > UNKNOWN_RATIO * floor and not found.free_form:
         summary += " Something else is missing too, which no known effect explains."
     return " ".join([summary, *varying(*about)])
 
@@ -260,11 +259,15 @@ def _what_pays(found: Findings) -> str:
 
 def _missing(found: Findings) -> str:
     """The effects found; where there are several, what is due to each, and whether one of them stands out."""
+    if found.free_form:
+        return (
+            f"Missing: {', '.join(found.added)}. On other joints no known effect explains the error; a curve takes its "
+            f"place: {', '.join(found.free_form)}."
+        )
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
-    known = {label: s for label, s in zip(found.paying, found.shares.values(), strict=True) if label in found.added}
-    parts = [f"{label} ({100 * s:.0f} %)" for label, s in known.items()]
-    if max(known.values()) >= DOMINANT:
+    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
+    if max(found.shares.values()) >= DOMINANT:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
 

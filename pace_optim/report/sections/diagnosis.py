@@ -46,8 +46,9 @@ def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
     """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
-    if content.get("free_form") and not content["added"]:
-        heading = "Something is missing that is none of the known effects; a curve takes its place"
+    if content.get("free_form"):
+        part_known = "only a part of it is known" if content["added"] else "it is none of the known effects"
+        css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
     elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
     add = ""
