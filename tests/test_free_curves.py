@@ -13,6 +13,7 @@ from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
 from pace_optim.diagnosis.acceptance import BlockErrors
+from pace_optim.diagnosis.advice import advise
 from pace_optim.diagnosis.base_fit import fit_base
 from pace_optim.diagnosis.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import summary_of
@@ -204,10 +205,16 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
         "friction_over_speed@b. With all of it"
     )
+    monkeypatch.setattr("pace_optim.diagnosis.advice.next_experiments", lambda *_: [])
+    advice = advise(robot, outcome, found.verdict, found.data, [])
+    assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
     told = error_map(curves, robot.joint_names)
     assert list(told) == ["b", "c"]
     first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
     assert first == pytest.approx(CALM["friction"])
+    curves.explained[0, 2] = 0.05
+    weak = error_map(curves, robot.joint_names)["c"]
+    assert weak["curve"] is None and weak["sentence"].startswith("no curve")
     assert last == pytest.approx(CALM["friction"] + 0.1 + 0.1 * CALM["viscous_friction"])
 
 

@@ -57,7 +57,6 @@ class FreeForm(Effect):
     resists: ClassVar[bool] = False
     """Whether it is a level of friction; else a torque."""
     source = "piecewise linear; no physics behind it"
-    two_sided = True
     reach: torch.Tensor
 
     @classmethod

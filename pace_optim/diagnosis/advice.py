@@ -8,6 +8,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.data_check import DataCheck
 from pace_optim.diagnosis.next_experiment import next_experiments
 from pace_optim.diagnosis.search import Outcome
+from pace_optim.diagnosis.stand_ins import curves_in
 from pace_optim.problem import Problem
 
 
@@ -31,9 +32,10 @@ def advise(
         f"them apart: {effect.separates}."
         for effect in absorbed
     ]
-    if decision == "unknown":
+    if decision == "unknown" or bool(curves_in(outcome.final.model).any()):
+        whose = "the error" if decision == "unknown" else "the error of some joints"
         result.append(
-            "None of the known effects explains the error. The report says which variable carries it, and how: find "
+            f"None of the known effects explains {whose}. The report says which variable carries it, and how: find "
             "what it is, write an effect of your own (docs/your_own_effect.md) and diagnose again with --effects "
             "module:Class."
         )

@@ -22,8 +22,8 @@ _BETTER = 0.5
 """A curve says more than the effects found where it leaves less than this part of the squared error that they leave."""
 _REACHED = 0.998
 """Quantile of a variable up to which the knots of a curve reach."""
-WORTH_A_WORD = 0.1
-"""With less than this part explained a curve is not told of."""
+_WORTH_A_WORD = 0.1
+"""With less than this part explained a curve is not told of, nor drawn."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -140,13 +140,13 @@ def error_map(curves: Curves | None, joint_names: Sequence[str]) -> dict[str, di
             "validation_rmse_before": before,
             "validation_rmse_after": after,
             "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after),
-            "curve": _curve(curves.models[k], effect, j),
+            "curve": _curve(curves.models[k], effect, j) if part >= _WORTH_A_WORD else None,
         }
     return joints
 
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
-    if part < WORTH_A_WORD:
+    if part < _WORTH_A_WORD:
         return "no curve over a single variable carries the error."
     kind = "friction" if effect.resists else "torque"
     return (

@@ -19,8 +19,6 @@ _HEADINGS = {
 }
 _PARTLY = 0.8
 """Effects that explain less than this part of the error above the floor are not all that is missing."""
-_SHOWN_CURVE = 0.1
-"""A curve that explains less than this part of a joint's error is not drawn."""
 _SHOWN = 10
 """Effects in the chart, at most."""
 _COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py )")
@@ -201,7 +199,7 @@ def _curve(joints: dict[str, dict[str, Any]]) -> str:
     squares = {
         name: joint["validation_rmse_before"] ** 2 - joint["validation_rmse_after"] ** 2
         for name, joint in joints.items()
-        if joint["explained"][joint["best"]] >= _SHOWN_CURVE
+        if joint["curve"]
     }
     if not squares:
         return ""
