@@ -14,13 +14,13 @@ import torch
 
 from pace_envs import load_env_cfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
-from pace_optim.dataset import make_dataset
-from pace_optim.jacobian import Colouring, colour
-from pace_optim.kinematic_trees import independent_trees
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.problem import Problem
+from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Recording, conform_recording
-from pace_optim.rollout import Rollout
+from pace_optim.recording.dataset import make_dataset
 
 TASK = "Pace-AnymalD-v0"
 FITTED = ("armature", "viscous_friction", "friction")

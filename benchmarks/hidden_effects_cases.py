@@ -17,17 +17,17 @@ import torch
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
-from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_to_whole
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import start_values
-from pace_optim.diagnosis.own_motion import OwnMotion
-from pace_optim.diagnosis.validation import validation_errors
-from pace_optim.diagnosis.verdict import ranking
-from pace_optim.joint_twins.problem import TwinProblem
+from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine, fit_to_whole
+from pace_optim.diagnosis.fitting.reference_update import OwnMotion
+from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import start_values
+from pace_optim.diagnosis.verdict.verdict import ranking
 from pace_optim.plant import Case, library_effects, outside_effects, write_case
-from pace_optim.problem import Problem, load_problem
+from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.single_joint_model.problem import TwinProblem
 
 GROUPS = ("effects", "clean", "outside", "pairs", "background", "harmonic")
 ROBOTS = {"bench": ("Pace-TestBench-v0", ".*"), "leg": ("Pace-AnymalD-v0", "LF_.*")}

@@ -27,15 +27,15 @@ import numpy as np
 from solver_trace import machine, table, write_json
 
 from pace_envs.simulation import Simulation
-from pace_optim.cli import run_cli
-from pace_optim.cmaes_optimizer import CMAESOptimizer
 from pace_optim.fit import fit
-from pace_optim.fit_settings import FitSettings
-from pace_optim.problem import Problem, load_problem
-from pace_optim.progress import ProgressLine
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.search import search
+from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import load_recording
-from pace_optim.rollout import Rollout
-from pace_optim.search import search
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.cli import run_cli
+from pace_optim.terminal.progress import ProgressLine
 
 TASK = "Pace-AnymalD-v0"
 LARGEST_SCORE, LARGEST_ERROR = 1e-12, 1e-3

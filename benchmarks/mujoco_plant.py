@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from pace_optim.diagnosis.diagnose import Findings, candidate_effects, search_effects
-from pace_optim.problem import load_problem
+from pace_optim.problem.problem import load_problem
 
 CONTROL_DT, PLANT_DT, DURATION, NOISE = 0.0025, 1e-4, 10.0, 1e-4
 KD, EFFORT_LIMIT, SATURATION_EFFORT, VELOCITY_LIMIT = 0.6, 89.0, 140.0, 8.5

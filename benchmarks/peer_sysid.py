@@ -22,11 +22,11 @@ from drive_problem import DriveProblem, drive_problem
 from solver_trace import Trace, machine, table, write_json
 from sysid_peer import Peer
 
-from pace_optim.cli import run_cli
-from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.least_squares import Descent
-from pace_optim.refine import refine
-from pace_optim.search import RefiningPays, search
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.least_squares import Descent
+from pace_optim.optimizers.refine import refine
+from pace_optim.optimizers.search import RefiningPays, search
+from pace_optim.terminal.cli import run_cli
 
 OURS = "pace least_squares"
 LEVELS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)

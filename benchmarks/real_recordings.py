@@ -19,15 +19,15 @@ from real_robots import ROBOTS, RealRobot, convert_robot, source_folder
 from static_sag import sag_table, static_sag
 
 from pace_envs import load_env_cfg
-from pace_optim.cli import run_cli
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
-from pace_optim.find_run import find_run
 from pace_optim.fit import fit
-from pace_optim.fit_result import FitResult
-from pace_optim.fit_settings import OPTIMIZERS, FitSettings
-from pace_optim.plots import plot_trajectories
 from pace_optim.report import write_report
-from pace_optim.summary import summary
+from pace_optim.report.plots import plot_trajectories
+from pace_optim.run.find import find_run
+from pace_optim.run.result import FitResult
+from pace_optim.run.settings import OPTIMIZERS, FitSettings
+from pace_optim.run.summary import summary
+from pace_optim.terminal.cli import run_cli
 
 SOURCE = Path(__file__).resolve().parents[2] / "shared" / "measurements"
 PLOT_DPI = 90

@@ -35,9 +35,9 @@ from pace_envs.rl import Evaluation, PlaySettings, play
 from pace_envs.rl.training import EditCfg
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.fit import fit
-from pace_optim.fit_settings import FitSettings
 from pace_optim.plant import PlantCfg, Truth, draw_base, make_suite, plant_robot, simulate_runs
 from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 ROBOT, TASK = "Pace-AnymalD-v0", "Pace-AnymalD-Velocity-v0"

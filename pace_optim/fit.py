@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pace_optim.assessment import assess, trajectories
-from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.consistency import Consistency, check_consistency
-from pace_optim.evaluator import Evaluator
-from pace_optim.fit_result import FitResult, make_result, rmse_by_joint
-from pace_optim.fit_settings import FitSettings
-from pace_optim.fit_warnings import fit_warnings
-from pace_optim.history import History
-from pace_optim.jacobian import colour
-from pace_optim.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.other_solutions import with_other_solutions
-from pace_optim.problem import Problem, as_vector, file_digest, load_problem
-from pace_optim.progress import ProgressLine
-from pace_optim.refine import refine
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.optimizers.refine import refine
+from pace_optim.optimizers.search import RefiningPays, search
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.problem import Problem, as_vector, file_digest, load_problem
 from pace_optim.report import write_report
-from pace_optim.run_folder import RunFolder
-from pace_optim.search import RefiningPays, search
-from pace_optim.tensorboard_log import TensorBoardLog
+from pace_optim.run.folder import RunFolder
+from pace_optim.run.history import History
+from pace_optim.run.result import FitResult, make_result, rmse_by_joint
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.tensorboard_log import TensorBoardLog
+from pace_optim.terminal.progress import ProgressLine
+from pace_optim.uncertainty.assessment import assess, trajectories
+from pace_optim.uncertainty.consistency import Consistency, check_consistency
+from pace_optim.uncertainty.other_solutions import with_other_solutions
+from pace_optim.uncertainty.warnings import fit_warnings
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from pace_optim.cli import make_parser, run_cli
 from pace_optim.comparison import compare, comparison_text
+from pace_optim.terminal.cli import make_parser, run_cli
 
 
 def main() -> None:

@@ -4,10 +4,10 @@ import sys
 
 import torch
 
-from pace_optim.cli import run_cli
 from pace_optim.data_collection import cfg_from_args, collect, make_collection_parser
 from pace_optim.experiment_design import design_table
-from pace_optim.progress import ProgressLine
+from pace_optim.terminal.cli import run_cli
+from pace_optim.terminal.progress import ProgressLine
 
 
 def main() -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import torch
 
-from pace_optim.cli import make_parser, run_cli
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.fit import fit
-from pace_optim.fit_settings import FitSettings
 from pace_optim.report import write_report
-from pace_optim.summary import summary
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.summary import summary
+from pace_optim.terminal.cli import make_parser, run_cli
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]

@@ -4,9 +4,9 @@ import sys
 
 import torch
 
-from pace_optim.cli import make_parser, run_cli
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.report import write_report
+from pace_optim.terminal.cli import make_parser, run_cli
 
 
 def main() -> None:

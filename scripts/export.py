@@ -2,8 +2,8 @@
 
 import sys
 
-from pace_optim.cli import make_parser, run_cli
 from pace_optim.export import FORMATS, export
+from pace_optim.terminal.cli import make_parser, run_cli
 
 
 def main() -> None:

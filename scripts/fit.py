@@ -4,11 +4,11 @@ import sys
 
 import torch
 
-from pace_optim.cli import import_task, make_parser, run_cli
 from pace_optim.fit import fit, resume
-from pace_optim.fit_settings import OPTIMIZERS, FitSettings
-from pace_optim.problem import DELAY_MODES
-from pace_optim.summary import summary
+from pace_optim.problem.problem import DELAY_MODES
+from pace_optim.run.settings import OPTIMIZERS, FitSettings
+from pace_optim.run.summary import summary
+from pace_optim.terminal.cli import import_task, make_parser, run_cli
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from pace_envs import load_env_cfg, registered_tasks
-from pace_optim.cli import make_parser, run_cli
+from pace_optim.terminal.cli import make_parser, run_cli
 
 HEADER = ("task", "robot", "joints", "physics/control", "sample recording")
 

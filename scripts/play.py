@@ -9,8 +9,8 @@ if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported: films need no screen
 
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
-from pace_optim.cli import import_task, make_parser, run_cli  # noqa: E402
-from pace_optim.training_replay import replay_in_training  # noqa: E402
+from pace_optim.run.training_replay import replay_in_training  # noqa: E402
+from pace_optim.terminal.cli import import_task, make_parser, run_cli  # noqa: E402
 
 
 def main() -> None:

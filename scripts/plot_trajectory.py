@@ -8,11 +8,11 @@ import matplotlib
 import torch
 from matplotlib.figure import Figure
 
-from pace_optim.cli import make_parser, run_cli
-from pace_optim.find_run import find_mean, find_run
-from pace_optim.history import History
-from pace_optim.plots import plot_scores, plot_trajectories
-from pace_optim.replay import replay
+from pace_optim.report.plots import plot_scores, plot_trajectories
+from pace_optim.run.find import find_mean, find_run
+from pace_optim.run.history import History
+from pace_optim.run.replay import replay
+from pace_optim.terminal.cli import make_parser, run_cli
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import sys
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from pace_envs.rl import RunSettings, resume, train
-from pace_optim.cli import import_task, make_parser, run_cli
+from pace_optim.terminal.cli import import_task, make_parser, run_cli
 
 
 def main() -> None:

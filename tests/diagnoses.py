@@ -13,16 +13,16 @@ from run_folders import JOINTS, make_result
 
 from pace_actuators.effects import Effect, get_effect
 from pace_envs import set_physics_dt
-from pace_optim.atomic import write_json
-from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE
-from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.trials import Trial
-from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Trial
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE
+from pace_optim.diagnosis.search.search import Outcome
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
-from pace_optim.problem import load_problem
+from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
+from pace_optim.single_joint_model import reference_path, twin_problem
+from pace_optim.terminal.atomic import write_json
 
 
 def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:

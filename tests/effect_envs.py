@@ -12,7 +12,7 @@ from problems import BENCH, DT, TRUTH, env_cfg
 
 from pace_actuators.effects import EffectCfg, available_effects, get_effect
 from pace_envs import ManagerBasedRLEnv
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import ParameterSpace
 
 torch.set_num_threads(1)
 

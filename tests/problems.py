@@ -15,11 +15,11 @@ from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_env_cfg
 from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.pace_cfg import make_bounds
-from pace_optim.dataset import make_dataset
-from pace_optim.kinematic_trees import independent_trees
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.problem import Problem
+from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
 from pace_optim.recording import Drive, Load, Recording, conform_recording
+from pace_optim.recording.dataset import make_dataset
 
 torch.set_num_threads(1)  # small tensors
 
@@ -129,7 +129,7 @@ def make_problem(
     train_fraction: float = 1.0,
     delay_mode: str = "command",
 ) -> Problem:
-    """What :func:`pace_optim.problem.load_problem` makes of files, of recordings."""
+    """What :func:`pace_optim.problem.problem.load_problem` makes of files, of recordings."""
     cfg = copy.deepcopy(cfg or env_cfg())
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings or [record()])
     for each in cfg.scene.robot.actuators.values():

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from pace_optim.atomic import write_json, write_tensors
-from pace_optim.fit_result import FitResult
-from pace_optim.history import History
+from pace_optim.run.history import History
+from pace_optim.run.result import FitResult
+from pace_optim.terminal.atomic import write_json, write_tensors
 
 JOINTS = ("hip", "knee", "ankle")
 UNITS = {

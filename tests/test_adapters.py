@@ -12,7 +12,7 @@ from torque_sequence import DT, ENVS, JOINTS, STEPS, sequence, write_result
 from pace_actuators import IdentifiedDrives, PaceDCMotorCfg
 from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, use_identified
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import ParameterSpace
 
 MODES = ("command", "effort")
 

@@ -13,10 +13,10 @@ import torch
 from problems import ANYMAL, BENCH, env_cfg, record
 
 from pace_envs.tasks.pace import Parameter, test_bench
-from pace_optim.cli import run_cli
 from pace_optim.fit import fit
-from pace_optim.fit_settings import FitSettings
 from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.cli import run_cli
 
 ROOT = Path(__file__).parents[1]
 JOINTS = env_cfg(ANYMAL).sim2real.joint_order

@@ -17,10 +17,10 @@ from problems import (
 )
 
 from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.convergence import TargetScore
-from pace_optim.search import search
-from pace_optim.tree_strategy import DIVERGED_SCORE
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.convergence import TargetScore
+from pace_optim.optimizers.search import search
+from pace_optim.optimizers.tree_strategy import DIVERGED_SCORE
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.tasks.pace import Parameter
-from pace_optim import consistency
-from pace_optim.consistency import check_consistency
-from pace_optim.jacobian import colour
-from pace_optim.least_squares import least_squares
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.problem import load_problem
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
+from pace_optim.uncertainty import consistency
+from pace_optim.uncertainty.consistency import check_consistency
 
 GAINS = {"soft": (60.0, 1.0), "middle": (85.0, 2.0), "stiff": (120.0, 4.0)}
 
@@ -92,7 +92,7 @@ def test_a_controller_of_another_rate_than_the_environment_is_refused(monkeypatc
         other.decimation = 4
         return other
 
-    monkeypatch.setattr("pace_optim.problem.load_env_cfg", cfg)
+    monkeypatch.setattr("pace_optim.problem.problem.load_env_cfg", cfg)
     monkeypatch.setattr(ManagerBasedRLEnv, "__init__", lambda *args: pytest.fail("checked too late"))
     with pytest.raises(ValueError, match=r"controller runs every 2\.5 ms, the environment steps every 10 ms"):
         load_problem("Pace-TestBench-v0")

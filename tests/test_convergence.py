@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from pace_optim.convergence import MovingWindow, ParameterSpread, Plateau, ScoreSpread, SearchState, TargetScore
+from pace_optim.optimizers.convergence import (
+    MovingWindow,
+    ParameterSpread,
+    Plateau,
+    ScoreSpread,
+    SearchState,
+    TargetScore,
+)
 
 
 def state(scores=(1.0, 2.0), best=(1.0,), spread=(0.5,)):

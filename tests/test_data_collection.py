@@ -14,12 +14,12 @@ from command_lines import run_script
 
 import pace_envs
 from pace_envs.tasks.pace import go2
-from pace_optim.cli import run_cli
 from pace_optim.data_collection import Encoder, true_parameters
-from pace_optim.dataset import make_dataset
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import conform_recording, load_recording
-from pace_optim.rollout import Rollout
+from pace_optim.recording.dataset import make_dataset
+from pace_optim.terminal.cli import run_cli
 
 ROOT = Path(__file__).parents[1]
 BENCH = ("--task", "Pace-TestBench-v0")

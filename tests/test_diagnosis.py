@@ -15,15 +15,15 @@ from problems import BENCH, DT
 from run_folders import make_result
 
 from pace_actuators.effects import get_effect
-from pace_optim.atomic import write_json
 from pace_optim.diagnosis import candidate_effects
-from pace_optim.diagnosis.acceptance import BlockErrors, block_errors, check_long_enough, judge
+from pace_optim.diagnosis.candidates.screening import _FOLDS, _explained
 from pace_optim.diagnosis.diagnose import search_effects
-from pace_optim.diagnosis.next_experiment import rivals_of
-from pace_optim.diagnosis.processes import spread
-from pace_optim.diagnosis.screening import _FOLDS, _explained
-from pace_optim.diagnosis.trials import Round
-from pace_optim.diagnosis.verdict import explained_joints, labels, ranking, verdict
+from pace_optim.diagnosis.fitting.processes import spread
+from pace_optim.diagnosis.judging.acceptance import BlockErrors, block_errors, check_long_enough, judge
+from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.telling.next_experiment import rivals_of
+from pace_optim.diagnosis.verdict.verdict import explained_joints, labels, ranking, verdict
+from pace_optim.terminal.atomic import write_json
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

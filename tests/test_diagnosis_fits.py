@@ -10,17 +10,19 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis import base_fit, descent, search
-from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.data_check import check_data
-from pace_optim.diagnosis.descent import fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.far_starts import far_starts
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.levenberg_marquardt import Way
-from pace_optim.diagnosis.model import BASE, JointModel, start_values, whole_values
-from pace_optim.diagnosis.own_motion import OwnMotion
-from pace_optim.diagnosis.side_by_side import SideBySide, Slot, _merged
-from pace_optim.joint_twins import reference_path, twin_problem
+from pace_optim.diagnosis.beginning import base_fit
+from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.beginning.data_check import check_data
+from pace_optim.diagnosis.candidates.multistart import far_starts
+from pace_optim.diagnosis.fitting import coarse_to_fine as descent
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine, fit_side_by_side
+from pace_optim.diagnosis.fitting.levenberg_marquardt import Way
+from pace_optim.diagnosis.fitting.reference_update import OwnMotion
+from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot, _merged
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
+from pace_optim.diagnosis.search import search
+from pace_optim.single_joint_model import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

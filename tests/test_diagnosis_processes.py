@@ -13,13 +13,13 @@ import torch
 from diagnoses import joint_alone
 
 from pace_actuators.effects import Effect, get_effect
-from pace_optim.diagnosis import processes
-from pace_optim.diagnosis.descent import fit_side_by_side
-from pace_optim.diagnosis.far_starts import far_starts
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel, start_values
-from pace_optim.diagnosis.processes import spread
-from pace_optim.diagnosis.screening import screen
+from pace_optim.diagnosis.candidates.multistart import far_starts
+from pace_optim.diagnosis.candidates.screening import screen
+from pace_optim.diagnosis.fitting import processes
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.fitting.processes import spread
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 

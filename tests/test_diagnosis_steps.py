@@ -9,16 +9,20 @@ from diagnoses import errors_of, joint_alone, make_trial, outcome_of, with_effec
 from problems import DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import next_experiment, one_for_several, one_round, search, some_joints, swapping
-from pace_optim.diagnosis.descent import fit_side_by_side
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.next_experiment import distances, menu, next_experiments, rivals_of
-from pace_optim.diagnosis.screening import absorbed_effects
-from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.stand_ins import stand_ins
-from pace_optim.diagnosis.trials import Round
-from pace_optim.diagnosis.verdict import explained_joints, labels, verdict
+from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.judging import some_joints
+from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search import merge_effects as one_for_several
+from pace_optim.diagnosis.search import one_round, search
+from pace_optim.diagnosis.search import replace_effect as swapping
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.telling import next_experiment
+from pace_optim.diagnosis.telling.next_experiment import distances, menu, next_experiments, rivals_of
+from pace_optim.diagnosis.verdict.proxy_effects import stand_ins
+from pace_optim.diagnosis.verdict.verdict import explained_joints, labels, verdict
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))

@@ -9,7 +9,13 @@ from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_cfg import make_bounds
 from pace_optim.excitation import Trajectory, excitations, make_excitation, register_excitation, write_command_csv
-from pace_optim.motion_check import MotionLimits, check_command, check_simulated, refuse_errors, summarise
+from pace_optim.experiment_design.motion_check import (
+    MotionLimits,
+    check_command,
+    check_simulated,
+    refuse_errors,
+    summarise,
+)
 
 DT = 0.0025
 TASKS = ("Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0")

@@ -9,17 +9,17 @@ from problems import ANYMAL, BENCH, DT, env_cfg, make_problem, normalised, pendu
 
 from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg
-from pace_optim.assessment import assess
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.data_collection.design import expected_parameters
 from pace_optim.excitation import make_excitation
 from pace_optim.experiment_design import DesignCfg, optimize_motion
 from pace_optim.experiment_design.joint_motion import slowed
-from pace_optim.jacobian import colour
-from pace_optim.least_squares import least_squares
-from pace_optim.motion_check import MotionLimits, check_command
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.experiment_design.motion_check import MotionLimits, check_command
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import Recording, load_recording
+from pace_optim.uncertainty.assessment import assess
 
 NOISE = 1e-4  # [rad]
 SMALL = DesignCfg(noise=NOISE, candidates=(8, 4), width=(0.2,))

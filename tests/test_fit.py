@@ -13,11 +13,11 @@ from problems import BENCH, TRUTH, chirp, record
 
 import pace_optim.fit as fit_module
 from pace_optim.fit import fit, resume
-from pace_optim.fit_result import FitResult
-from pace_optim.fit_settings import FitSettings
-from pace_optim.progress import ProgressLine
 from pace_optim.recording import Drive, Load, load_recording, save_recording
-from pace_optim.summary import summary
+from pace_optim.run.result import FitResult
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.summary import summary
+from pace_optim.terminal.progress import ProgressLine
 
 DESIGN_KEYS = {
     "version",
@@ -343,7 +343,7 @@ def test_a_fit_in_which_everything_diverges_says_so(recordings, tmp_path):
 
 def test_the_time_left_is_that_of_the_phase(monkeypatch):
     now, out = [0.0], io.StringIO()
-    monkeypatch.setattr("pace_optim.progress.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("pace_optim.terminal.progress.time.perf_counter", lambda: now[0])
     line = ProgressLine(out)
     now[0] = 100.0
     line.say("something before")

@@ -12,19 +12,19 @@ from problems import BENCH, CALM
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
-from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.advice import advise
-from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import summary_of
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.free_curves import Curves, error_map, fit_curves, take_curves
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.validation import validation_errors
-from pace_optim.diagnosis.verdict import labels, verdict
-from pace_optim.fit_result import FitResult
+from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.telling.advice import advise
+from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
+from pace_optim.diagnosis.verdict.verdict import labels, verdict
 from pace_optim.report import write_report
+from pace_optim.run.result import FitResult
 
 CURVES = [name for name in available_effects() if get_effect(name).free_form]
 YES = torch.tensor([True])
@@ -121,7 +121,7 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
             curves.errors[curves.best(0)], square=times * curves.errors[curves.best(0)].square
         )
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
-    monkeypatch.setattr("pace_optim.diagnosis.free_curves.SomeJoints.refitted", lambda *_: fits)
+    monkeypatch.setattr("pace_optim.diagnosis.verdict.free_curves.SomeJoints.refitted", lambda *_: fits)
     found = fit_curves(outcome, FLOOR)
     assert found.instead.tolist() == [instead]
     take_curves(outcome, found)
@@ -205,7 +205,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
         "friction_over_speed@b. With all of it"
     )
-    monkeypatch.setattr("pace_optim.diagnosis.advice.next_experiments", lambda *_: [])
+    monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
     advice = advise(robot, outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
     told = error_map(curves, robot.joint_names)

@@ -20,9 +20,9 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.fit import fit
-from pace_optim.fit_result import drive_in_force
-from pace_optim.fit_settings import FitSettings
-from pace_optim.training_replay import replay_in_training
+from pace_optim.run.result import drive_in_force
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.training_replay import replay_in_training
 
 ROOT = Path(__file__).parents[1]
 CHIRP = chirp(0.2)

@@ -14,7 +14,7 @@ from problems import (
     record,
 )
 
-from pace_optim.jacobian import Colouring, colour, jacobian, perturbed
+from pace_optim.optimizers.jacobian import Colouring, colour, jacobian, perturbed
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}
 

@@ -6,7 +6,7 @@ import pytest
 from problems import env_cfg, pendulums_cfg
 
 from pace_envs import ManagerBasedRLEnv
-from pace_optim.kinematic_trees import independent_trees
+from pace_optim.problem.kinematic_trees import independent_trees
 
 
 def trees(cfg):

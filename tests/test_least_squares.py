@@ -19,9 +19,9 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear
 
-from pace_optim.evaluator import Residuals
-from pace_optim.jacobian import Colouring, colour
-from pace_optim.least_squares import Descent, LeastSquaresCfg, bounded_step, least_squares
+from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, bounded_step, least_squares
+from pace_optim.problem.evaluator import Residuals
 
 
 def refine(problem, *starts, cfg=None, **options):

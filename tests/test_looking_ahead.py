@@ -7,10 +7,10 @@ import torch
 from diagnoses import errors_of, make_trial
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import search, steps
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.trials import Round
+from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search import search, steps
 
 ELASTICITY, MOUNT, GAIN, SPRING = (
     get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring")

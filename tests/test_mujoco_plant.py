@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 import mujoco_plant
 
-from pace_optim.problem import load_problem
+from pace_optim.problem.problem import load_problem
 
 BASE = {"armature": 0.08, "viscous_friction": 1.0, "friction": 0.5, "encoder_bias": 0.02, "delay": 2.3}
 HIDDEN = {

@@ -10,10 +10,10 @@ from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, re
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.model import BASE
-from pace_optim.diagnosis.one_delay import hold_late_joints, later_than_most
-from pace_optim.diagnosis.screening import absorbed_effects
+from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints, later_than_most
+from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.model.model import BASE
 
 LATE_LOG = get_effect("measurement_delay")
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.02, "delay": 2.0}
@@ -92,5 +92,7 @@ def test_where_no_joint_is_late_the_base_model_stays_as_it_is(punctual):
 def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypatch):
     """That of a joint that hardly moves may be anything."""
     twins, base = punctual
-    monkeypatch.setattr("pace_optim.diagnosis.one_delay.later_than_most", lambda delay: torch.arange(len(delay)) == 4)
+    monkeypatch.setattr(
+        "pace_optim.diagnosis.beginning.shared_delay.later_than_most", lambda delay: torch.arange(len(delay)) == 4
+    )
     assert hold_late_joints(twins, base) == (base, [])

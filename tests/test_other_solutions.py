@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from pace_envs import load_env_cfg
-from pace_optim.least_squares import Descent
-from pace_optim.other_solutions import with_other_solutions
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.uncertainty import Uncertainty
+from pace_optim.optimizers.least_squares import Descent
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.uncertainty.other_solutions import with_other_solutions
+from pace_optim.uncertainty.uncertainty import Uncertainty
 
 SPACE = ParameterSpace.of(load_env_cfg("Pace-TestBench-v0").sim2real)
 SURE = Uncertainty(

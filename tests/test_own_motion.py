@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace_optim.diagnosis import own_motion
-from pace_optim.diagnosis.own_motion import OwnMotion
+from pace_optim.diagnosis.fitting import reference_update as own_motion
+from pace_optim.diagnosis.fitting.reference_update import OwnMotion
 
 FLOOR = 0.5
 

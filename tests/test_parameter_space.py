@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from problems import TRUTH, chirp, env_cfg, make_problem, range_error, record
 
 from pace_envs.tasks.pace import Parameter, base_parameters
-from pace_optim.jacobian import colour
-from pace_optim.least_squares import least_squares
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.problem.parameter_space import ParameterSpace
 
 
 def parameter(name="gain", *, keys=("a", "b"), lower=None, upper=None, scale="linear", apply=lambda env, values: None):

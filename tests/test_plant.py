@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 from problems import BENCH, env_cfg
 
-from pace_optim.cli import run_cli
-from pace_optim.dataset import make_dataset
-from pace_optim.parameter_space import ParameterSpace
 from pace_optim.plant import (
     BENCH_LOAD,
     EFFECTS,
@@ -37,8 +34,11 @@ from pace_optim.plant import (
 )
 from pace_optim.plant.friction_solver import friction_impulse
 from pace_optim.plant.suite import make_suite
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, conform_recording, load_recording
-from pace_optim.rollout import Rollout
+from pace_optim.recording.dataset import make_dataset
+from pace_optim.terminal.cli import run_cli
 
 ROOT = Path(__file__).parents[1]
 DT = 0.0025
@@ -75,7 +75,7 @@ def test_the_plant_shares_no_code_with_the_model(path):
             names = [node.module or ""]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "import" in path.name:
             names = [node.value]
-        foreign = [name for name in names if name.startswith(("pace_actuators", "torch", "pace_optim.rollout"))]
+        foreign = [name for name in names if name.startswith(("pace_actuators", "torch", "pace_optim.problem.rollout"))]
         assert not foreign, f"{path.name} imports {foreign}"
 
 

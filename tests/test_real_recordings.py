@@ -16,9 +16,9 @@ import real_robots
 import static_sag
 
 from pace_envs import load_env_cfg
-from pace_optim.cli import run_cli
-from pace_optim.problem import load_problem
+from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Recording, load_recording, save_recording
+from pace_optim.terminal.cli import run_cli
 
 needs_measurements = pytest.mark.skipif(
     not real_recordings.SOURCE.is_dir(), reason=f"the real recordings are not at {real_recordings.SOURCE}"

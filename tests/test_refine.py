@@ -4,10 +4,10 @@ import pytest
 import torch
 from problems import make_problem, normalised
 
-from pace_optim.dataset import make_dataset
-from pace_optim.jacobian import colour, jacobian, perturbed
-from pace_optim.least_squares import Descent, least_squares
-from pace_optim.refine import beginning, refine
+from pace_optim.optimizers.jacobian import colour, jacobian, perturbed
+from pace_optim.optimizers.least_squares import Descent, least_squares
+from pace_optim.optimizers.refine import beginning, refine
+from pace_optim.recording.dataset import make_dataset
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,6 @@ def test_a_start_that_is_better_than_its_coarse_end_is_kept(problem, colouring, 
     def led_astray(evaluator, colouring, starts, cfg=None, on_iteration=None, where=None):
         return list(starts) if where is None else [Descent(x=torch.full_like(x, 0.9)) for x in starts]
 
-    monkeypatch.setattr("pace_optim.refine.least_squares", led_astray)
+    monkeypatch.setattr("pace_optim.optimizers.refine.least_squares", led_astray)
     best = refine(problem.training_evaluator(), colouring, [Descent(x=normalised(problem))])[0]
     assert torch.equal(best.x, normalised(problem)) and best.score < 1e-14

@@ -23,9 +23,9 @@ from problems import PENDULUMS_TRUTH as TWO
 
 from pace_envs import set_physics_dt
 from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Load
-from pace_optim.rollout import Rollout
 
 EXACT = 1e-12  # [rad²]
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05}

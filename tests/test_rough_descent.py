@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace_optim.diagnosis import descent
-from pace_optim.diagnosis.descent import fit_side_by_side
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
+from pace_optim.diagnosis.fitting import coarse_to_fine as descent
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
 
 SAMPLES, TRUTH = 400, torch.tensor([0.3, -0.2, 0.5, 0.1, -0.4], dtype=torch.float64)
 

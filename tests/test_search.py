@@ -6,12 +6,12 @@ import pytest
 import torch
 from problems import chirp, make_problem, record
 
-import pace_optim.search as search_module
+import pace_optim.optimizers.search as search_module
 from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.evaluator import Residuals
-from pace_optim.jacobian import Colouring, colour
-from pace_optim.search import RefiningPays, search
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.optimizers.search import RefiningPays, search
+from pace_optim.problem.evaluator import Residuals
 
 
 class FakeOptimizer:

@@ -11,15 +11,15 @@ from problems import ANYMAL, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import get_effect
 from pace_envs.simulation import SimulationCfg
-from pace_optim.diagnosis.base_fit import joint_vectors
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.one_round import _choose
-from pace_optim.diagnosis.side_by_side import SideBySide, Slot
-from pace_optim.diagnosis.some_joints import SomeJoints
-from pace_optim.diagnosis.trials import Round
-from pace_optim.joint_twins import reference_path, twin_problem
-from pace_optim.joint_twins.simulation import TwinSimulation
+from pace_optim.diagnosis.beginning.base_fit import joint_vectors
+from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.some_joints import SomeJoints
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search.one_round import _choose
 from pace_optim.recording import Load
+from pace_optim.single_joint_model import reference_path, twin_problem
+from pace_optim.single_joint_model.simulation import TwinSimulation
 
 ELASTICITY, MOUNT, GAIN, FRICTION, PAYLOAD = (
     get_effect(name)

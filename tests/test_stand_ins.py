@@ -11,15 +11,15 @@ from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
-from pace_optim.diagnosis.acceptance import BlockErrors
-from pace_optim.diagnosis.data_check import DataCheck
+from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import Findings, summary_of
-from pace_optim.diagnosis.evenness import unevenness
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.search import Outcome
-from pace_optim.diagnosis.stand_ins import stand_ins, varying
-from pace_optim.diagnosis.verdict import verdict
+from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.judging.size_consistency import unevenness
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.verdict.proxy_effects import stand_ins, varying
+from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
 
 SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")

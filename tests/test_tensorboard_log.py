@@ -10,9 +10,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, base_parameters
 from pace_envs.tasks.pace.pace_cfg import make_bounds
-from pace_optim.cmaes_optimizer import CMAESOptimizer
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.tensorboard_log import TensorBoardLog
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.run.tensorboard_log import TensorBoardLog
 
 GENERATIONS = 12
 
@@ -104,7 +104,7 @@ def test_nothing_is_written_before_the_first_event(tmp_path):
 def test_importing_it_does_not_import_tensorboard():
     import subprocess
 
-    code = "import sys, pace_optim.tensorboard_log; sys.exit('tensorboard' in sys.modules)"
+    code = "import sys, pace_optim.run.tensorboard_log; sys.exit('tensorboard' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

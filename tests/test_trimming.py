@@ -8,12 +8,12 @@ import torch
 from diagnoses import joint_alone
 from problems import DT
 
-from pace_optim import windows
-from pace_optim.diagnosis import trimming
-from pace_optim.diagnosis.descent import fit_over_wide_steps
-from pace_optim.diagnosis.fitted import Fitted
-from pace_optim.diagnosis.model import BASE, JointModel
-from pace_optim.diagnosis.trimming import fit_trimmed
+from pace_optim.diagnosis.fitting import trimmed_fit as trimming
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_over_wide_steps
+from pace_optim.diagnosis.fitting.trimmed_fit import fit_trimmed
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.recording import windows
 
 ALL = torch.tensor([True])
 

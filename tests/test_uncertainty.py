@@ -6,12 +6,12 @@ import torch
 from problems import TRUTH, chirp, env_cfg, make_problem, normalised, physical, record
 
 from pace_envs.tasks.pace import Parameter
-from pace_optim.assessment import assess
-from pace_optim.evaluator import Residuals
-from pace_optim.jacobian import Colouring, Jacobian, colour
-from pace_optim.least_squares import least_squares
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.uncertainty import autocovariance, estimate_uncertainty
+from pace_optim.optimizers.jacobian import Colouring, Jacobian, colour
+from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.uncertainty.assessment import assess
+from pace_optim.uncertainty.uncertainty import autocovariance, estimate_uncertainty
 
 
 def linear(columns, error, names=None):

@@ -7,8 +7,8 @@ import torch
 from diagnoses import make_trial
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis import one_round
-from pace_optim.diagnosis.weighing import _evidence
+from pace_optim.diagnosis.candidates.evidence import _evidence
+from pace_optim.diagnosis.search import one_round
 
 K, OWN, OTHERS = 200, 2, 6
 OFFSET, SPRING, GAIN = (get_effect(name) for name in ("torque_offset", "parallel_spring", "torque_gain"))

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.atomic import write_atomically
 from pace_optim.report import write_report
-from pace_optim.trajectory_errors import held_out_spans
+from pace_optim.report.trajectory_errors import held_out_spans
+from pace_optim.terminal.atomic import write_atomically
 
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.trajectory_errors import rms
+from pace_optim.report.trajectory_errors import rms
 
 from .dimensions import Dimension, dimensions_of
 from .frequency import band_edges, band_power, narrowest_band, response

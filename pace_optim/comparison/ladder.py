@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.number_text import angle_unit, three_figures
-from pace_optim.trajectory_errors import rms
+from pace_optim.report.number_text import angle_unit, three_figures
+from pace_optim.report.trajectory_errors import rms
 
 from .joint import noise_floors, rmse_by_part
 from .tracks import RunTracks, Track

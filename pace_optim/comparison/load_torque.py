@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 
 from pace_envs import ManagerBasedEnv
-from pace_optim.evaluator import Evaluator
+from pace_optim.problem.evaluator import Evaluator
 
 _CUTOFF = 10.0
 _MODEL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pace_optim.number_text import angle_text, angle_unit
+from pace_optim.report.number_text import angle_text, angle_unit
 
 from .dimensions import Dimension
 from .regions import Layout, Region, best_region, evidence, inside, refine

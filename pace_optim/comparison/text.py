@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pace_optim.number_text import angle_unit
+from pace_optim.report.number_text import angle_unit
 
 from .ladder import ladder_table
 

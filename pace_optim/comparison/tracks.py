@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.assessment import trajectories
-from pace_optim.evaluator import Evaluator
-from pace_optim.fit_result import FitResult
-from pace_optim.fit_settings import FitSettings
-from pace_optim.problem import Problem, file_digest, load_problem
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.problem import Problem, file_digest, load_problem
 from pace_optim.recording import Drive, Recording
+from pace_optim.run.result import FitResult
+from pace_optim.run.settings import FitSettings
+from pace_optim.uncertainty.assessment import trajectories
 
 from .load_torque import load_torques
 

@@ -7,11 +7,11 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pace_optim.cli import Parser, import_task, make_parser
 from pace_optim.excitation import excitations
-from pace_optim.motion_check import MAX_SHARE_AT_LIMIT
+from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
+from pace_optim.terminal.cli import Parser, import_task, make_parser
 
 from .cfg import CollectionCfg
 

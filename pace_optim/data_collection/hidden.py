@@ -11,7 +11,6 @@ import torch
 
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.excitation import Trajectory
-from pace_optim.parameter_space import ParameterSpace
 from pace_optim.plant import (
     BaseTruth,
     PlantCfg,
@@ -23,6 +22,7 @@ from pace_optim.plant import (
     session_of,
     simulate_motions,
 )
+from pace_optim.problem.parameter_space import ParameterSpace
 
 from .cfg import CollectionCfg
 from .simulate import Simulated

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from pace_optim.dataset import make_dataset
 from pace_optim.excitation import Trajectory
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, Recording, conform_recording
-from pace_optim.rollout import Rollout
+from pace_optim.recording.dataset import make_dataset
 
 from .encoder import Encoder
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pace_envs.tasks.pace import PaceCfg
-from pace_optim.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import ParameterSpace
 
 
 def true_parameters(cfg: PaceCfg, space: ParameterSpace, overrides: Mapping[str, float]) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """Which physical effect is missing: search joint by joint, judge on recordings that were not fitted, advise."""
 
 from pace_optim.diagnosis.diagnose import candidate_effects, diagnose, search_effects
-from pace_optim.diagnosis.result import Diagnosis
 from pace_optim.diagnosis.settings import DiagnosisSettings
+from pace_optim.diagnosis.telling.result import Diagnosis
 
 __all__ = ["Diagnosis", "DiagnosisSettings", "candidate_effects", "diagnose", "search_effects"]

@@ -10,28 +10,28 @@ from pathlib import Path
 import torch
 
 from pace_actuators.effects import Effect, available_effects, get_effect
-from pace_optim.diagnosis.acceptance import check_long_enough
-from pace_optim.diagnosis.advice import advise
-from pace_optim.diagnosis.base_fit import fit_base
-from pace_optim.diagnosis.data_check import FLOOR_MARGIN, DataCheck, check_data
-from pace_optim.diagnosis.denormals import flushed_denormals
-from pace_optim.diagnosis.free_curves import Curves, error_map, fit_curves, take_curves
-from pace_optim.diagnosis.model import whole_values
-from pace_optim.diagnosis.one_delay import hold_late_joints
-from pace_optim.diagnosis.own_motion import OwnMotion
-from pace_optim.diagnosis.result import Diagnosis
-from pace_optim.diagnosis.screening import absorbed_effects
-from pace_optim.diagnosis.search import Outcome, add_effects
+from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.beginning.data_check import FLOOR_MARGIN, DataCheck, check_data
+from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
+from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.fitting.denormals import flushed_denormals
+from pace_optim.diagnosis.fitting.reference_update import OwnMotion
+from pace_optim.diagnosis.judging.acceptance import check_long_enough
+from pace_optim.diagnosis.model.model import whole_values
+from pace_optim.diagnosis.search.pooling import share
+from pace_optim.diagnosis.search.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
-from pace_optim.diagnosis.shares import DOMINANT, shares
-from pace_optim.diagnosis.sharing import share
-from pace_optim.diagnosis.stand_ins import UNKNOWN_RATIO, curves_in, stand_ins, varying
-from pace_optim.diagnosis.verdict import explained_joints, keep_on, labels, ranking, verdict
+from pace_optim.diagnosis.telling.advice import advise
+from pace_optim.diagnosis.telling.result import Diagnosis
+from pace_optim.diagnosis.verdict.contributions import DOMINANT, shares
+from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
+from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in, stand_ins, varying
+from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, ranking, verdict
 from pace_optim.fit import fit
-from pace_optim.fit_result import FitResult
-from pace_optim.fit_settings import FitSettings
-from pace_optim.problem import Problem, load_problem
-from pace_optim.progress import ProgressLine
+from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.run.result import FitResult
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.progress import ProgressLine
 
 
 @dataclass(kw_only=True, eq=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pace_optim.jacobian import colour
-from pace_optim.problem import Problem
-from pace_optim.uncertainty import Uncertainty, uncertainty_of
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.uncertainty import Uncertainty, uncertainty_of
 
 _UNIFORM = 12.0 / 2.0**2
 """Precision of what is known before: anywhere within the bounds, [-1, 1]."""

@@ -10,10 +10,10 @@ import torch
 
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.excitation import Trajectory
-from pace_optim.motion_check import MotionLimits
-from pace_optim.parameter_space import ParameterSpace
-from pace_optim.problem import Problem
-from pace_optim.uncertainty import Uncertainty
+from pace_optim.experiment_design.motion_check import MotionLimits
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.uncertainty import Uncertainty
 
 from .criterion import expected_uncertainty, mean_log_error
 from .information import Information, ProblemOf, information_of

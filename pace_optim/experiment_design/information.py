@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from pace_optim.assessment import Probes, make_probes
 from pace_optim.excitation import Trajectory
-from pace_optim.jacobian import Colouring, colour
-from pace_optim.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
-from pace_optim.problem import Problem
+from pace_optim.experiment_design.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
+from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.assessment import Probes, make_probes
 
 ProblemOf = Callable[[Sequence[Trajectory]], Problem]
 """Makes the problem whose recordings follow trajectories; their measured positions do not matter but for the first."""
@@ -29,7 +29,7 @@ class Information:
         hessian_t = J_tᵀ J_t,    middle_t = J_tᵀ (I + S_t S_tᵀ) J_t
 
     Both add over trees. White noise of variance σ² in every sample gives the parameters the covariance σ² H⁻¹ M H⁻¹
-    (see ``pace_optim.uncertainty``).
+    (see ``pace_optim.uncertainty.uncertainty``).
     """
 
     hessian: np.ndarray

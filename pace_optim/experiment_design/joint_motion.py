@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg
 from pace_optim.excitation import Trajectory, make_excitation
-from pace_optim.motion_check import MotionLimits
+from pace_optim.experiment_design.motion_check import MotionLimits
 
 _SMALLEST_AMPLITUDE = 0.2  # of the room
 _NARROWEST_BAND = 3.0  # upper over lower end

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.fit_warnings import in_words
-from pace_optim.uncertainty import Uncertainty
+from pace_optim.uncertainty.uncertainty import Uncertainty
+from pace_optim.uncertainty.warnings import in_words
 
 from .design import Design
 

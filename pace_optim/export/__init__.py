@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
-from pace_optim.atomic import write_atomically
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf
+from pace_optim.terminal.atomic import write_atomically
 
 __all__ = ["FORMATS", "Export", "export"]
 

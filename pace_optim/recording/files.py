@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.atomic import write_atomically
+from pace_optim.terminal.atomic import write_atomically
 
 from .checks import check_recording
 from .csv_format import read_csv, write_csv

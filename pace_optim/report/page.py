@@ -7,7 +7,7 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from pace_optim.atomic import write_atomically
+from pace_optim.terminal.atomic import write_atomically
 
 from .markup import Section, esc
 from .run_data import RunData

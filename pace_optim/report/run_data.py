@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.fit_result import FitResult
-from pace_optim.history import History
+from pace_optim.run.history import History
+from pace_optim.run.result import FitResult
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from pace_optim.number_text import angle_unit, three_figures
+from pace_optim.report.number_text import angle_unit, three_figures
 
 from ..markup import Section, bullets, esc, figure, table
 from ..run_data import RunData

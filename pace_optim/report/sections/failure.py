@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pace_optim.number_text import angle_unit, three_figures
+from pace_optim.report.number_text import angle_unit, three_figures
 
 from ..markup import Section, bullets, choice, esc, json_script, table
 from ..run_data import RunData

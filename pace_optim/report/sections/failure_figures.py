@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from pace_optim.number_text import angle_text, angle_unit, short_duration
+from pace_optim.report.number_text import angle_text, angle_unit, short_duration
 
 _PANELS = ("velocity", "since_reversal", "position", "load", "acceleration", "time")
 _MEASURED, _MODEL, _NOISE = "var(--measured)", "var(--simulated)", "var(--muted)"

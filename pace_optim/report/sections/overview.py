@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from pace_optim.fit_result import FitResult
-from pace_optim.number_text import angle_text, angle_unit, three_figures
+from pace_optim.report.number_text import angle_text, angle_unit, three_figures
+from pace_optim.run.result import FitResult
 
 from ..markup import Section, bullets, esc
 from ..run_data import RunData

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pace_optim.number_text import angle_text, angle_unit
-from pace_optim.trajectory_errors import held_out_spans, rms
+from pace_optim.report.number_text import angle_text, angle_unit
+from pace_optim.report.trajectory_errors import held_out_spans, rms
 
 from ..markup import Section, choice, json_script
 from ..run_data import RecordingData, RunData

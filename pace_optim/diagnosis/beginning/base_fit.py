@@ -1,0 +1,88 @@
+"""The base model of each joint, fitted at the step of the diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
+from pace_optim.single_joint_model.problem import TwinProblem
+
+_FAR = 0.02
+"""Where a normalised parameter has moved further than this the reference is computed again."""
+_ROUNDS = 3
+_AWAY = 0.05
+"""What a joint without neighbours feels is taken along the measured motion, unless it ends further from it than this
+(RMS) [rad]: then gravity is not linear in between."""
+
+
+def fit_base(
+    problem: Problem,
+    physical: torch.Tensor,
+    effects: Sequence[type[Effect]] = (),
+    say: Callable[[str], None] = lambda _: None,
+) -> tuple[TwinProblem, Fitted, torch.Tensor]:
+    """Fit the base model from a first guess; the reference that the joints move along follows.
+
+    Args:
+        problem: The whole robot, without effects.
+        physical: First guess of its parameters, (size,).
+        effects: Effects whose influence on the rigid bodies is wanted.
+        say: Shows how far it is.
+
+    Returns:
+        The problem of single joints, the fitted model with its Jacobian, and the typical torque of each joint
+        (n,) [N m].
+    """
+    fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
+    names = [effect.name for effect in effects if effect.overrides("write_model")]
+    along = measured_path if problem.joints_stand_alone else reference_path
+    twins, fitted = _fit_along(problem, fitted, along, names, say)
+    if along is measured_path and float(fitted.score.max()) > _AWAY**2:
+        twins, fitted = _fit_along(problem, fitted, reference_path, names, say)
+    armature = fitted.model.to_physical(fitted.x)[:, BASE.index("armature")]
+    return twins, fitted, twins.path.typical_effort(armature)
+
+
+def _fit_along(
+    problem: Problem,
+    fitted: Fitted,
+    along: Callable[[Problem, torch.Tensor, Sequence[str]], ReferencePath],
+    model_effects: Sequence[str],
+    say: Callable[[str], None],
+) -> tuple[TwinProblem, Fitted]:
+    """The joints along a reference that follows the model, and the model fitted there."""
+
+    def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
+        return along(of, whole_vector(of, fitted.model.to_physical(fitted.x)), model_effects)
+
+    at_control_step = problem.with_physics_dt(problem.control_dt)
+    for i in range(_ROUNDS):
+        say(f"base model, round {i + 1}")
+        coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()
+        before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6)[0]
+        if float((fitted.x - before.x).abs().max()) < _FAR:
+            break
+    twins = twin_problem(problem, path(problem, model_effects))
+    return twins, fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
+
+
+def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:
+    """The base parameters of each joint, (n, 5), of a vector of the whole robot."""
+    n, space = len(problem.joint_names), problem.space
+    return torch.stack([physical[space[name]].expand(n) for name in BASE], dim=1)
+
+
+def whole_vector(problem: Problem, joints: torch.Tensor) -> torch.Tensor:
+    """A vector of the whole robot of each joint's base parameters (n, 5); the delay is the joints' median."""
+    space = problem.space
+    result = space.to_physical(space.start)
+    for k, name in enumerate(BASE):
+        result[space[name]] = joints[:, k].median() if name == "delay" else joints[:, k]
+    return result

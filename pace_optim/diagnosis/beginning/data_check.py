@@ -1,0 +1,118 @@
+"""A look at the recordings before anything is concluded from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from pace_optim.comparison.noise import lattice_step, noise_floor
+from pace_optim.diagnosis.beginning.base_fit import whole_vector
+from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.step_error import step_error
+from pace_optim.run.result import FitResult
+from pace_optim.single_joint_model.problem import TwinProblem
+
+FLOOR_MARGIN = 1.1
+"""An RMSE up to this many times the floor is at the floor."""
+
+
+@dataclass(kw_only=True, eq=False)
+class DataCheck:
+    """What the recordings can show."""
+
+    floor: torch.Tensor
+    """RMSE that no model can go below: measurement noise and the error of the physics step, (n,) [rad]. Where the
+    run's own step leaves no more than that, all that this one leaves."""
+    noise: torch.Tensor
+    """(n,) [rad]."""
+    numerical: torch.Tensor
+    """Change when the physics step is halved, (n,) [rad]."""
+    sentences: list[str] = field(default_factory=list)
+    loads: int = 1
+    """Number of different loads."""
+    gains: int = 1
+    """Number of different gains."""
+
+
+def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResult | None = None) -> DataCheck:
+    """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are.
+
+    Args:
+        problem: The whole robot with the base model.
+        twins: Its joints simulated alone.
+        base: The base model, fitted to them.
+        run: The whole robot's own fit. Where its base model is at the floor with its own physics step, what another
+            step leaves comes from the step: recordings of a simulation are such.
+    """
+    data, names = problem.dataset, problem.joint_names
+    squares, steps = [], {}
+    for recording in data.recordings:
+        dt = float(np.median(np.diff(recording.time)))
+        squares.append([noise_floor(recording.dof_pos[:, j], dt).sigma ** 2 for j in range(len(names))])
+        for j, name in enumerate(names):
+            step = lattice_step(recording.dof_pos[:, j])
+            if step is not None:
+                steps[name] = step
+    noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
+    numerical = step_error(problem, whole_vector(problem, base.model.to_physical(base.x)), data.validation)
+    sentences = [
+        f"Measurement noise: {_span(1e3 * noise)}; halving "
+        f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
+        f"{1e3 * float(numerical.max()):.2g} mrad.",
+    ]
+    if steps:
+        coarse = max(steps, key=lambda name: steps[name])
+        sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} mrad ({coarse}).")
+    loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
+    gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
+    sentences.append(
+        f"{_count(len(data.recordings), 'recording')} with {_count(len(loads), 'load')} and "
+        f"{_count(len(gains), 'set')} of gains."
+    )
+    floor = (noise**2 + numerical**2).sqrt()
+    if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
+        by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
+        left = validation_errors(twins, [base])[0].mse.sqrt()
+        by_step = (by_run <= FLOOR_MARGIN * floor) & (left > FLOOR_MARGIN * floor)
+        if bool(by_step.any()):
+            floor = torch.where(by_step, left, floor)
+            sentences.append(
+                f"With the run's physics step of {1e3 * run.physics_dt:g} ms its model leaves no more than noise on "
+                f"{', '.join(name for name, yes in zip(names, by_step.tolist(), strict=True) if yes)}. What "
+                f"{1e3 * problem.physics_dt:g} ms leave there comes from the step and counts as noise: recordings of a "
+                "simulation are such."
+            )
+    return DataCheck(
+        floor=floor,
+        noise=noise,
+        numerical=numerical,
+        sentences=sentences,
+        loads=len(loads),
+        gains=len(gains),
+    )
+
+
+def _span(values: torch.Tensor) -> str:
+    """Values of all joints [mrad], or the only one."""
+    lowest, highest = f"{float(values.min()):.2g}", f"{float(values.max()):.2g}"
+    return f"{lowest} mrad" if lowest == highest else f"{lowest} to {highest} mrad by joint"
+
+
+def _key(*values: object) -> str:
+    return repr([_plain(value) for value in values])
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

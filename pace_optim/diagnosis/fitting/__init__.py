@@ -1,0 +1,1 @@
+"""Fitting many joints and effects side by side."""

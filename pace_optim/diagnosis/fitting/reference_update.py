@@ -1,0 +1,83 @@
+"""Joints alone move along a reference: with what was found, along the motion that the robot now has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import whole_values
+from pace_optim.diagnosis.verdict.verdict import labels
+from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_model import reference_path, twin_problem
+from pace_optim.single_joint_model.path import ReferencePath
+from pace_optim.single_joint_model.problem import TwinProblem
+
+_FAR = 0.01
+"""A joint without neighbours feels a reference that is this near (RMS) [rad] as its own motion: gravity is linear
+there."""
+_TIMES = 4
+"""At most: what was fitted along the motion of a wrong model gives a better one, and so on."""
+_ITERATIONS = 6
+"""Of the fit along each."""
+_GAIN = 0.9
+"""The motion is renewed again where it lowered the squared error to less than this part."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnMotion:
+    """Renews the reference of the joints of a robot."""
+
+    problem: Problem
+    """The whole robot with the base model."""
+    candidates: Sequence[type[Effect]]
+    """Effects whose influence on the rigid bodies is wanted."""
+    enough: torch.Tensor
+    """At this RMSE of each joint there is nothing more to gain, (n,) [rad]."""
+    say: Callable[[str], None] = lambda _: None
+    """Shows how far it is."""
+
+    def follow(self, twins: TwinProblem, now: Fitted) -> tuple[TwinProblem, Fitted]:
+        """The joints along the motion of the whole robot with a model, and the model fitted there in windows.
+
+        Args:
+            twins: The joints along the present reference.
+            now: The model, fitted along it.
+        """
+        self.say("motion of the robot with what was found")
+        alone = self.problem.joints_stand_alone
+        for _ in range(_TIMES):
+            if alone and self._away(twins, now) < _FAR:
+                break
+            before = now.score
+            twins = twin_problem(self.problem, self._path(now))
+            now = fit_side_by_side(twins.in_windows(), [now], max_iteration=_ITERATIONS)[0]
+            if bool(((now.score <= self.enough**2) | (now.score > _GAIN * before)).all()):
+                break
+        return twins, now
+
+    def _away(self, twins: TwinProblem, now: Fitted) -> float:
+        """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""
+        problem = twins.coarse().with_effects(labels(now.model, twins.joint_names))
+        rollout, sampled = problem.evaluator().rollout(1), problem.dataset.sampled
+        rollout.start(self._values(problem, now)[None], sampled)
+        square = torch.zeros(())
+        for k, _ in enumerate(rollout.simulated(rollout.duration_steps)):
+            away = rollout.robot.data.joint_pos - problem.path.position[k]
+            square = square + away[sampled[k]].square().sum()
+        rollout.env.close()
+        return math.sqrt(float(square) / (int(sampled.sum()) * len(problem.joint_names)))
+
+    def _path(self, now: Fitted) -> ReferencePath:
+        problem = self.problem.with_effects(labels(now.model, self.problem.joint_names))
+        changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
+        return reference_path(problem, self._values(problem, now), changing)
+
+    @staticmethod
+    def _values(problem: Problem, now: Fitted) -> torch.Tensor:
+        return problem.space.from_dict(whole_values(now.model, now.x, problem.joint_names))

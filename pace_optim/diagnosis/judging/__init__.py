@@ -1,0 +1,1 @@
+"""Whether a candidate is better, alike or worse on held-out recordings."""

@@ -1,0 +1,57 @@
+"""Whether an effect has the same size in every recording: what stands in for something else mostly does not."""
+
+from __future__ import annotations
+
+import torch
+
+from pace_optim.diagnosis.candidates.screening import free_columns
+from pace_optim.diagnosis.model.fitted import Fitted
+
+_FEWEST = 3
+"""Recordings, from which sizes can be compared."""
+_RIDGE = 1e-9
+
+
+def unevenness(now: Fitted) -> torch.Tensor:
+    """What each effect could explain of a joint's squared training error if its size differed between recordings.
+
+    With e the error, J its derivatives by the other parameters, and S_r those by the effect's on recording r alone,
+
+        unevenness = 1 - SSE[J, S_1, ..., S_R] / SSE[J, S_1 + ... + S_R]
+
+    to first order: nothing is simulated. Parameters at a bound do not count.
+
+    Args:
+        now: A model, fitted, with its Jacobian.
+
+    Returns:
+        (effects, n); zero where a joint does not have the effect, and where there are fewer than three recordings.
+
+    Raises:
+        ValueError: If there is no Jacobian.
+    """
+    result = torch.zeros(now.model.has.shape, dtype=torch.float64)
+    if not bool(now.model.has.any()):
+        return result
+    columns = free_columns(now)
+    if now.error is None:
+        raise ValueError("The sizes in each recording need a model that was fitted with keep_jacobian.")
+    if now.error.shape[1] < _FEWEST:
+        return result
+    for i, effect in enumerate(now.model.effects):
+        own = torch.arange(now.model.size)[now.model.columns(effect)].tolist()
+        others = [p for p in range(now.model.size) if p not in own]
+        for j in now.model.has[i].nonzero()[:, 0].tolist():
+            jacobian, error = columns[..., j].double(), now.error[..., j].double().flatten()
+            alone = torch.diag_embed(jacobian[own]).permute(0, 3, 1, 2)  # (own, R, K, R)
+            together = torch.cat([jacobian[others].flatten(1), alone.flatten(2).flatten(0, 1)])
+            result[i, j] = 1 - _left(together, error) / max(_left(jacobian.flatten(1), error), 1e-300)
+    return result
+
+
+def _left(columns: torch.Tensor, error: torch.Tensor) -> float:
+    """Sum of squares of an error (K,) that columns (p, K) leave."""
+    columns = columns[columns.norm(dim=1) > 0]
+    columns = columns / columns.norm(dim=1, keepdim=True)
+    gram = columns @ columns.T + _RIDGE * torch.eye(len(columns), dtype=columns.dtype)
+    return float((error - torch.linalg.solve(gram, columns @ error) @ columns).square().sum())

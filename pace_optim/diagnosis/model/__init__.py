@@ -1,0 +1,1 @@
+"""What a diagnosis fits: base parameters and effects, and a fitted model of every joint."""

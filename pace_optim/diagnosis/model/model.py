@@ -1,0 +1,241 @@
+"""A model of each joint alone: base parameters, effects, and where each is free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.problem.problem import Problem
+
+BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
+"""The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
+_AT_BOUND = 0.998
+"""Normalised values beyond this are at a bound."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointModel:
+    """The parameters of n joints, each with the same P entries: base, then those of effects."""
+
+    effects: tuple[type[Effect], ...]
+    """Effects in the order of their entries."""
+    has: torch.Tensor
+    """Which joint has which effect, (effects, n) bool; a joint without it keeps its null values."""
+    lower: torch.Tensor
+    """(n, P), physical."""
+    upper: torch.Tensor
+    """(n, P), physical."""
+    log: torch.Tensor
+    """Which entries have a logarithmic scale, (P,) bool."""
+    barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
+    """Effects that some joints cannot get, (n,) bool."""
+    shared: frozenset[type[Effect]] = frozenset()
+    """Effects with one value for all joints that have them, beside those that are so by their nature."""
+
+    @classmethod
+    def base(cls, problem: Problem) -> JointModel:
+        """The base model with the bounds of a problem."""
+        space, n = problem.space, len(problem.joint_names)
+        lower = [space.lower[space[name]].expand(n) for name in BASE]
+        upper = [space.upper[space[name]].expand(n) for name in BASE]
+        return cls(
+            effects=(),
+            has=torch.zeros(0, n, dtype=torch.bool),
+            lower=torch.stack(lower, dim=1),
+            upper=torch.stack(upper, dim=1),
+            log=torch.zeros(len(BASE), dtype=torch.bool),
+        )
+
+    @property
+    def size(self) -> int:
+        """Entries P of each joint."""
+        return len(self.log)
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.lower)
+
+    @property
+    def free(self) -> torch.Tensor:
+        """Which entries can be fitted, (n, P) bool."""
+        result = self.upper > self.lower
+        for effect, has in zip(self.effects, self.has, strict=True):
+            result[:, self.columns(effect)] &= has[:, None]
+        return result
+
+    def columns(self, effect: type[Effect]) -> slice:
+        """Where an effect's entries are."""
+        start = len(BASE)
+        for other in self.effects:
+            if other is effect:
+                break
+            start += len(other.parameters)
+        return slice(start, start + len(effect.parameters))
+
+    def on_joints(self, joints: torch.Tensor) -> tuple[JointModel, list[int]]:
+        """The same of some joints, (n,) bool, with the effects that any of them has; and which entries those are."""
+        kept = [row for row, has in enumerate(self.has) if bool(has[joints].any())]
+        entries = list(range(len(BASE)))
+        for row in kept:
+            columns = self.columns(self.effects[row])
+            entries += range(columns.start, columns.stop)
+        model = replace(
+            self,
+            effects=tuple(self.effects[row] for row in kept),
+            has=self.has[kept][:, joints],
+            lower=self.lower[joints][:, entries],
+            upper=self.upper[joints][:, entries],
+            log=self.log[entries],
+            barred={effect: barred[joints] for effect, barred in self.barred.items()},
+        )
+        return model, entries
+
+    def with_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
+        """The same with an effect on some joints, (n,) bool, beside those that have it already."""
+        if effect in self.effects:
+            has = self.has.clone()
+            has[self.effects.index(effect)] |= joints
+            return replace(self, has=has)
+        n = self.num_joints
+        bounds = [
+            torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64).expand(n, -1)
+            for side in ("lower", "upper")
+        ]
+        return replace(
+            self,
+            effects=(*self.effects, effect),
+            has=torch.cat([self.has, joints[None]]),
+            lower=torch.cat([self.lower, bounds[0]], dim=1),
+            upper=torch.cat([self.upper, bounds[1]], dim=1),
+            log=torch.cat([self.log, torch.tensor([p.scale == "log" for p in effect.parameters])]),
+        )
+
+    def without_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
+        """The same without an effect on some joints, (n,) bool; its entries stay."""
+        has = self.has.clone()
+        has[self.effects.index(effect)] &= ~joints
+        return replace(self, has=has)
+
+    def extended(
+        self, physical: torch.Tensor, effect: type[Effect], joints: torch.Tensor, values: torch.Tensor
+    ) -> tuple[JointModel, torch.Tensor]:
+        """The same with an effect on some more joints, and the physical values (n, P) with those of the effect.
+
+        Args:
+            physical: Of this model, (n, P).
+            effect: The effect.
+            joints: Which joints get it, (n,) bool.
+            values: Of the effect, (n, parameters).
+        """
+        model = self.with_effect(effect, joints)
+        if effect not in self.effects:
+            return model, torch.cat([physical, values], dim=1)
+        physical, lower, upper = physical.clone(), model.lower.clone(), model.upper.clone()
+        columns = self.columns(effect)
+        physical[joints, columns] = values[joints]
+        # what was held for a joint's old values is not held for its new ones
+        lower[joints, columns] = torch.tensor([p.lower for p in effect.parameters], dtype=torch.float64)
+        upper[joints, columns] = torch.tensor([p.upper for p in effect.parameters], dtype=torch.float64)
+        return replace(model, lower=lower, upper=upper), physical
+
+    def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
+        """The same with an effect's structural parameter held where it is: a choice between things is no way to walk.
+
+        Args:
+            effect: The effect.
+            physical: Of this model, (n, P).
+        """
+        if not effect.structural:
+            return self
+        return self.held(effect, [effect.structural], physical)
+
+    def held(self, effect: type[Effect], names: Sequence[str], physical: torch.Tensor) -> JointModel:
+        """The same with parameters of an effect held where they are, on the joints that have it.
+
+        Args:
+            effect: The effect.
+            names: Its parameters.
+            physical: Of this model, (n, P).
+        """
+        has, start = self.has[self.effects.index(effect)], self.columns(effect).start
+        lower, upper = self.lower.clone(), self.upper.clone()
+        for column, parameter in enumerate(effect.parameters, start=start):
+            if parameter.name in names:
+                lower[has, column] = upper[has, column] = physical[has, column]
+        return replace(self, lower=lower, upper=upper)
+
+    def may_get(self, effect: type[Effect]) -> torch.Tensor:
+        """Joints that can have an effect beside those that they have, (n,) bool; only one can part motor and link."""
+        excluded = self.barred.get(effect, torch.zeros(self.num_joints, dtype=torch.bool)).clone()
+        for other, has in zip(self.effects, self.has, strict=True):
+            if other is effect or (other.parts_motor_and_link and effect.parts_motor_and_link):
+                excluded |= has
+        return ~excluded
+
+    def at_bounds(self, x: torch.Tensor) -> torch.Tensor:
+        """Joints with an effect whose size has run into a bound, (effects, n) bool.
+
+        A size is what vanishes at a null; the bound that is the null, or next to an infinite one, does not count.
+
+        Args:
+            x: Normalised, (n, P).
+        """
+        result = torch.zeros_like(self.has)
+        for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
+            for parameter, value in zip(effect.parameters, x[:, self.columns(effect)].unbind(dim=1), strict=True):
+                if parameter.null is not None and parameter.null > parameter.lower:
+                    result[row] |= has & (value <= -_AT_BOUND)
+                if parameter.null is not None and parameter.null < parameter.upper:
+                    result[row] |= has & (value >= _AT_BOUND)
+        return result
+
+    def to_physical(self, x: torch.Tensor) -> torch.Tensor:
+        """Physical values of normalised ones (…, n, P)."""
+        low, high = self._ends()
+        value = low + (x + 1) / 2 * (high - low)
+        return torch.where(self.log, value.exp(), value).clamp(self.lower, self.upper)
+
+    def to_normalised(self, physical: torch.Tensor) -> torch.Tensor:
+        """Normalised values of physical ones (…, n, P); 0 where the bounds are equal."""
+        low, high = self._ends()
+        value = torch.where(self.log, physical.clamp(min=1e-300).log(), physical)
+        width = high - low
+        return torch.where(width > 0, (value - low) / width.clamp(min=1e-300) * 2 - 1, 0.0).clamp(-1.0, 1.0)
+
+    def _ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        low = torch.where(self.log, self.lower.clamp(min=1e-300).log(), self.lower)
+        high = torch.where(self.log, self.upper.clamp(min=1e-300).log(), self.upper)
+        return low, high
+
+
+def start_values(effect: type[Effect], values: dict[str, float]) -> torch.Tensor:
+    """Physical entries of an effect, (parameters,), inside their bounds."""
+    return torch.tensor(
+        [min(max(values.get(p.name, p.start), p.lower), p.upper) for p in effect.parameters], dtype=torch.float64
+    )
+
+
+def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Normalised values (n, P) as the parameters of the whole robot; the delay is the joints' median."""
+    physical = model.to_physical(x)
+    values: dict[str, dict[str, float]] = {}
+    for k, name in enumerate(BASE):
+        column = physical[:, k]
+        values[name] = (
+            {"all": float(column.median())} if name == "delay" else dict(zip(names, column.tolist(), strict=True))
+        )
+    for effect, has in zip(model.effects, model.has, strict=True):
+        if not bool(has.any()):
+            continue
+        own = physical[:, model.columns(effect)]
+        for k, parameter in enumerate(effect.parameters):
+            key = f"{effect.name}.{parameter.name}"
+            if effect.shared or effect in model.shared:
+                values[key] = {"all": float(own[has][:, k].median())}
+            else:
+                values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
+    return values

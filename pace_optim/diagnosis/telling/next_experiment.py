@@ -1,0 +1,219 @@
+"""Which further recording would tell effects apart: the rivals are simulated on a menu of motions, gains and loads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import whole_values
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.verdict.verdict import labels
+from pace_optim.excitation import make_excitation
+from pace_optim.problem.problem import Problem
+from pace_optim.recording import Recording
+from pace_optim.recording.dataset import make_dataset
+
+_MOTIONS = ("chirp", "multisine", "ramp", "steps")
+_DURATION = 10.0
+_GAIN = 1.5
+_LOAD = 1.5
+_CLEAR = 3.0
+"""Predictions that part by fewer times the noise than this are not told apart."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Choice:
+    """One entry of the menu."""
+
+    words: str
+    """What to record."""
+    arguments: str
+    """The same for ``scripts/data_collection.py``."""
+    recording: Recording
+    """Its commands, gains and load; what would be measured is not known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rivals:
+    """Two effects that do equally well on some joints."""
+
+    chosen: type[Effect]
+    rival: type[Effect]
+    models: tuple[Fitted, Fitted]
+    """With either effect, fitted."""
+    joints: list[int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """How far two effects' predictions for an entry of the menu are apart."""
+
+    pair: Rivals
+    choice: Choice
+    apart: float
+    """[rad]."""
+    times: float
+    """The same as a multiple of the noise."""
+
+
+def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) -> list[str]:
+    """Which recordings would tell apart what the present ones cannot, as few of them as do, as sentences.
+
+    Args:
+        problem: The whole robot with the base model.
+        outcome: What the search found.
+        noise: Of each joint, (n,) [rad].
+    """
+    pairs = rivals_of(outcome)
+    if not pairs or problem.env_cfg.sim2real.excitation is None:
+        return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
+    predictions = [each for pair in pairs for each in _predictions(problem, pair, noise)]
+    result = []
+    clear = [each for each in predictions if each.times >= _CLEAR]
+    while clear:
+        best = _most_telling(clear)
+        result.append(_sentence(best, problem))
+        told = [each.pair for each in best]
+        clear = [each for each in clear if each.pair not in told]
+    seen = [each.pair for each in predictions if each.times >= _CLEAR]
+    for pair in [pair for pair in pairs if pair not in seen]:
+        count = sum(each.pair is pair for each in predictions)
+        text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
+        result.append(f"{text} {_hint(pair)}".rstrip())
+    return result
+
+
+def _predictions(problem: Problem, pair: Rivals, noise: torch.Tensor) -> list[Prediction]:
+    choices = list(menu(problem, pair.joints[0]))
+    apart = distances(problem, pair, [choice.recording for choice in choices]).tolist()
+    level = float(noise[pair.joints].mean())
+    return [
+        Prediction(pair=pair, choice=choice, apart=each, times=each / level)
+        for choice, each in zip(choices, apart, strict=True)
+    ]
+
+
+def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
+    """Predictions for the recording that tells most pairs apart; among equals, the one that does so most clearly."""
+    by_recording: dict[str, list[Prediction]] = {}
+    for each in clear:
+        by_recording.setdefault(each.choice.arguments + each.choice.words, []).append(each)
+    return max(by_recording.values(), key=lambda own: (len(own), min(each.times for each in own)))
+
+
+def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
+    choice = told[0].choice
+    pairs = ", nor ".join(_named(each.pair, problem) for each in told)
+    apart = _range([1e3 * each.apart for each in told], "{:.2g}")
+    times = _range([each.times for each in told], "{:.0f}")
+    return (
+        f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
+        f"mrad, {times} times the noise. scripts/data_collection.py --task {problem.task} {choice.arguments} "
+        "--command_only --export_command next.csv"
+    )
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    low, high = form.format(min(values)), form.format(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+def rivals_of(outcome: Outcome) -> list[Rivals]:
+    """Pairs of a chosen effect and one that does as well, with the joints where that is so and it stayed."""
+    result = []
+    has = dict(zip(outcome.final.model.effects, outcome.final.model.has.tolist(), strict=True))
+    for this in outcome.rounds:
+        found: dict[tuple[type[Effect], type[Effect]], list[int]] = {}
+        for j, (chosen, rivals) in enumerate(zip(this.chosen, this.rivals, strict=True)):
+            for rival in rivals:
+                if chosen is not None and chosen in has and has[chosen][j]:
+                    found.setdefault((chosen, rival), []).append(j)
+        result += [
+            Rivals(chosen=a, rival=b, models=(this.models[a], this.models[b]), joints=joints)
+            for (a, b), joints in found.items()
+        ]
+    return result
+
+
+def menu(problem: Problem, joint: int) -> Iterator[Choice]:
+    """Every motion as the robot was, with a larger proportional gain, and with more load on a joint."""
+    like = problem.dataset.recordings[problem.dataset.trained()[0]]
+    conditions = [("", "", like), *_other_gain(like), *_other_load(problem, like, joint)]
+    for motion in _MOTIONS:
+        trajectory = make_excitation(
+            motion, problem.env_cfg.sim2real, control_dt=problem.control_dt, duration=_DURATION
+        )[0]
+        target = trajectory.des_dof_pos
+        for words, arguments, facts in conditions:
+            yield Choice(
+                words=f"Another recording ({motion}, {_DURATION:g} s{words})",
+                arguments=f"--excitation {motion} --duration {_DURATION:g}{arguments}",
+                recording=Recording(
+                    name=motion,
+                    joint_names=problem.joint_names,
+                    time=trajectory.time,
+                    dof_pos=np.repeat(target[:1], len(target), axis=0),
+                    des_dof_pos=target,
+                    command=target,
+                    drive=facts.drive,
+                    load=facts.load,
+                ),
+            )
+
+
+def distances(problem: Problem, pair: Rivals, recordings: Sequence[Recording]) -> torch.Tensor:
+    """RMS difference of two models' predictions on each recording, over the joints of the pair, (R,) [rad]."""
+    data = make_dataset(recordings, train_fraction=1)
+    errors = []
+    for fitted in pair.models:
+        own = replace(problem.with_effects(labels(fitted.model, problem.joint_names)), dataset=data)
+        values = own.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
+        errors.append(own.evaluator().residuals(values[None], data.sampled).error[0][..., pair.joints])
+    return (errors[0] - errors[1]).square().mean(dim=(0, 2)).sqrt()
+
+
+def _other_gain(like: Recording) -> Iterator[tuple[str, str, Recording]]:
+    stiffness = like.drive.stiffness
+    if stiffness is None:
+        return
+    words = f", {_GAIN:g} times the proportional gain"
+    same = bool(np.ptp(stiffness) < 1e-9)
+    arguments = f" --stiffness {_GAIN * stiffness[0]:g}" if same else ""
+    yield words, arguments, replace(like, drive=replace(like.drive, stiffness=_GAIN * stiffness))
+
+
+def _other_load(problem: Problem, like: Recording, joint: int) -> Iterator[tuple[str, str, Recording]]:
+    if like.load.load_mass is not None:
+        mass = round(_LOAD * like.load.load_mass, 2)
+        yield f", {mass:g} kg on the arm", f" --load_mass {mass:g}", _loaded(like, load_mass=mass)
+        return
+    env = problem.make_env(1)
+    model = env.sim.model
+    body = model.body(int(model.jnt_bodyid[model.joint(problem.joint_names[joint]).id]))
+    mass = max(0.1, round((_LOAD - 1) * float(body.mass[0]), 1))
+    env.close()
+    added = {**like.load.added_mass, body.name: like.load.added_mass.get(body.name, 0.0) + mass}
+    yield (
+        f", {mass:g} kg fixed to {body.name}",
+        f" --added_mass {body.name}={mass:g}",
+        _loaded(like, added_mass=added),
+    )
+
+
+def _loaded(like: Recording, **changes: object) -> Recording:
+    return replace(like, load=replace(like.load, **changes))  # type: ignore[arg-type]
+
+
+def _named(pair: Rivals, problem: Problem) -> str:
+    names = ", ".join(problem.joint_names[j] for j in pair.joints)
+    return f"{pair.chosen.name} from {pair.rival.name} ({names})"
+
+
+def _hint(pair: Rivals) -> str:
+    separates = pair.chosen.separates or pair.rival.separates
+    return f"What would tell them apart: {separates}." if separates else ""

@@ -1,0 +1,78 @@
+"""What a diagnosis found: ``diagnosis.json``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pace_optim.terminal.atomic import write_json
+
+VERSION = 1
+
+
+@dataclass(kw_only=True)
+class Diagnosis:
+    """The content of ``diagnosis.json``; field names are the file's keys."""
+
+    version: int = VERSION
+    run: str
+    verdict: str
+    """``effect``, ``nothing_missing`` or ``unknown``."""
+    summary: str
+    """The verdict in a sentence or two."""
+    explained: float = 1.0
+    """Part of the error above the floor that the effects found explain."""
+    added: list[str]
+    """Effects that are what is missing, as ``fit.py --effects`` takes them, the largest share first; none unless the
+    verdict is ``effect``."""
+    paying: list[str] = field(default_factory=list)
+    """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
+    free_form: list[str] = field(default_factory=list)
+    """Those in ``paying`` that are curves of any form, where no effect is known."""
+    shares: dict[str, float] = field(default_factory=dict)
+    """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
+    ranking: list[dict[str, Any]]
+    """Every effect that was refitted: those added first, as in ``added``, then round by round by what they explain."""
+    joints: dict[str, dict[str, Any]]
+    """For each joint its errors, floor and effects."""
+    data: list[str]
+    """What was noticed about the recordings."""
+    absorbed: dict[str, str] = field(default_factory=dict)
+    """Effects that these recordings would not show, with the base parameter that takes each up."""
+    advice: list[str]
+    """What to do or to record next."""
+    runs: list[str]
+    """Folders of the refits."""
+    tried: list[str]
+    """Names of all candidates."""
+    physics_dt: float
+    """Physics step of the diagnosis [s]."""
+    ladder: list[dict[str, Any]] = field(default_factory=list)
+    """Validation RMSE of all joints from the base model to the last effect [rad]."""
+    error_map: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Which variable carries what is missing, on each joint whose error effects do not explain: what part of it each
+    curve explains by itself, and the best curve."""
+    wall_time_s: float = 0.0
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``diagnosis.json`` to a run's folder, atomically."""
+        path = Path(folder) / "diagnosis.json"
+        write_json(path, asdict(self))
+        return path
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Diagnosis:
+        """Read it.
+
+        Raises:
+            ValueError: If it is missing or of another version.
+        """
+        path = Path(folder) / "diagnosis.json"
+        if not path.is_file():
+            raise ValueError(f"{path} does not exist. Run scripts/diagnose.py {folder} first.")
+        content = json.loads(path.read_text())
+        if content.get("version") != VERSION:
+            raise ValueError(f"{path} is no diagnosis of version {VERSION}. Diagnose again.")
+        return cls(**{key: value for key, value in content.items() if key in cls.__dataclass_fields__})

@@ -1,0 +1,1 @@
+"""What the search found: verdict, contributions, proxies, free curves."""

@@ -1,0 +1,213 @@
+"""Curves of any form in place of effects: which variable carries what is missing, and where that says more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from pace_actuators.effects import available_effects, get_effect
+from pace_actuators.effects.free_form import FreeForm
+from pace_optim.diagnosis.judging.acceptance import BlockErrors, judge
+from pace_optim.diagnosis.judging.some_joints import SomeJoints
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.model import BASE
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.verdict.proxy_effects import EXPLAINED, above_floor, near_floor
+from pace_optim.single_joint_model.problem import TwinProblem
+
+_BETTER = 0.5
+"""A curve says more than the effects found where it leaves less than this part of the squared error that they leave."""
+_REACHED = 0.998
+"""Quantile of a variable up to which the knots of a curve reach."""
+_WORTH_A_WORD = 0.1
+"""With less than this part explained a curve is not told of, nor drawn."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Curves:
+    """Each curve by itself on top of the base model, on the joints that effects leave far from the floor."""
+
+    joints: torch.Tensor
+    """On which joints they were fitted, (n,) bool."""
+    effects: list[type[FreeForm]]
+    """The curves."""
+    models: list[Fitted]
+    """The base model with each, of all joints."""
+    errors: list[BlockErrors]
+    """Of all joints."""
+    base_errors: BlockErrors
+    """Of the base model, fitted along the same motion."""
+    explained: torch.Tensor
+    """Part of a joint's squared error above the floor that each explains, (curves, n)."""
+    instead: torch.Tensor
+    """Joints on which the best one says more than the effects found, (n,) bool."""
+
+    def best(self, joint: int) -> int:
+        """The curve that explains most of a joint's error."""
+        return int(self.explained[:, joint].argmax())
+
+
+def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None] = lambda _: None) -> Curves | None:
+    """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
+
+    A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
+    one variable that leaves less than half of what all effects found leave says that those are not it. Joints with an
+    effect that the whole robot shares are left out.
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+        say: Shows how far it is.
+    """
+    model = outcome.final.model
+    joints = ~near_floor(outcome, floor)
+    for effect, has in zip(model.effects, model.has, strict=True):
+        joints &= ~(has & effect.shared)
+    if not bool(joints.any()):
+        return None
+    say("fitting curves of any form in place of effects")
+    ranges = _ranges(outcome.problem, outcome.base)
+    known = (get_effect(name) for name in available_effects())
+    effects = [each for each in known if issubclass(each, FreeForm) and each.variable in ranges]
+    without = Fitted.start(outcome.base.model, outcome.base.model.to_physical(outcome.base.x))
+    starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
+    models, errors = SomeJoints(joints).refitted(outcome.problem, starts, outcome.base_errors)
+    above = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
+    found = Curves(
+        joints=joints,
+        effects=effects,
+        models=models[1:],
+        errors=errors[1:],
+        base_errors=errors[0],
+        explained=torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0),
+        instead=torch.zeros_like(joints),
+    )
+    _, left = above_floor(outcome, floor)
+    tried = len(effects) * int(joints.sum())
+    for j in joints.nonzero()[:, 0].tolist():
+        k, has_effects = found.best(j), bool(model.has[:, j].any())
+        now = outcome.final_errors if has_effects else found.base_errors
+        pays = judge(now, found.errors[k], j, tried, first=not has_effects).significant
+        says_more = not has_effects or float(above[1 + k, j]) < _BETTER * float(left[j])
+        found.instead[j] = pays and says_more and float(found.explained[k, j]) >= EXPLAINED
+    return found
+
+
+def take_curves(outcome: Outcome, curves: Curves) -> None:
+    """Let the final model have a joint's best curve in place of its effects, where that says more."""
+    model, errors = outcome.final.model, outcome.final_errors
+    for effect in model.effects:
+        model = model.without_effect(effect, curves.instead)
+    physical = model.to_physical(outcome.final.x)
+    square, score = errors.square.clone(), outcome.final.score.clone()
+    for j in curves.instead.nonzero()[:, 0].tolist():
+        k = curves.best(j)
+        effect, own = curves.effects[k], curves.models[k]
+        values = own.model.to_physical(own.x)
+        here = torch.arange(len(physical)) == j
+        model, physical = model.extended(physical, effect, here, values[:, own.model.columns(effect)])
+        model = model.held(effect, _shape(effect), physical)
+        physical[j, : len(BASE)] = values[j, : len(BASE)]
+        square[:, j], score[j] = curves.errors[k].square[:, j], own.score[j]
+    more = torch.zeros(len(model.effects) - len(outcome.unevenness), len(physical), dtype=outcome.unevenness.dtype)
+    outcome.unevenness = torch.cat([outcome.unevenness, more])
+    outcome.final = Fitted(model=model, x=model.to_normalised(physical), score=score)
+    outcome.final_errors = replace(errors, square=square)
+
+
+def error_map(curves: Curves | None, joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
+
+    Args:
+        curves: What was fitted.
+        joint_names: The joints.
+    """
+    if curves is None:
+        return {}
+    joints = {}
+    for j in curves.joints.nonzero()[:, 0].tolist():
+        k = curves.best(j)
+        effect, part = curves.effects[k], float(curves.explained[k, j])
+        before, after = (float(each.mse[j].sqrt()) for each in (curves.base_errors, curves.errors[k]))
+        joints[joint_names[j]] = {
+            "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
+            "best": effect.name,
+            "best_label": f"{effect.variable} [{effect.parameters[-1].unit}]",
+            "kind": "friction" if effect.resists else "missing torque",
+            "validation_rmse_before": before,
+            "validation_rmse_after": after,
+            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after),
+            "curve": _curve(curves.models[k], effect, j) if part >= _WORTH_A_WORD else None,
+        }
+    return joints
+
+
+def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
+    if part < _WORTH_A_WORD:
+        return "no curve over a single variable carries the error."
+    kind = "friction" if effect.resists else "torque"
+    return (
+        f"a curve of {kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the floor "
+        f"({before:.3g} to {after:.3g} mrad)."
+    )
+
+
+def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list[float]]:
+    """Where the knots are, and the torque that is missing there, or all friction that there is [N m]."""
+    physical = fitted.model.to_physical(fitted.x)[joint]
+    names = [p.name for p in effect.parameters]
+    curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
+    if effect.resists:  # what the base model has of it and what the curve has cannot be told apart everywhere
+        level, viscous = (float(physical[BASE.index(name)]) for name in ("friction", "viscous_friction"))
+        slope = viscous if effect.variable == "speed" else 0.0
+        total = (max(0.0, level + more) for more in curve["torque"])
+        curve["torque"] = [each + slope * x for each, x in zip(total, curve["at"], strict=True)]
+    return curve
+
+
+def _start(base: Fitted, effect: type[FreeForm], joints: torch.Tensor, seen: torch.Tensor) -> Fitted:
+    """The base model with a curve of nothing, its knots where the joints' variable was seen, (2, n)."""
+    first, last = seen
+    has_center = "center" in _shape(effect)
+    shape = {
+        "reach": 0.5 * (last - first) if has_center else torch.maximum(last, -first),
+        "center": 0.5 * (first + last),
+    }
+    values = torch.zeros(len(joints), len(effect.parameters), dtype=torch.float64)
+    for column, p in enumerate(effect.parameters):
+        if p.name in shape:
+            values[:, column] = shape[p.name].clamp(p.lower, p.upper)
+    model, physical = base.model.extended(base.model.to_physical(base.x), effect, joints, values)
+    return Fitted.start(model.held(effect, _shape(effect), physical), physical, tried=effect)
+
+
+def _shape(effect: type[FreeForm]) -> list[str]:
+    """Parameters that say where the knots are."""
+    return [p.name for p in effect.parameters if p.null is None]
+
+
+def _ranges(problem: TwinProblem, base: Fitted) -> dict[str, torch.Tensor]:
+    """From where to where each variable goes in what is trained on, (2, n) by its name."""
+    path, data = problem.path, problem.dataset
+    effort, load = path.effort(base.model.to_physical(base.x)[:, BASE.index("armature")]), path.load()
+    # what holds a load has its size, and pulls the other way
+    seen = {"position": path.position, "torque": effort, "speed": path.speed(), "load on the gear": effort - load}
+    time = data.session_start + problem.control_dt * torch.arange(len(path.position))[:, None]
+    seen["time"] = time[..., None].expand(path.position.shape)
+    return {name: _quantiles(values, data.train) for name, values in seen.items()}
+
+
+def _quantiles(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """Almost the smallest and the largest, (2, n), of (T', R, n) that leave out as many steps at the end as before.
+
+    Args:
+        values: The values.
+        where: Which steps count, (T, R) bool.
+    """
+    left_out = (len(where) - len(values)) // 2
+    flat = values[where[left_out : left_out + len(values)]].double().sort(dim=0).values
+    last = len(flat) - 1
+    return flat[[round((1 - _REACHED) * last), round(_REACHED * last)]]

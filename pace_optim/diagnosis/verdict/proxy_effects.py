@@ -1,0 +1,97 @@
+"""Which effects found are really there, and which stand in for something that is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.diagnosis.search.search import Outcome
+
+EXPLAINED = 0.5
+"""Less than this part of the error above the floor, and the effects found are not what is missing."""
+UNKNOWN_RATIO = 3.0
+"""An unexplained error above this many times the floor is a finding of its own."""
+DOMINANT = 0.9
+"""Of effects that explain more than this part of the error above the floor, sizes do not matter."""
+UNEVEN = 0.15
+"""Above this unevenness an effect stands in for something else. Measured: up to 0.08 for the evenest effect among many
+others as large together, 0.18 to 0.36 for such that stood in."""
+VARYING = 0.5
+"""Above this one, most of what is left would go: the effect's form is right, and its size depends on something more.
+Measured: 0.73 for the friction of a servo at gains from 100 to 800."""
+
+
+def above_floor(outcome: Outcome, floor: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Squared error above the floor before and after, (n,) each [rad²].
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    before, after = ((errors.mse - floor**2).clamp(min=0.0) for errors in (outcome.base_errors, outcome.final_errors))
+    return before, after
+
+
+def near_floor(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints whose error is near the floor in the end, (n,) bool."""
+    return outcome.final_errors.mse.sqrt() <= UNKNOWN_RATIO * floor
+
+
+def real_effects(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Effects that do not stand in for something else, (effects, n) bool."""
+    model = outcome.final.model
+    return model.has & ~curves_in(model) & ~_at_bounds(outcome) & ~_uneven(outcome, floor)
+
+
+def curves_in(model: JointModel) -> torch.Tensor:
+    """Curves of any form that stand where an effect is not known, (effects, n) bool."""
+    return model.has & torch.tensor([effect.free_form for effect in model.effects], dtype=torch.bool)[:, None]
+
+
+def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Effects that count as missing, (effects, n) bool: no curves, no smoothing of friction where it hardly shows."""
+    model = outcome.final.model
+    smooths = torch.tensor([effect.smooths_friction for effect in model.effects], dtype=torch.bool)[:, None]
+    return model.has & ~curves_in(model) & ~(smooths & (outcome.base_errors.mse.sqrt() <= UNKNOWN_RATIO * floor))
+
+
+def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
+    """Effects that stand in for something else, and what shows it: a sentence each."""
+    stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome, floor)))
+    return [
+        *([f"At a bound, so that it stands in for something else: {stuck}."] if stuck else []),
+        *([f"Of another size in each recording, so that it stands in for something else: {uneven}."] if uneven else []),
+    ]
+
+
+def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
+    """Effects of the right form whose size differs between recordings, in a sentence."""
+    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
+    return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
+
+
+def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
+    """Effects on some joints, (effects, n) bool, in words."""
+    return ", ".join(
+        f"{effect.name} ({', '.join(name for name, yes in zip(names, joints.tolist(), strict=True) if yes)})"
+        for effect, joints in zip(outcome.final.model.effects, which & outcome.final.model.has, strict=True)
+        if bool(joints.any())
+    )
+
+
+def _at_bounds(outcome: Outcome) -> torch.Tensor:
+    model = outcome.final.model
+    return model.at_bounds(outcome.final.x) & ~curves_in(model)
+
+
+def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    share = outcome.unevenness
+    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
+
+
+def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
+    before, after = above_floor(outcome, floor)
+    return (after > (1 - DOMINANT) * before) & ~near_floor(outcome, floor)

@@ -1,0 +1,180 @@
+"""From what was tried to a verdict, in numbers and in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from pace_actuators.effects import Effect, EffectCfg
+from pace_optim.diagnosis.judging.acceptance import FIRST_RATIO, NEXT_RATIO
+from pace_optim.diagnosis.judging.candidate_results import Round, Trial
+from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.verdict.proxy_effects import (
+    EXPLAINED,
+    UNKNOWN_RATIO,
+    above_floor,
+    counts,
+    curves_in,
+    near_floor,
+    real_effects,
+)
+
+SHARE = 0.2
+"""Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
+
+
+def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
+    """The verdict, and the part of the error above the floor that the effects found explain.
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    excess, left = above_floor(outcome, floor)
+    explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
+    if bool(outcome.final.model.has.any()):
+        good = explained_joints(outcome, floor)
+        if float(excess[good].sum()) >= SHARE * float(excess.sum()):
+            return "effect", explained
+    far = float((outcome.final_errors.mse.sqrt() / floor).max()) > UNKNOWN_RATIO
+    if far or bool(curves_in(outcome.final.model).any()):
+        return "unknown", explained
+    return "nothing_missing", explained
+
+
+def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints on which the effects found are what is missing, (n,) bool.
+
+    They explain at least half of the error above the floor, and not all of them stand in for something else. Near the
+    floor it does not matter how. How friction is smoothed at standstill is not missing where it makes less of an error
+    than would be a finding of its own.
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    excess, left = above_floor(outcome, floor)
+    enough = (left <= (1 - EXPLAINED) * excess) & real_effects(outcome, floor).any(dim=0)
+    return counts(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
+
+
+def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
+    """Go back to the base model on all joints but these, (n,) bool."""
+    model, base = outcome.final.model, outcome.base
+    others = ~joints & model.has.any(dim=0)
+    if not bool(others.any()):
+        return
+    for effect in model.effects:
+        model = model.without_effect(effect, others)
+    x, errors = outcome.final.x.clone(), outcome.final_errors
+    x[others, : base.model.size] = base.x[others]
+    square = torch.where(others, outcome.base_errors.square, errors.square)
+    outcome.final = replace(outcome.final, model=model, x=x)
+    outcome.final_errors = replace(errors, square=square)
+
+
+def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
+    """The effects found as ``fit.py --effects`` takes them.
+
+    Args:
+        model: The model that has them.
+        joint_names: Its joints.
+        order: Which comes first; none keeps the model's order.
+    """
+    result = []
+    for effect in order or model.effects:
+        has = model.has[model.effects.index(effect)]
+        own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
+        if not own:
+            continue
+        everywhere = len(own) == len(joint_names)
+        cfg = EffectCfg(
+            effect=effect.name,
+            joint_names_expr=".*" if effect.shared or everywhere else own,
+            shared=effect.shared or effect in model.shared,
+        )
+        result.append(cfg.label)
+    return result
+
+
+def ranking(
+    outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
+) -> list[dict[str, Any]]:
+    """Every effect that was refitted, those that the model has in the end first.
+
+    The others round by round: those that are the best on some joint, then by what they explain.
+
+    Args:
+        outcome: Where the search ended.
+        joint_names: The joints.
+        decision: The verdict; unless it is ``effect``, nothing counts as added.
+        order: Which of those added comes first; none goes round by round.
+    """
+    places = {effect.name: place for place, effect in enumerate(order)}
+    model = outcome.final.model
+    entries: list[tuple[tuple, dict[str, Any]]] = []
+    for depth, this in enumerate(outcome.rounds):
+        for effect in dict.fromkeys(t.effect for own in this.trials for t in own):
+            kept = model.has[model.effects.index(effect)].tolist() if effect in model.effects else []
+            added = [j for j, yes in enumerate(kept) if yes and this.chosen[j] is effect]
+            entry = {
+                "effect": effect.name,
+                "round": depth + 1,
+                "added": bool(added) and decision == "effect",
+                **_told(this, effect, added, joint_names, first=depth == 0),
+            }
+            is_best = any(own and own[0].effect is effect for own in this.trials)
+            ratio = entry["validation_rmse_before"] / max(entry["validation_rmse_after"], 1e-12)
+            place = places.get(effect.name, len(places)) if added else 0
+            entries.append(((not added, place, depth, not is_best, -ratio), entry))
+    return [entry for _, entry in sorted(entries, key=lambda each: each[0])]
+
+
+def _told(
+    this: Round, effect: type[Effect], added: Sequence[int], joint_names: Sequence[str], first: bool
+) -> dict[str, Any]:
+    """What a round tells of an effect: on the joints that have it in the end, or else where it counts, or anywhere."""
+    own = [t for trials in this.trials for t in trials if t.effect is effect]
+    good = [t for t in own if t.significant]
+    shown = [t for t in own if t.joint in added] or good or own
+    confounded = {other.name for j in added for other in this.rivals[j]}
+    for chosen, rivals in zip(this.chosen, this.rivals, strict=True):
+        if chosen is not None and effect in rivals:
+            confounded.add(chosen.name)
+    return {
+        "joints": [joint_names[t.joint] for t in shown],
+        "validation_rmse_before": _rms(t.mse_before for t in shown),
+        "validation_rmse_after": _rms(t.mse_after for t in shown),
+        "significant": bool(good),
+        "evidence": _evidence(shown, effect, first),
+        "confounded_with": sorted(confounded),
+        "screen_score": max(t.screen_score for t in own),
+        "values": {joint_names[t.joint]: t.values for t in shown},
+    }
+
+
+def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
+    before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
+    strongest = max(trials, key=lambda t: t.ratio)
+    blocks = f"t = {strongest.t:.1f} over blocks of up to one second"
+    verb, why = "falls", f" ({blocks})"
+    if after >= before:
+        verb, why = "does not fall:", ""
+    elif not strongest.significant:
+        least = FIRST_RATIO if first else NEXT_RATIO
+        little = f", less than the {least:g} times that count" if before < least * after else ""
+        why = little or f", too unevenly to count ({blocks})"
+    return (
+        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} mrad with it{why}. "
+        f"Sign: {effect.looks}."
+    )
+
+
+def _rms(squares: Any) -> float:
+    values = list(squares)
+    return math.sqrt(sum(values) / len(values))

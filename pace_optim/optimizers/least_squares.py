@@ -1,0 +1,260 @@
+"""Box-constrained Levenberg–Marquardt on rollout residuals, several starts and all trials in one batch."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import torch
+
+from pace_optim.optimizers.jacobian import Colouring, Jacobian, jacobian, perturbed
+from pace_optim.problem.evaluator import Evaluator, Residuals
+
+_DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
+_STALLED = 3
+_CREEPING = 4
+_SMALLEST_DAMPING = 1e-9
+
+
+@dataclass(kw_only=True)
+class LeastSquaresCfg:
+    """Settings of the refinement."""
+
+    max_iteration: int = 40
+    """Largest number of iterations."""
+
+    score_tolerance: float = 1e-6
+    """Stop when an iteration lowers the score by less than this part of it."""
+
+    creep_tolerance: float = 1e-4
+    """Stop when the score fell by less than this part of it in each of the last four iterations, on average."""
+
+    step_tolerance: float = 1e-7
+    """Stop when no normalised parameter moves by more than this."""
+
+    target_score: float = 1e-16
+    """Stop below this score [rad²]."""
+
+    give_up_ratio: float = 100.0
+    """A start whose score is this many times the best one's after a few iterations is dropped."""
+
+    same_valley: float = 2e-2
+    """A start that has come this near to the best one, in every normalised parameter, is dropped."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Descent:
+    """One start's way down."""
+
+    x: torch.Tensor
+    """Present normalised vector, (size,)."""
+    score: float = np.inf
+    """Its score [rad²]."""
+    damping: float = 1e-3
+    """Levenberg–Marquardt damping, relative to the diagonal of JᵀJ."""
+    jacobian: Jacobian | None = None
+    """At x; ``None`` until it is known."""
+    stop_reason: str | None = None
+    iteration: int = 0
+    stalled: int = 0
+    """Iterations in a row that gained next to nothing."""
+    scores: list[float] = field(default_factory=list)
+    lost_jacobian: bool = False
+    """Whether the Jacobian was known when the descent was written down."""
+
+    @classmethod
+    def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
+        """Descents as a run's checkpoint has them; their Jacobians are computed again."""
+        scores = json.loads(str(checkpoint["descent_scores"]))
+        return [
+            cls(
+                x=torch.as_tensor(x),
+                score=float(score),
+                damping=float(damping),
+                stop_reason=str(stop) or None,
+                iteration=int(iteration),
+                stalled=int(stalled),
+                scores=history,
+                lost_jacobian=bool(known) and not stop,
+            )
+            for x, (score, damping, iteration, stalled, known), stop, history in zip(
+                checkpoint["descent_x"], checkpoint["descent_state"], checkpoint["descent_stop"], scores, strict=True
+            )
+        ]
+
+    def trials(self) -> torch.Tensor:
+        """Steps at several dampings, the favoured first, (trials, size)."""
+        if self.jacobian is None:
+            return self.x[None]
+        hessian, gradient = self.jacobian.normal_equations()
+        return torch.stack(
+            [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in _DAMPING_TRIALS]
+        )
+
+    def expected_gain(self, x: torch.Tensor) -> float:
+        """How much lower the linear model has the score at x, -(2 gᵀd + dᵀHd) with d the step to x [rad²]."""
+        if self.jacobian is None:
+            return np.inf
+        hessian, gradient = self.jacobian.normal_equations()
+        move = x - self.x
+        return -float(2 * gradient @ move + move @ hessian @ move)
+
+
+def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor, damping: float) -> torch.Tensor:
+    """The damped Gauss–Newton step inside the box [-1, 1].
+
+        min_d  ½ dᵀ (H + μ diag H) d + gᵀ d   with  -1 ≤ x + d ≤ 1
+
+    solved with MuJoCo's box-constrained quadratic program, so that entries at their bounds leave the active set.
+
+    Args:
+        x: Present vector, (size,).
+        hessian: JᵀJ, (size, size).
+        gradient: Jᵀr, (size,).
+        damping: μ.
+
+    Returns:
+        The new vector x + d, (size,).
+    """
+    # scaled to a unit diagonal: entries of very different influence then weigh the same
+    diagonal = hessian.diagonal()
+    scale = diagonal.clamp(min=1e-14 * float(diagonal.max()) + 1e-300).rsqrt()
+    n = len(x)
+    matrix = (hessian * scale[:, None] * scale[None, :]).numpy() + (damping + 1e-12) * np.eye(n)
+    slope = gradient * scale
+    size = max(float(slope.norm()), 1e-300)  # of the problem; the solver's tolerances are absolute
+    lower = ((-1 - x) / scale / size).clamp(max=0.0).numpy()
+    upper = ((1 - x) / scale / size).clamp(min=0.0).numpy()
+    result, factor = np.zeros(n), np.zeros((n, n + 7))
+    free = mujoco.mju_boxQP(result, factor, None, np.ascontiguousarray(matrix), (slope / size).numpy(), lower, upper)
+    if free < 0:
+        return x.clone()
+    return (x + torch.as_tensor(result) * (size * scale)).clamp(-1.0, 1.0)
+
+
+def least_squares(
+    evaluator: Evaluator,
+    colouring: Colouring,
+    starts: Sequence[torch.Tensor | Descent],
+    cfg: LeastSquaresCfg | None = None,
+    on_iteration: Callable[[list[Descent]], None] | None = None,
+    where: torch.Tensor | None = None,
+) -> list[Descent]:
+    """Refine starts to the nearest minimum of the score.
+
+    Each iteration simulates, in one batch, every start's trial steps at several dampings, and beside the favoured
+    trial the perturbed vectors for its Jacobian: where the favoured trial wins, the next Jacobian is already there.
+
+    Args:
+        evaluator: Simulates.
+        colouring: Which entries are perturbed together.
+        starts: Normalised vectors, (size,), or descents to go on with.
+        cfg: Settings.
+        on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
+        where: Which samples count, (T, R) bool; ``None`` means those to train on.
+
+    Returns:
+        The descents, the best first.
+    """
+    cfg = cfg or LeastSquaresCfg()
+    descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
+    for descent in descents:
+        if descent.lost_jacobian:
+            _find_jacobian(descent, evaluator, colouring, where)
+    while running := [d for d in descents if d.stop_reason is None]:
+        batches, steps = [], []
+        for descent in running:
+            trials = descent.trials()
+            neighbours, step = perturbed(trials[0], colouring)
+            batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
+            steps.append(step)
+        every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)), where)
+        start = 0
+        for descent, batch, step in zip(running, batches, steps, strict=True):
+            part = Residuals(error=every.error[start : start + len(batch)], where=every.where, step=every.step)
+            _advance(descent, batch, part, step, colouring, cfg)
+            start += len(batch)
+        _drop_hopeless(descents, cfg)
+        if on_iteration is not None:
+            on_iteration(descents)
+    return sorted(descents, key=lambda d: d.score)
+
+
+def _find_jacobian(descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None) -> None:
+    """Compute the Jacobian at x again, beside the descent's iterations."""
+    neighbours, step = perturbed(descent.x, colouring)
+    residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([descent.x[None], neighbours])), where)
+    descent.jacobian, descent.lost_jacobian = jacobian(residuals, step, colouring), False
+
+
+def _advance(
+    descent: Descent,
+    batch: torch.Tensor,
+    residuals: Residuals,
+    step: torch.Tensor,
+    colouring: Colouring,
+    cfg: LeastSquaresCfg,
+) -> None:
+    """Look around where the descent is, or take the best trial; say when it is time to stop.
+
+    Args:
+        descent: Changed in place.
+        batch: Normalised vectors: the favoured trial, its neighbours, the other trials.
+        residuals: Theirs.
+        step: The neighbours' signed steps.
+        colouring: Which entries were perturbed together.
+        cfg: Settings.
+    """
+    descent.iteration += 1
+    scores = residuals.score
+    if descent.jacobian is None:  # the only trial is x itself
+        if not np.isfinite(descent.score):
+            descent.score = float(scores[0])
+        descent.jacobian = jacobian(residuals, step, colouring)
+    else:
+        rows = [0, *range(1 + len(colouring.colours), len(batch))]
+        best = int(scores[rows].argmin())
+        gain = descent.score - float(scores[rows[best]])
+        expected = descent.expected_gain(batch[0])
+        descent.stalled = 0 if gain > cfg.score_tolerance * descent.score else descent.stalled + 1
+        if gain > 0:
+            moved = float((batch[rows[best]] - descent.x).abs().max())
+            descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
+            descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[best] / 10.0)
+            # the favoured trial's neighbours were simulated beside it
+            descent.jacobian = jacobian(residuals, step, colouring) if best == 0 else None
+            if moved < cfg.step_tolerance:
+                descent.stop_reason = "converged"
+        else:
+            descent.damping *= 1e3
+        if expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED:
+            descent.stop_reason = "converged"
+    descent.scores.append(descent.score)
+    if descent.stop_reason is None and _creeps(descent.scores, cfg.creep_tolerance):
+        descent.stop_reason = "converged"
+    if descent.score <= cfg.target_score:
+        descent.stop_reason = f"score below {cfg.target_score:g}"
+    elif not np.isfinite(descent.score):
+        descent.stop_reason = "diverged at its start"
+    elif descent.stop_reason is None and descent.iteration >= cfg.max_iteration:
+        descent.stop_reason = f"max_iteration {cfg.max_iteration}"
+
+
+def _creeps(scores: Sequence[float], tolerance: float) -> bool:
+    """Whether the score has all but stopped falling, as it does where friction makes it rough."""
+    return len(scores) > _CREEPING and scores[-1 - _CREEPING] - scores[-1] < _CREEPING * tolerance * scores[-1]
+
+
+def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
+    """Stop starts that are far behind the best one, or that have come down into its valley."""
+    best = min(descents, key=lambda d: d.score)
+    for descent in descents:
+        if descent is best or descent.stop_reason is not None or descent.iteration < 5:
+            continue
+        if descent.score > cfg.give_up_ratio * best.score:
+            descent.stop_reason = "another start is far better"
+        elif float((descent.x - best.x).abs().max()) < cfg.same_valley:
+            descent.stop_reason = "another start is in the same valley"

@@ -1,0 +1,74 @@
+"""From starts to the result: first on the beginning of the recordings, then on all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from pace_optim.optimizers.jacobian import Colouring, jacobian, perturbed
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.recording.dataset import Dataset
+
+_COARSE_PART = 0.25
+_COARSE = LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
+_DAMPING_AFTER_COARSE = 1e-5
+_ANOTHER_VALLEY = 0.02
+_MUCH_WORSE = 10.0
+
+
+def refine(
+    evaluator: Evaluator,
+    colouring: Colouring,
+    starts: Sequence[Descent],
+    on_iteration: Callable[[list[Descent]], None] | None = None,
+) -> list[Descent]:
+    """Least squares from several starts; most of the way is gone on a part of each recording, which is cheaper.
+
+    Args:
+        evaluator: Simulates.
+        colouring: Which entries are perturbed together.
+        starts: Fresh descents, or those of an interrupted run to go on with.
+        on_iteration: Called with all descents after each iteration on the whole recordings.
+
+    Returns:
+        The descents, the best first.
+    """
+    descents = list(starts)
+    if all(descent.iteration == 0 for descent in descents):
+        descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents])
+        if on_iteration is not None:
+            on_iteration(descents)
+    return least_squares(evaluator, colouring, descents, on_iteration=on_iteration)
+
+
+def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequence[torch.Tensor]) -> list[Descent]:
+    """Refine on the beginnings of the recordings; keep, of each start, what is better on the whole.
+
+    Ends that are far worse than the best, or next to it, are left out.
+    """
+    ends = [d.x for d in least_squares(evaluator, colouring, starts, _COARSE, where=beginning(evaluator.dataset))]
+    candidates = torch.stack([*ends, *starts])
+    neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
+    residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))
+    scores = residuals.score[: len(candidates)]
+    kept: list[Descent] = []
+    for i in scores.argsort().tolist():
+        x = candidates[i]
+        if kept and not scores[i] < _MUCH_WORSE * scores.min():
+            break
+        if all(float((x - other.x).abs().max()) > _ANOTHER_VALLEY for other in kept):
+            kept.append(Descent(x=x, score=float(scores[i]), damping=_DAMPING_AFTER_COARSE, iteration=1))
+    for descent in kept:
+        if torch.equal(descent.x, ends[0]):
+            around = torch.cat([residuals.error[:1], residuals.error[len(candidates) :]])
+            descent.jacobian = jacobian(replace(residuals, error=around), step, colouring)
+    return kept[: len(starts)]
+
+
+def beginning(dataset: Dataset, part: float = _COARSE_PART) -> torch.Tensor:
+    """The first part of each recording's training samples, (T, R) bool."""
+    order = dataset.train.cumsum(dim=0)
+    return dataset.train & (order <= (part * dataset.train.sum(dim=0)).ceil())

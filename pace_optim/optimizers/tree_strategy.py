@@ -1,0 +1,102 @@
+"""One CMA-ES strategy over a group of entries of the parameter vector."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from pace_optim.optimizers.convergence import Criterion, SearchState
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # cma warns of optional packages at import
+    import cma
+
+DIVERGED_SCORE = 1e6
+"""The score of a simulation that is not finite [rad²]."""
+
+
+class TreeStrategy:
+    """pycma's strategy with its own random numbers, its best candidate and its reasons to stop."""
+
+    def __init__(
+        self,
+        entries: Sequence[int],
+        *,
+        start: np.ndarray,
+        sigma: float,
+        population_size: int,
+        seed: int,
+        criteria: Sequence[Criterion],
+    ):
+        """Start a search.
+
+        Args:
+            entries: Which entries of the full vector it searches.
+            start: Where it starts, normalised, (len(entries),).
+            sigma: Initial standard deviation, normalised.
+            population_size: Candidates per generation.
+            seed: Seed of its random numbers.
+            criteria: When it stops, beside pycma's own conditions.
+        """
+        self.entries = np.asarray(entries)
+        self.criteria = tuple(criteria)
+        self.best_x = np.array(start, dtype=float)
+        self.best_score = np.inf
+        self.best_scores: list[float] = []
+        self.stop_reason: str | None = None
+        generator = np.random.default_rng(seed)
+        options = {
+            "bounds": [-1.0, 1.0],
+            "popsize": population_size,
+            "randn": lambda *shape: generator.standard_normal(shape),
+            "seed": np.nan,
+            "verbose": -9,
+            "tolfun": 1e-13,
+            "tolfunhist": 1e-14,
+            "tolx": 1e-10,
+            "maxiter": np.inf,
+        }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._strategy = cma.CMAEvolutionStrategy(list(start), sigma, options)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of the search distribution, normalised, inside the bounds."""
+        return np.asarray(self._strategy.result.xfavorite)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of the search distribution, normalised."""
+        return np.asarray(self._strategy.stds)
+
+    def ask(self) -> np.ndarray:
+        """Candidates of the next generation, normalised, (population_size, len(entries))."""
+        return np.asarray(self._strategy.ask())
+
+    def tell(self, x: np.ndarray, scores: np.ndarray, shown: np.ndarray) -> None:
+        """Take the scores of a generation.
+
+        Args:
+            x: What :meth:`ask` gave.
+            scores: [rad²], (population_size,).
+            shown: What was simulated, where it differs from ``x``.
+        """
+        self._strategy.tell(list(x), scores)
+        i = int(scores.argmin())
+        if scores[i] < self.best_score:
+            self.best_score, self.best_x = float(scores[i]), shown[i].copy()
+        self.best_scores.append(self.best_score)
+        state = SearchState(
+            generation=len(self.best_scores), scores=scores, best_scores=self.best_scores, spread=self.spread
+        )
+        own = [reason for criterion in self.criteria if (reason := criterion(state))]
+        pycma = [f"cma: {name}" for name in self._strategy.stop()]
+        self.stop_reason = next(iter(own + pycma), None)
+
+    def forget_best(self) -> None:
+        """Start over with the best, after what is simulated for a vector has changed."""
+        self.best_score = np.inf
+        self.stop_reason = None

@@ -1,0 +1,1 @@
+"""One identification problem: parameters, environments, rollouts and their residuals."""

@@ -1,0 +1,188 @@
+"""Everything that a fit starts from: task, recordings, parameters, trees, and how to build environments."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import torch
+
+from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.simulation import Simulation
+from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording import Recording, conform_recording, load_recording
+from pace_optim.recording.dataset import Dataset, make_dataset
+
+DELAY_MODES = ("command", "effort")
+
+
+@dataclass(kw_only=True, eq=False)
+class Problem:
+    """One identification problem."""
+
+    task: str
+    plain_cfg: PaceSim2realEnvCfg
+    """The environment before effects and a finer physics step."""
+    env_cfg: PaceSim2realEnvCfg
+    """The environment with them."""
+    dataset: Dataset
+    space: ParameterSpace
+    trees: list[list[str]]
+    delay_mode: str
+    control_dt: float
+    """Control step [s]."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints, in order."""
+        return tuple(self.env_cfg.sim2real.joint_order)
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics step [s]."""
+        return self.env_cfg.sim.dt
+
+    @property
+    def effects(self) -> list[str]:
+        """The effects whose parameters are identified, as on the command line."""
+        return [cfg.label for cfg in effect_cfgs(self.env_cfg.sim2real.effects)]
+
+    @property
+    def joints_stand_alone(self) -> bool:
+        """Whether no joint moves another."""
+        return max(len(tree) for tree in self.trees) == 1
+
+    def make_env(self, num_envs: int, simulation: Callable[..., Simulation] | None = None) -> ManagerBasedRLEnv:
+        """Build the environment.
+
+        Args:
+            num_envs: Number of environments.
+            simulation: What builds its simulation; ``None`` keeps the configuration's.
+        """
+        cfg = copy.deepcopy(self.env_cfg)
+        cfg.scene.num_envs = num_envs
+        cfg.sim.class_type = simulation or cfg.sim.class_type
+        return ManagerBasedRLEnv(cfg)
+
+    def with_effects(self, effects: Sequence[EffectCfg | str]) -> Problem:
+        """The same recordings with these effects instead of its own."""
+        cfg = _configured(self.plain_cfg, self.physics_dt, effects)
+        return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    def with_physics_dt(self, physics_dt: float) -> Problem:
+        """The same with another physics step [s]."""
+        return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
+
+    def evaluator(self) -> Evaluator:
+        """An evaluator of candidates on all recordings."""
+        return Evaluator(self.make_env, self.dataset, self.space)
+
+    def training_evaluator(self) -> Evaluator:
+        """An evaluator of candidates on the recordings that are trained on."""
+        return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space)
+
+
+def load_problem(
+    task: str,
+    *,
+    data: Sequence[str | Path] = (),
+    validation: Sequence[str | Path] = (),
+    delay_mode: str | None = None,
+    physics_dt: float | None = None,
+    effects: Sequence[EffectCfg | str] = (),
+) -> Problem:
+    """Read and check everything that a fit needs.
+
+    Args:
+        task: Registered name of the environment.
+        data: Recordings to train on; none means the robot's own sample.
+        validation: Recordings that are never trained on; none keeps the last 30 % of each recording for that.
+        delay_mode: ``"command"`` or ``"effort"``; ``None`` keeps the configuration's.
+        physics_dt: A finer physics step under the same control rate [s].
+        effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
+            keeps the configuration's.
+
+    Raises:
+        ValueError: If anything does not fit.
+    """
+    cfg = load_env_cfg(task)
+    if not isinstance(cfg, PaceSim2realEnvCfg):
+        raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
+    if delay_mode is not None and delay_mode not in DELAY_MODES:
+        raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
+    control_dt = cfg.sim.dt * cfg.decimation
+    drives = cfg.scene.robot.actuators.values()
+    for drive in drives:
+        drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
+        drive_dt = cfg.sim.dt * drive.control_decimation
+        if abs(drive_dt - control_dt) > 1e-9:
+            raise ValueError(
+                f"The drive's controller runs every {1e3 * drive_dt:g} ms, the environment steps every "
+                f"{1e3 * control_dt:g} ms: identification needs both alike, so that a delay has one unit. Set the "
+                "drive's control_decimation to the environment's decimation."
+            )
+        longest = float(cfg.sim2real.bounds_params[-1, 1])
+        if drive.max_delay < longest:
+            raise ValueError(
+                f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
+                f"{drive.max_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
+            )
+    cfg.scene.num_envs = 1
+    plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
+    env = ManagerBasedRLEnv(cfg)
+    paths = [Path(path) for path in data] or [Path(cfg.sim2real.data_dir)]
+    recordings = [_load(path, env, control_dt) for path in paths]
+    held_out = [_load(Path(path), env, control_dt) for path in validation]
+    problem = Problem(
+        task=task,
+        plain_cfg=plain,
+        env_cfg=cfg,
+        dataset=make_dataset(recordings, held_out),
+        space=ParameterSpace.of(cfg.sim2real),
+        trees=independent_trees(env),
+        delay_mode=next(iter(drives)).delay_mode,
+        control_dt=control_dt,
+    )
+    env.close()
+    return problem
+
+
+def _configured(
+    plain: PaceSim2realEnvCfg, physics_dt: float | None, effects: Sequence[EffectCfg | str]
+) -> PaceSim2realEnvCfg:
+    cfg = copy.deepcopy(plain)
+    cfg.set_effects(effects)
+    if physics_dt is not None:
+        set_physics_dt(cfg, physics_dt)
+    return cfg
+
+
+def _load(path: Path, env: ManagerBasedRLEnv, control_dt: float) -> Recording:
+    cfg = cast(PaceSim2realEnvCfg, env.cfg)
+    robot = env.scene["robot"]
+    return conform_recording(
+        load_recording(path),
+        joint_order=tuple(robot.joint_names),
+        control_dt=control_dt,
+        joint_pos_limits=robot.data.joint_pos_limits.numpy(),
+        load_bodies=robot.body_names,
+        accepts_load=cfg.sim2real.apply_load is not None,
+    )
+
+
+def file_digest(path: str | Path) -> str:
+    """SHA-256 of a file, to tell whether it has changed."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def as_vector(problem: Problem, values: dict) -> torch.Tensor:
+    """The normalised vector of a result's ``parameters``."""
+    return problem.space.to_normalised(problem.space.from_dict(values))

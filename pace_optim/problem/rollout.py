@@ -1,0 +1,241 @@
+"""Simulating candidates on recordings, all in one batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import torch
+
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording.dataset import Dataset
+
+if TYPE_CHECKING:
+    from pace_envs import ManagerBasedEnv
+
+_LOAD_STEPS = 6
+"""Fixed-point steps of a start whose positions depend on the load there."""
+_DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+
+
+class Rollout:
+    """Lets every candidate follow every recording's commands.
+
+    Environment ``c * R + r`` simulates candidate c on recording r, with that recording's gains, limits and load.
+    Iterating simulates; at every sample it yields the simulated and measured positions:
+
+        rollout.start(physical)
+        for sim_dof_pos, real_dof_pos in rollout:   # each (num_envs, n) [rad]
+            …
+
+    ``sim_dof_pos`` is what the encoders would show without bias (the true joint position, unless an effect changes
+    that): subtract the candidate's encoder bias to compare.
+    During the iteration, ``weight`` (num_envs, 1) says how much each environment's sample counts in the score (its
+    sum over the rollout is 1 per candidate), and ``sim_dof_vel`` and ``real_dof_vel`` are at hand.
+    """
+
+    def __init__(self, env: ManagerBasedEnv, dataset: Dataset, space: ParameterSpace):
+        """Give each environment its recording's facts.
+
+        Args:
+            env: Its number of environments must be a multiple of the number of recordings.
+            dataset: The recordings.
+            space: The parameters.
+
+        Raises:
+            ValueError: If the number of environments does not fit, or a recording's facts cannot be simulated.
+        """
+        count = dataset.num_recordings
+        if env.num_envs % count:
+            raise ValueError(
+                f"num_envs is {env.num_envs}, expected a multiple of the number of recordings ({count}): "
+                f"try {max(1, env.num_envs // count) * count}."
+            )
+        self.env = env
+        self.robot = env.scene["robot"]
+        self.dataset = dataset
+        self.space = space
+        self.num_candidates = env.num_envs // count
+        self.simulated_steps = 0
+        self._where = dataset.train
+        self.weight: torch.Tensor | float = 0.0
+        self.physical = torch.empty(0)
+        for r in range(count):
+            self._set_facts(r)
+        begin = dataset.session_start.repeat(self.num_candidates)[:, None]
+        self._session_start = begin.expand(-1, self.robot.num_joints)
+
+    @property
+    def sim_dof_vel(self) -> torch.Tensor:
+        """Simulated joint velocities at the present sample, (num_envs, n) [rad/s]."""
+        return self.robot.data.joint_vel
+
+    @property
+    def real_dof_vel(self) -> torch.Tensor:
+        """Measured joint velocities at the present sample, (num_envs, n) [rad/s]."""
+        return self._rows(self.dataset.measured_vel[self._step])
+
+    @property
+    def duration_steps(self) -> int:
+        """Control steps of the present rollout."""
+        return self.dataset.last_step(self._where)
+
+    def start(
+        self,
+        physical: torch.Tensor,
+        where: torch.Tensor | None = None,
+        per_joint: Mapping[str, torch.Tensor] | None = None,
+        initial_offset: torch.Tensor | None = None,
+    ) -> None:
+        """Write candidates and put every environment at its recording's first sample.
+
+        Args:
+            physical: Physical parameters, (num_candidates, size).
+            where: Which samples count, (T, R) bool; ``None`` means those to train on.
+            per_joint: Values per joint of shared parameters, in place of those in ``physical``:
+                {name: (num_candidates, n)}.
+            initial_offset: Added to each recording's first position, (num_candidates, n) [rad].
+        """
+        count = self.dataset.num_recordings
+        self._where = self.dataset.train if where is None else where
+        self.physical = physical.repeat_interleave(count, dim=0)
+        self.env.scene.reset()
+        copies = {name: values.repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
+        self.space.apply(self.env, self.physical, copies)
+        self.begin(0.0 if initial_offset is None else initial_offset.repeat_interleave(count, dim=0))
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
+        data = self.dataset
+        weights = self._where.double() / self._where.sum()
+        counts = self._where.any(dim=1).tolist()
+        for k, sim_dof_pos in self._samples():
+            self._step = k
+            if counts[k]:
+                self.weight = self._rows(weights[k, :, None])
+                yield sim_dof_pos, self._rows(data.measured[k])
+
+    def _samples(self) -> Iterator[tuple[int, torch.Tensor]]:
+        """Step and sensed positions at every control step, as late as the effects on the recording have them."""
+        steps = self.duration_steps
+        lag = self._observation_lag(steps)
+        if lag is None:
+            yield from enumerate(self.simulated(steps))
+            return
+        # a sample of step k is taken at k - lag: some steps are simulated ahead, some are remembered
+        ahead = max(0, math.ceil(-float(lag.min()))) + 2
+        behind = max(0, math.ceil(float(lag.max()))) + 2
+        length = ahead + behind + 1
+        seen = torch.zeros(length, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        late = (lag != 0).any(dim=2).any(dim=0).nonzero()[:, 0]
+        first = lag[0, late]
+        rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
+        for j, position in enumerate(self.simulated(steps + ahead)):
+            seen[j % length] = position
+            if j == 0:
+                seen[:] = position
+            if (k := j - ahead) >= 0:
+                shown = seen[k % length].clone()
+                shown[late] = _interpolated(seen[:, late], k - (first + rate * k))
+                yield k, shown
+
+    def _observation_lag(self, steps: int) -> torch.Tensor | None:
+        """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
+        dt = self.env.step_dt
+        total = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        start = self._rows(self.dataset.start_time[:, None])
+        found = False
+        for actuator in self.robot.actuators.values():
+            if actuator.effects is not None and actuator.effects.lags:
+                found = True
+                for row, at in enumerate((0.0, (steps - 1) * dt)):
+                    lag = actuator.effects.observation_lag((start + at).expand(-1, actuator.num_joints))
+                    if lag is not None:
+                        total[row][:, actuator.joint_indices] = lag / dt
+        return total if found else None
+
+    def simulated(self, steps: int) -> Iterator[torch.Tensor]:
+        """Simulate that many control steps; yields the sensed positions at each, (num_envs, n) [rad]."""
+        data, enable = self.dataset, self.dataset.torque_enable
+        last = len(data.command) - 1
+        for j in range(steps):
+            yield self.robot.sensed_joint_pos()
+            if j + 1 == steps:
+                break
+            k = min(j, last)
+            if enable is not None and (j == 0 or not torch.equal(enable[k], enable[k - 1])):
+                for actuator in self.robot.actuators.values():
+                    actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
+            self.env.simulate(self._rows(data.command[k]))
+        self.simulated_steps += (steps - 1) * self.env.num_envs
+
+    def _rows(self, per_recording: torch.Tensor) -> torch.Tensor:
+        """(R, m) to (num_envs, m): the same for every candidate."""
+        count = self.dataset.num_recordings
+        if count == 1:
+            return per_recording.expand(self.env.num_envs, -1)
+        return per_recording.expand(self.num_candidates, -1, -1).reshape(self.env.num_envs, -1)
+
+    def look_at(self, where: torch.Tensor) -> None:
+        """Say which samples count, (T, R) bool."""
+        self._where = where
+
+    def positions_at_every_step(self) -> Iterator[torch.Tensor]:
+        """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
+        for _, sim_dof_pos in self._samples():
+            yield sim_dof_pos
+
+    def begin(self, offset: torch.Tensor | float = 0.0) -> None:
+        """Put every environment at its recording's first sample, with the parameters that it has.
+
+        Args:
+            offset: Added to the first positions, (num_envs, n) [rad].
+        """
+        shown = self._rows(self.dataset.measured[0]).clone()
+        for actuator in self.robot.actuators.values():
+            ids = actuator.joint_indices
+            shown[:, ids] += actuator.encoder_bias
+            actuator.set_session_time(self._session_start[:, ids])
+        speed = self._rows(self.dataset.start_vel)
+        needs_load = any(actuator.needs_load for actuator in self.robot.actuators.values())
+        for _ in range(_LOAD_STEPS if needs_load else 1):  # the load bends what an encoder on the motor shows
+            self.robot.write_joint_state_to_sim(self.robot.joint_pos_that_shows(shown) + offset, speed)
+            if needs_load:
+                self.env.sim.forward()
+
+    def _set_facts(self, r: int) -> None:
+        recording = self.dataset.recordings[r]
+        rows = slice(r, None, self.dataset.num_recordings)
+        for actuator in self.robot.actuators.values():
+            for name in _DRIVE_FIELDS:
+                value = getattr(recording.drive, name)
+                if value is not None:
+                    getattr(actuator, name)[rows] = torch.as_tensor(value)[actuator.joint_indices]
+        load = {
+            key: value
+            for key in ("load_mass", "load_length", "arm_mass")
+            if (value := getattr(recording.load, key)) is not None
+        }
+        apply_load = self.env.cfg.sim2real.apply_load  # type: ignore[attr-defined]
+        if load and apply_load is not None:
+            apply_load(self.env, rows, load)
+        for body, mass in recording.load.added_mass.items():
+            self.robot.add_body_mass(body, mass, rows)
+
+
+def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+    """A ring of samples (length, m, n) at real-valued steps (m, n), by the cubic through four samples (Lagrange)."""
+    whole = at.floor()
+    f = (at - whole)[None]
+    index = whole.long()[None] + torch.arange(-1, 3)[:, None, None]
+    samples = seen.gather(0, index % len(seen))
+    weights = torch.cat(
+        [
+            -f * (f - 1) * (f - 2) / 6,
+            (f + 1) * (f - 1) * (f - 2) / 2,
+            -(f + 1) * f * (f - 2) / 2,
+            (f + 1) * f * (f - 1) / 6,
+        ]
+    )
+    return (weights * samples).sum(dim=0)

@@ -1,0 +1,169 @@
+"""Figures of a run: what was commanded, measured and simulated, and how the score fell."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from pace_optim.report.number_text import angle_text, angle_unit
+from pace_optim.report.trajectory_errors import held_out_spans, rms
+from pace_optim.run.history import History
+
+_TARGET, _MEASURED, _SIMULATED, _HELD_OUT = "#a5abb2", "#1f5fa8", "#e07b00", "#8a6fc4"
+_JOINTS_PER_FIGURE = 12
+_GRID: dict[str, Any] = {"alpha": 0.25, "linewidth": 0.6}
+
+
+def plot_trajectories(
+    best_trajectory: Mapping[str, Any], *, title: str = "", make_figure: Callable[..., Figure] = Figure
+) -> dict[str, Figure]:
+    """Draw every joint of every recording: positions above, the error underneath, validation data shaded.
+
+    Args:
+        best_trajectory: The content of ``best_trajectory.pt``.
+        title: Written before the recording's name.
+        make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
+
+    Returns:
+        One figure per recording and dozen joints, by a name fit for a file.
+    """
+    names = list(best_trajectory["joint_names"])
+    parts = [range(i, min(i + _JOINTS_PER_FIGURE, len(names))) for i in range(0, len(names), _JOINTS_PER_FIGURE)]
+    figures = {}
+    for r, recording in enumerate(best_trajectory["recordings"]):
+        for p, joints in enumerate(parts):
+            stem = "trajectory_" + (re.sub(r"[^\w.-]+", "_", recording["name"]).strip("._") or str(r + 1))
+            stem += f"_{p + 1}" if len(parts) > 1 else ""
+            stem += f"_recording_{r + 1}" if stem in figures else ""
+            heading = " · ".join(text for text in (title, recording["name"]) if text)
+            figures[stem] = _plot_joints(recording, names, joints, heading, make_figure)
+    return figures
+
+
+def _tight_layout() -> ConstrainedLayoutEngine:
+    return ConstrainedLayoutEngine(h_pad=0.02, hspace=0.0)
+
+
+def _plot_joints(
+    recording: Mapping[str, Any],
+    names: Sequence[str],
+    joints: Sequence[int],
+    title: str,
+    make_figure: Callable[..., Figure],
+) -> Figure:
+    """One figure of some joints of one recording."""
+    columns = min(3, len(joints))
+    rows = -(-len(joints) // columns)
+    figure = make_figure(figsize=(max(9.0, 5.4 * columns), 1.1 + max(3.9, 3.1 * rows)), layout=_tight_layout())
+    series = {key: np.asarray(recording[key]) for key in ("time", "des_dof_pos", "dof_pos", "sim_dof_pos", "train")}
+    factor, unit = angle_unit(np.abs(series["sim_dof_pos"] - series["dof_pos"])[:, list(joints)].max(axis=0))
+    outer = figure.add_gridspec(rows, columns)
+    for place, j in enumerate(joints):
+        inner = outer[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2.6, 1), hspace=0.04)
+        above = figure.add_subplot(inner[0])
+        below = figure.add_subplot(inner[1], sharex=above)
+        _plot_joint(above, below, series, j, factor)
+        above.set_title(names[j], fontsize=10, loc="left")
+        above.set_title(_errors(series, j), fontsize=8, loc="right", color="#5f6368")
+        if place % columns == 0:
+            above.set_ylabel("position [rad]", fontsize=9)
+            below.set_ylabel(f"error [{unit}]", fontsize=9)
+        if place + columns >= len(joints):
+            below.set_xlabel("time [s]", fontsize=9)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=color, lw=2, label=label)
+        for color, label in ((_TARGET, "target"), (_MEASURED, "measured"), (_SIMULATED, "simulated"))
+    ]
+    if not series["train"].all():
+        handles.append(Patch(color=_HELD_OUT, alpha=0.14, lw=0, label="kept for validation"))
+    figure.suptitle(title, fontsize=11)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
+    return figure
+
+
+def _plot_joint(above: Axes, below: Axes, series: Mapping[str, np.ndarray], j: int, factor: float) -> None:
+    time = series["time"]
+    error = factor * (series["sim_dof_pos"][:, j] - series["dof_pos"][:, j])
+    above.plot(time, series["des_dof_pos"][:, j], color=_TARGET, lw=0.9, alpha=0.7)
+    above.plot(time, series["dof_pos"][:, j], color=_MEASURED, lw=1.3)
+    above.plot(time, series["sim_dof_pos"][:, j], color=_SIMULATED, lw=0.9, ls=(0, (4, 1.5)))
+    below.plot(time, error, color=_SIMULATED, lw=0.7)
+    below.axhline(0.0, color="0.5", lw=0.6)
+    for axes in (above, below):
+        for start, end in held_out_spans(time, series["train"]):
+            axes.axvspan(start, end, color=_HELD_OUT, alpha=0.14, lw=0)
+        axes.grid(**_GRID)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    above.set_xlim(time[0], time[-1])
+    above.tick_params(labelbottom=False)
+
+
+def _errors(series: Mapping[str, np.ndarray], j: int) -> str:
+    error = series["sim_dof_pos"][:, j] - series["dof_pos"][:, j]
+    train = series["train"].astype(bool)
+    parts = (("train", rms(error[train])), ("validation", rms(error[~train])))
+    return ",  ".join(f"{name} {angle_text(value)}" for name, value in parts if value is not None)
+
+
+def plot_scores(history: History, *, title: str = "", make_figure: Callable[..., Figure] = Figure) -> Figure:
+    """Draw the score over the iterations, search first and refinement after it; the axis above counts simulated steps.
+
+    Args:
+        history: What happened.
+        title: Above everything.
+        make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
+    """
+    figure = make_figure(figsize=(9.0, 5.0), layout=_tight_layout())
+    axes = figure.add_subplot()
+    searched, refined = len(history.search_best), len(history.refine_best)
+    search = np.arange(1, searched + 1)
+    refine = searched + np.arange(1, refined + 1)
+    mark = "o" if searched + refined < 60 else None
+    if searched:
+        axes.plot(search, history.search_mean, color=_TARGET, lw=1.2, label="search, mean of the generation")
+        axes.plot(search, history.search_best, color=_MEASURED, lw=1.8, marker=mark, ms=3, label="search, best so far")
+    if refined:
+        axes.plot(refine, history.refine_best, color=_SIMULATED, lw=1.8, marker=mark, ms=3, label="refinement, best")
+    if searched and refined:
+        axes.axvline(searched + 0.5, color="0.6", lw=0.8, ls=":")
+    if searched + refined:
+        axes.set_yscale("log", nonpositive="mask")
+        axes.legend(frameon=False, fontsize=9)
+        _steps_above(axes, [*history.search_steps, *history.refine_steps])
+    else:
+        axes.text(0.5, 0.5, "no iteration was recorded", ha="center", va="center", transform=axes.transAxes)
+    axes.set_xlabel("iteration (generations, then iterations of the refinement)" if refined else "generation")
+    axes.set_ylabel("score [rad²]")
+    axes.grid(**_GRID)
+    axes.spines["right"].set_visible(False)
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _steps_above(axes: Axes, steps: Sequence[int]) -> None:
+    """A second x axis in simulated steps, which do not grow evenly with the iterations."""
+    count = len(steps)
+    axes.set_xlim(0.5, count + 0.5)
+    marks = np.unique(np.linspace(1, count, min(6, count)).round().astype(int))
+    upper = axes.secondary_xaxis("top")
+    upper.set_xticks(marks, [_in_short(steps[mark - 1]) for mark in marks])
+    upper.set_xlabel("simulated steps")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _in_short(count: float) -> str:
+    """A count with a suffix: 3.49 M."""
+    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if count >= size:
+            return f"{count / size:.3g} {suffix}"
+    return f"{count:.0f}"

@@ -1,0 +1,184 @@
+"""A run's recordings, replayed inside a training environment: the same drives, its physics, the base held."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pace_actuators import IdentifiedDrives
+from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs.identified import use_identified
+from pace_envs.manager_based_env import ManagerBasedEnvCfg
+from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.rollout import Rollout
+from pace_optim.recording import Recording, conform_recording, load_recording
+from pace_optim.recording.dataset import make_dataset
+from pace_optim.run.result import FitResult, rmse_by_joint
+from pace_optim.run.settings import FitSettings
+
+_HEIGHT = 2.0
+"""How far the base is lifted, so that no leg reaches the ground [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingReplay:
+    """Errors of a fit in a training environment, beside its own."""
+
+    joint_names: tuple[str, ...]
+    """The joints, in order."""
+
+    control_dt: float
+    """Control step of the training environment [s]."""
+
+    fitted_control_dt: float
+    """Control step of the identification [s]."""
+
+    fitted: Mapping[str, Mapping[str, float]]
+    """RMSE of the fit by ``"train"`` and ``"validation"``, joint (and ``"all"``) [rad]."""
+
+    replayed: Mapping[str, Mapping[str, float]]
+    """The same in the training environment."""
+
+    @property
+    def largest_change(self) -> float:
+        """Relative change of the error of all joints, the larger of training and validation data."""
+        parts = [part for part in self.replayed if self.replayed[part] and self.fitted.get(part)]
+        return max((abs(self.replayed[p]["all"] / self.fitted[p]["all"] - 1) for p in parts), default=float("nan"))
+
+    def __str__(self) -> str:
+        """A table: one line per joint."""
+        width = max(len(name) for name in (*self.joint_names, "joint"))
+        parts = [part for part in ("train", "validation") if self.replayed.get(part)]
+        head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>9}" for part in parts)
+        lines = [f"{'RMSE [mrad]':<{width}}{head}"]
+        for name in (*self.joint_names, "all"):
+            cells = ""
+            for part in parts:
+                fitted, here = self.fitted[part][name], self.replayed[part][name]
+                cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f}{100 * (here / fitted - 1):>+8.2f}%"
+            lines.append(f"{name:<{width}}{cells}")
+        lines.append(
+            f"control steps: {1e3 * self.fitted_control_dt:g} ms in the fit, {1e3 * self.control_dt:g} ms here"
+        )
+        return "\n".join(lines)
+
+
+def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg) -> TrainingReplay:
+    """Let the robot of a training environment follow the recordings of a fit, its base held in the air.
+
+    The drives are those that :func:`pace_envs.identified.use_identified` makes of the result, with the gains that were
+    in force in the recordings; the model, its contacts and the physics are the training environment's.
+
+    Args:
+        run: The fit's folder, or its ``result.json``.
+        cfg: The training environment; it is not changed.
+
+    Raises:
+        ValueError: If a recording has gone, or the environment's robot is another.
+    """
+    folder = Path(run) if Path(run).is_dir() else Path(run).parent
+    result = FitResult.load(folder)
+    settings, _ = FitSettings.load(folder / "settings.json")
+    fitted_cfg = load_env_cfg(settings.task)
+    if not isinstance(fitted_cfg, PaceSim2realEnvCfg):
+        raise ValueError(f"{settings.task} is no identification task: {folder} cannot be replayed.")
+    env_cfg = _held_robot(fitted_cfg, cfg, folder)
+    control_dt = _control_dt(env_cfg)
+    env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
+    paths = settings.data or [str(fitted_cfg.sim2real.data_dir)]
+    dataset = make_dataset(
+        [_load(path, env, control_dt) for path in paths], [_load(path, env, control_dt) for path in settings.validation]
+    )
+    env.close()
+    env = ManagerBasedRLEnv(_with_envs(env_cfg, dataset.num_recordings))
+    error = _errors(env, Rollout(env, dataset, _AsItIs()))  # type: ignore[arg-type]
+    env.close()
+    where = dataset.sampled[: len(error)]
+    residuals = Residuals(error=error[None] * where[None, :, :, None], where=where, step=torch.arange(len(error)))
+    return TrainingReplay(
+        joint_names=tuple(result.joint_names),
+        control_dt=control_dt,
+        fitted_control_dt=IdentifiedDrives.load(folder).at.control_dt,
+        fitted=result.rmse,
+        replayed={
+            part: rmse_by_joint(residuals, mask[: len(error)], tuple(result.joint_names))
+            for part, mask in (("train", dataset.train), ("validation", dataset.validation))
+        },
+    )
+
+
+class _AsItIs:
+    """Stands for the parameter space: the drives keep the values of their configuration."""
+
+    def apply(self, *_: Any) -> None:
+        """Write nothing."""
+
+
+def _held_robot(fitted: PaceSim2realEnvCfg, training: ManagerBasedEnvCfg, folder: Path) -> PaceSim2realEnvCfg:
+    """The identification task with the training environment's robot, ground and physics."""
+    cfg, training = copy.deepcopy(fitted), copy.deepcopy(training)
+    drives = {name: _with_recorded_gains(drive, fitted) for name, drive in training.scene.robot.actuators.items()}
+    training.scene.robot.actuators = drives
+    use_identified(training, folder, gains=True, on_the_rig=True)
+    x, y, z = fitted.scene.robot.init_state.pos
+    robot = replace(
+        training.scene.robot,
+        fix_base=True,
+        joint_order=tuple(fitted.sim2real.joint_order),
+        init_state=replace(fitted.scene.robot.init_state, pos=(x, y, z + _HEIGHT)),
+    )
+    cfg.scene = replace(cfg.scene, robot=robot, terrain=training.scene.terrain)
+    cfg.sim = training.sim
+    decimations = {drive.control_decimation for drive in robot.actuators.values()}
+    if len(decimations) > 1:
+        raise ValueError(
+            f"The drives have control_decimation {', '.join(map(str, sorted(decimations)))}, expected one for all: a "
+            "recording is replayed at one control step."
+        )
+    cfg.decimation = decimations.pop()
+    return cfg
+
+
+def _with_recorded_gains(drive: Any, fitted: PaceSim2realEnvCfg) -> Any:
+    """A training drive with the gains and limits of the identification task, for results that do not say them."""
+    groups = [each for each in fitted.scene.robot.actuators.values() if each.joint_names_expr == drive.joint_names_expr]
+    names = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+    return replace(drive, **{name: getattr(groups[0], name) for name in names}) if groups else drive
+
+
+def _load(path: str, env: ManagerBasedRLEnv, control_dt: float) -> Recording:
+    robot = env.scene["robot"]
+    return conform_recording(
+        load_recording(path),
+        joint_order=tuple(robot.joint_names),
+        control_dt=control_dt,
+        joint_pos_limits=robot.data.joint_pos_limits.numpy(),
+        load_bodies=robot.body_names,
+        accepts_load=env.cfg.sim2real.apply_load is not None,  # type: ignore[attr-defined]
+    )
+
+
+def _control_dt(cfg: PaceSim2realEnvCfg) -> float:
+    return cfg.sim.dt * cfg.decimation
+
+
+def _with_envs(cfg: PaceSim2realEnvCfg, num_envs: int) -> PaceSim2realEnvCfg:
+    cfg = copy.deepcopy(cfg)
+    cfg.scene.num_envs = num_envs
+    return cfg
+
+
+def _errors(env: ManagerBasedRLEnv, rollout: Rollout) -> torch.Tensor:
+    """q_sim - bias - q_measured at every step, (T, R, n) [rad]."""
+    robot, data = env.scene["robot"], rollout.dataset
+    bias = torch.zeros(env.num_envs, robot.num_joints, dtype=torch.float64)
+    for actuator in robot.actuators.values():
+        bias[:, actuator.joint_indices] = actuator.encoder_bias
+    rollout.start(torch.empty(1, 0), data.sampled)
+    return torch.stack([sim - bias - real for sim, real in rollout])

@@ -1,0 +1,1 @@
+"""What reaches disk and screen: atomic writes, messages, progress."""

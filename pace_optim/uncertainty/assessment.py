@@ -1,0 +1,93 @@
+"""A result looked at once more: its error bars and its trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from pace_optim.optimizers.jacobian import Colouring, jacobian, perturbed
+from pace_optim.problem.evaluator import Evaluator, Residuals
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
+
+_INITIAL_STEP = 1e-5
+"""Change of the first position for its derivative [rad]."""
+
+
+def assess(
+    problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
+) -> tuple[Uncertainty, Residuals]:
+    """Error bars at x from the training samples, and x's residuals on all samples."""
+    data, probes = problem.dataset, make_probes(x, colouring, problem.trees, problem.joint_names)
+    every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
+    train = data.train[every.step]
+    steps = train.any(dim=1)
+    trained = Residuals(
+        error=every.error[:, steps] * train[steps][None, :, :, None], where=train[steps], step=every.step[steps]
+    )
+    initial = probes.initial(trained.error)
+    there = jacobian(trained, probes.step, colouring)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints)
+    return uncertainty, Residuals(error=every.error[:1], where=every.where, step=every.step)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Probes:
+    """The simulations that say how the residuals depend on the parameters and on the first positions."""
+
+    vectors: torch.Tensor
+    """Normalised: x, the colours' perturbed vectors, then x once per set of joints, (m, size)."""
+    offset: torch.Tensor
+    """Added to the first positions, (m, n) [rad]."""
+    step: torch.Tensor
+    """Signed step of every entry, (size,)."""
+    initial_joints: tuple[tuple[int, ...], ...]
+    """Joints whose first position is moved together: the i-th of each tree."""
+
+    def initial(self, error: torch.Tensor) -> torch.Tensor:
+        """Derivatives by the first positions of ``initial_joints``, (sets, …), of residuals (m, …)."""
+        return (error[-len(self.initial_joints) :] - error[:1]) / _INITIAL_STEP
+
+
+def make_probes(
+    x: torch.Tensor, colouring: Colouring, trees: Sequence[Sequence[str]], joint_names: Sequence[str]
+) -> Probes:
+    """What to simulate for the error bars at x.
+
+    Args:
+        x: Normalised vector, (size,).
+        colouring: Which entries are perturbed together.
+        trees: Groups of joints that do not influence each other.
+        joint_names: All joints, in order.
+    """
+    neighbours, step = perturbed(x, colouring)
+    index = {name: i for i, name in enumerate(joint_names)}
+    depth = max(len(tree) for tree in trees)
+    shaken = tuple(tuple(index[tree[i]] for tree in trees if i < len(tree)) for i in range(depth))
+    vectors = torch.cat([x[None], neighbours, x.repeat(len(shaken), 1)])
+    offset = torch.zeros(len(vectors), len(joint_names), dtype=torch.float64)
+    for row, joints in zip(offset[-len(shaken) :], shaken, strict=True):
+        row[list(joints)] = _INITIAL_STEP
+    return Probes(vectors=vectors, offset=offset, step=step, initial_joints=shaken)
+
+
+def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
+    """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
+    data, result = problem.dataset, []
+    for r, recording in enumerate(data.recordings):
+        at = residuals.where[:, r]
+        measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
+        result.append(
+            {
+                "name": recording.name,
+                "time": torch.as_tensor(recording.time)[: len(measured)],
+                "des_dof_pos": torch.as_tensor(recording.des_dof_pos)[: len(measured)],
+                "dof_pos": measured,
+                "sim_dof_pos": measured + residuals.error[0, at, r],
+                "train": data.train[residuals.step][at, r],
+            }
+        )
+    return {"joint_names": list(problem.joint_names), "recordings": result}

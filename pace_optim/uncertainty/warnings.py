@@ -1,0 +1,175 @@
+"""What a user must know before trusting a result."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from pace_envs.tasks.pace import GLOBAL
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.step_error import step_error
+from pace_optim.uncertainty.uncertainty import Uncertainty
+
+_OVERFIT_RATIO = 1.5
+_NOTHING = 1e-6
+"""Errors below this are nothing to speak of [rad]."""
+_OF_THE_STEP = (0.3, 5.0)
+"""The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
+recording comes from a simulation with this very step."""
+_UNKNOWN = 0.5
+"""A standard deviation above this part of the bound range leaves a parameter open."""
+
+
+def fit_warnings(
+    problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty, rmse: dict[str, dict[str, float]]
+) -> list[str]:
+    """Plain sentences, none if all is well.
+
+    Args:
+        problem: What was fitted.
+        physical: The result, (size,).
+        uncertainty: At the result.
+        rmse: Errors as in ``result.json``.
+    """
+    warnings = _at_bounds(problem, physical, uncertainty)
+    if uncertainty.no_influence:
+        listed = ", ".join(uncertainty.no_influence)
+        warnings.append(f"No influence on these recordings, so the value means nothing: {listed}.")
+    unknown = [
+        label
+        for label, std, low, high in zip(
+            problem.space.labels,
+            uncertainty.std.tolist(),
+            problem.space.lower.tolist(),
+            problem.space.upper.tolist(),
+            strict=True,
+        )
+        if std > _UNKNOWN * (high - low)
+    ]
+    if unknown:
+        warnings.append(f"Hardly known, the error bar is as wide as the bounds: {', '.join(unknown)}.")
+    for group in uncertainty.indistinguishable:
+        warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
+    warnings += _critical_delays(problem, physical)
+    change = _change_at_half_the_step(problem, physical, rmse)
+    return warnings + _overfit(rmse, change) + _coarse_step(problem, rmse, change)
+
+
+def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+    """Whether the error on other data is larger than the fit and the physics step (its change [rad]) make it."""
+    train, validation = rmse["train"].get("all"), rmse["validation"].get("all")
+    if not train or not validation or validation < _NOTHING:
+        return []
+    of_the_step = change if change <= _OF_THE_STEP[1] * validation else 0.0
+    if validation <= math.hypot(_OVERFIT_RATIO * train, of_the_step):
+        return []
+    return [
+        f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
+        f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
+    ]
+
+
+def _change_at_half_the_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> float:
+    """RMS change of the motion when the physics step is halved [rad], where errors are judged."""
+    data = problem.dataset
+    where = data.validation if rmse["validation"].get("all") else data.train
+    return float(step_error(problem, physical, where).square().mean().sqrt())
+
+
+def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+    """Whether a part of the error may come from the physics step (its change [rad])."""
+    left = rmse["validation"].get("all") or rmse["train"].get("all")
+    least, most = _OF_THE_STEP
+    if not left or not least * left <= change <= most * left:
+        return []
+    return [
+        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} mrad, "
+        f"and the error is {1e3 * left:.3g} mrad: part of it may come from the step. Fit with "
+        f"--physics_dt {problem.physics_dt / 2:.12g}."
+    ]
+
+
+def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:
+    """One sentence per parameter and side."""
+    space = problem.space
+    low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
+    places: dict[tuple[str, str, float], list[str]] = {}
+    for label in uncertainty.at_bound:
+        i = space.labels.index(label)
+        name, key = label.split("/")
+        side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
+        places.setdefault((name, side, bound), []).append(key)
+    return [
+        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.units[name]})"
+        + ("" if keys == [GLOBAL] else f" on {', '.join(keys)}")
+        + ": widen the bound, or physics is missing that this parameter stands in for."
+        for (name, side, bound), keys in places.items()
+    ]
+
+
+def in_words(labels: tuple[str, ...]) -> str:
+    """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
+    names = [label.split("/")[0].replace("_", " ") for label in labels]
+    keys = {label.split("/")[1] for label in labels} - {"all"}
+    if len(keys) == 1:
+        return f"{_listed(names)} of {keys.pop()}"
+    return _listed([f"{name} of {label.split('/')[1]}" for name, label in zip(names, labels, strict=True)])
+
+
+def _listed(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
+
+
+def critical_delay(inertia: float, viscous_friction: float, stiffness: float, damping: float) -> float:
+    """The delay of the whole torque at which a PD loop starts to oscillate [s].
+
+    The characteristic equation I s² + d s + (P + D s) e^(-sT) = 0 has a root on the imaginary axis, s = iω, where
+    |P + iDω| = |Iω² - idω|; then T = (arg(P + iDω) - arg(Iω² - idω)) / ω.
+
+    Args:
+        inertia: I, armature and load [kg m²].
+        viscous_friction: d [N m s/rad].
+        stiffness: P [N m/rad].
+        damping: D [N m s/rad].
+
+    Returns:
+        T; infinite if no delay makes it oscillate.
+    """
+    # I²w² + (d² - D²) w - P² = 0 with w = ω²
+    a, b, c = inertia**2, viscous_friction**2 - damping**2, -(stiffness**2)
+    if stiffness <= 0 or a <= 0:
+        return math.inf
+    omega = math.sqrt((-b + math.sqrt(b * b - 4 * a * c)) / (2 * a))
+    phase = math.atan2(damping * omega, stiffness) - math.atan2(-viscous_friction * omega, inertia * omega**2)
+    return phase % (2 * math.pi) / omega
+
+
+def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
+    """Only a delay of the whole torque lies inside the loop, whose gains and load are each recording's own."""
+    if problem.delay_mode != "effort":
+        return []
+    rollout, space = problem.evaluator().rollout(1), problem.space
+    rollout.start(physical[None])
+    robot, sim = rollout.robot, rollout.env.sim
+    sim.forward()
+    delay_s = float(physical[space["delay"]]) * problem.control_dt
+    viscous = physical[space["viscous_friction"]].tolist()
+    shortest: dict[str, float] = {}
+    for r in range(problem.dataset.num_recordings):
+        inertia = torch.as_tensor(sim.batch.get_model(r).dof_M0)[robot.dof_columns].tolist()
+        for actuator in robot.actuators.values():
+            for column, name in enumerate(actuator.joint_names):
+                j = robot.joint_names.index(name)
+                kp, kd = float(actuator.stiffness[r, column]), float(actuator.damping[r, column])
+                limit = critical_delay(inertia[j], viscous[j], kp, kd)
+                shortest[name] = min(limit, shortest.get(name, math.inf))
+    rollout.env.close()
+    beyond = [f"{name} ({1e3 * limit:.1f} ms)" for name, limit in shortest.items() if delay_s > limit]
+    if not beyond:
+        return []
+    return [
+        f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of the control loop of "
+        f"{_listed(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
+        "--delay_mode command."
+    ]
