@@ -1,88 +1,9 @@
-"""The whole way on ANYmal D with a hidden effect: record, fit, compare, diagnose, add what is missing, fit again."""
+"""``pace demo`` as a script; ``--help`` tells what it does."""
 
-import json
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
-import torch
-
-from pace_optim.comparison import compare, comparison_text
-from pace_optim.data_collection import CollectionCfg, collect
-from pace_optim.diagnosis import DiagnosisSettings, diagnose
-from pace_optim.fit import fit
-from pace_optim.report import write_report
-from pace_optim.run.settings import FitSettings
-from pace_optim.run.summary import summary
-from pace_optim.terminal.cli import make_parser, run_cli
-
-TASK = "Pace-AnymalD-v0"
-NOISE = 1e-4  # [rad]
-PHYSICS_DT = 0.00125  # [s], as in the diagnosis: then the ladder shows what the effect does, and not the step
-MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
-
-
-def record(effect: str, joints: str, duration: float, seed: int, folder: Path) -> dict[str, list[str]]:
-    """Recordings to fit and, of another kind, to validate on, by a simulator that shares no code with ours."""
-    cfgs = {
-        motion: CollectionCfg(
-            task=TASK,
-            excitation=motion,
-            duration=duration,
-            seed=seed,
-            effects=(effect,),
-            effect_joints=joints,
-            noise=NOISE,
-            output=folder / f"{motion}.npz",
-        )
-        for motions in MOTIONS.values()
-        for motion in motions
-    }
-    with ProcessPoolExecutor() as pool:
-        made = dict(zip(cfgs, pool.map(collect, cfgs.values()), strict=True))
-    return {part: [str(made[motion].recordings[0]) for motion in motions] for part, motions in MOTIONS.items()}
-
-
-def main() -> None:
-    """Tell the story step by step."""
-    parser = make_parser(__doc__, example="scripts/demo.py --effect backlash --effect_joints '.*KFE'")
-    parser.add_argument("--effect", default="stribeck_friction", help="what is hidden (default stribeck_friction)")
-    parser.add_argument("--effect_joints", default=".*KFE", metavar="REGEX", help="where (default: the knees)")
-    parser.add_argument("--seed", type=int, default=0, help="of the hidden parameters and the noise")
-    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="of each recording (default 6)")
-    parser.add_argument("--log_dir", type=Path, default=Path("logs/demo"), help="where all goes (default logs/demo)")
-    args = parser.parse_args()
-    torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
-
-    print(f"1. Record: a simulated ANYmal D whose {args.effect_joints} have {args.effect}.", flush=True)
-    files = record(args.effect, args.effect_joints, args.duration, args.seed, args.log_dir)
-    print("2. Fit the base model, which does not have it.", flush=True)
-    result, base = fit(
-        FitSettings(
-            task=TASK,
-            data=files["train"],
-            validation=files["validation"],
-            optimizer="least_squares",
-            physics_dt=PHYSICS_DT,
-            check_consistency=False,  # the story is another
-            log_dir=str(args.log_dir),
-        )
-    )
-    print(summary(result))
-    print("\n3. Compare: where does it fail?", flush=True)
-    print(comparison_text(compare([base])))
-    print("\n4. Diagnose: which effect is missing?", flush=True)
-    diagnosis = diagnose(DiagnosisSettings(run=base, max_effects=2))
-    print(diagnosis.summary)
-    hidden = json.loads(Path(files["train"][0]).with_suffix(".truth.json").read_text())["effects"]
-    print(f"\nThe truth: {', '.join(hidden)} on {args.effect_joints}.")
-    if len(diagnosis.runs) > 1:
-        print("\n5. The ladder of the error, from the base model to the last effect:", flush=True)
-        print(comparison_text(compare(diagnosis.runs)))
-    for run in diagnosis.runs:
-        print(f"report: {write_report(run)}")
-    print(f"run: {diagnosis.runs[-1]}")
-
+from pace_optim.commands.demo import main
+from pace_optim.terminal.cli import run_cli
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -1,32 +1,9 @@
-"""Write what was identified for other programs: a robot model, or the configuration of its drives."""
+"""``pace export`` as a script; ``--help`` tells what it does."""
 
 import sys
 
-from pace_optim.export import FORMATS, export
-from pace_optim.terminal.cli import make_parser, run_cli
-
-
-def main() -> None:
-    """Parse the command line, write, say what the format cannot hold."""
-    parser = make_parser(
-        "Write an identified robot for other programs: an MJCF with the joints' parameters, configurations of its "
-        "drives for this project (cfg), mjlab and Isaac Lab, or plain JSON.",
-        example="scripts/export.py logs/pace/anymal_d/<run>/result.json --format mjcf --output anymal_d.xml",
-    )
-    parser.add_argument("result", metavar="FILE", help="result.json of a fit, or its run's folder")
-    parser.add_argument("--format", required=True, choices=tuple(FORMATS), help="what to write")
-    parser.add_argument("--output", metavar="FILE", help="where (default: standard output)")
-    args = parser.parse_args()
-    exported = export(args.result, args.format)
-    if args.output is None:
-        print(exported.text, end="")
-    else:
-        exported.write(args.output)
-    for note in exported.notes:  # after the text on standard output, they go where they do not mix with it
-        print(f"note: {note}", file=sys.stdout if args.output else sys.stderr)
-    if args.output is not None:
-        print(f"written: {args.output}")
-
+from pace_optim.commands.export import main
+from pace_optim.terminal.cli import run_cli
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -1,67 +1,9 @@
-"""Identify a robot's drives from recordings."""
+"""``pace fit`` as a script; ``--help`` tells what it does."""
 
 import sys
 
-import torch
-
-from pace_optim.fit import fit, resume
-from pace_optim.problem.problem import DELAY_MODES
-from pace_optim.run.settings import OPTIMIZERS, FitSettings
-from pace_optim.run.summary import summary
-from pace_optim.terminal.cli import import_task, make_parser, run_cli
-
-
-def main() -> None:
-    """Parse the command line, fit, print the result."""
-    parser = make_parser(
-        "Identify armature, viscous friction, Coulomb friction and encoder bias of every joint, and the delay.",
-        example="scripts/fit.py --task Pace-AnymalD-v0 --num_envs 512",
-    )
-    parser.add_argument("--task", help="registered environment; scripts/list_envs.py lists them")
-    parser.add_argument("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
-    parser.add_argument(
-        "--data", nargs="+", default=[], metavar="FILE", help="recordings (default: the robot's sample)"
-    )
-    parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
-    parser.add_argument(
-        "--effects",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared",
-    )
-    parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
-    parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
-    parser.add_argument("--epsilon", type=float, help="stop at this relative spread of a generation's scores")
-    parser.add_argument("--sigma", type=float, help="initial standard deviation of the search, normalised")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
-    parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
-    parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")
-    parser.add_argument(
-        "--no_consistency",
-        dest="check_consistency",
-        action="store_false",
-        help="do not fit each recording alone to see whether they agree",
-    )
-    parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
-    parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
-    parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
-    args = vars(parser.parse_args())
-    del args["headless"]
-
-    torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
-    if run := args.pop("resume"):
-        result, folder = resume(run, args["max_iteration"])
-    else:
-        if args["task"] is None:
-            raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
-        result, folder = fit(FitSettings(**args | {"task": import_task(args["task"])}))
-    print(summary(result))
-    print(f"report: {folder / 'report.html'}")
-    print(f"run: {folder}")
-
+from pace_optim.commands.fit import main
+from pace_optim.terminal.cli import run_cli
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

@@ -1,93 +1,9 @@
-"""Look at a run: what was commanded, measured and simulated, and how the score fell."""
+"""``pace plot-trajectory`` as a script; ``--help`` tells what it does."""
 
-import json
 import sys
-from pathlib import Path
 
-import matplotlib
-import torch
-from matplotlib.figure import Figure
-
-from pace_optim.report.plots import plot_scores, plot_trajectories
-from pace_optim.run.find import find_mean, find_run
-from pace_optim.run.history import History
-from pace_optim.run.replay import replay
-from pace_optim.terminal.cli import make_parser, run_cli
-
-
-def main() -> None:
-    """Parse the command line, draw, show or save."""
-    parser = make_parser(
-        "Plot a run's trajectories and score: on screen, or as PNG files where there is none.",
-        example="scripts/plot_trajectory.py --robot_name anymal_d --plot_trajectory --output plots",
-    )
-    parser.add_argument("--robot_name", required=True, help="whose run")
-    parser.add_argument("--folder_name", help="which run (default: the newest)")
-    parser.add_argument("--mean_name", help="simulate this mean of the search, as mean_020.pt, instead of the best")
-    parser.add_argument("--plot_trajectory", action="store_true", help="positions and errors of every joint")
-    parser.add_argument("--plot_score", action="store_true", help="score over iterations (neither: both plots)")
-    parser.add_argument("--output", metavar="DIR", help="write PNG files there instead of showing windows")
-    parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
-    parser.add_argument("--headless", action="store_true", help="show nothing; without --output, write to the run")
-    args = parser.parse_args()
-    both = not (args.plot_trajectory or args.plot_score)
-
-    torch.set_num_threads(1)
-    run = find_run(args.log_dir, args.robot_name, args.folder_name)
-    on_screen = not (args.output or args.headless) and has_display()
-    if not on_screen:
-        matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figures: dict[str, Figure] = {}
-    title = f"{args.robot_name} · {run.name}"
-    if args.plot_trajectory or both:
-        if args.mean_name:
-            path = find_mean(run, args.mean_name)
-            content, of = replay(run, torch.load(path, weights_only=True)), path.stem
-        else:
-            content, of = torch.load(existing(run / "best_trajectory.pt"), weights_only=True), "best"
-        drawn = plot_trajectories(content, title=f"{title} · {of}", make_figure=plt.figure)
-        figures |= {stem if of == "best" else f"{stem}_{of}": figure for stem, figure in drawn.items()}
-    if args.plot_score or both:
-        history = History(**json.loads(existing(run / "history.json").read_text()))
-        figures["score"] = plot_scores(history, title=title, make_figure=plt.figure)
-    if on_screen:
-        plt.show()
-        return
-    output = Path(args.output) if args.output else run
-    output.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        path = output / f"{name}.png"
-        figure.savefig(path, dpi=110)
-        print(f"plot: {path}")
-
-
-def has_display() -> bool:
-    """Whether matplotlib can open windows here."""
-    try:
-        import matplotlib.pyplot as plt
-
-        plt.figure()
-        plt.close()
-    except ImportError:
-        return False
-    return matplotlib.get_backend().lower() != "agg"
-
-
-def existing(path: Path) -> Path:
-    """The path.
-
-    Raises:
-        ValueError: If there is no such file.
-    """
-    if not path.is_file():
-        raise ValueError(
-            f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {path.parent}"
-        )
-    return path
-
+from pace_optim.commands.plot_trajectory import main
+from pace_optim.terminal.cli import run_cli
 
 if __name__ == "__main__":
     sys.exit(run_cli(main))

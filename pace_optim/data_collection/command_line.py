@@ -12,6 +12,7 @@ from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
 from pace_optim.terminal.cli import Parser, import_task, make_parser
+from pace_optim.terminal.options import add_common_options
 
 from .cfg import CollectionCfg
 
@@ -33,7 +34,7 @@ def make_collection_parser() -> Parser:
     )
     kinds = "; ".join(f"{e.name}: {e.description} ({e.duration:g} s)" for e in excitations())
     add = parser.add_argument
-    add("--task", required=True, help="identification environment, see scripts/list_envs.py; module:Task imports first")
+    add_common_options(parser, required=True)
     add("--output", type=Path, metavar="FILE", help=".npz, .pt or .csv (default data/<robot>/<excitation>.npz)")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", default="chirp", metavar="NAME", help=f"(default chirp) {kinds}")

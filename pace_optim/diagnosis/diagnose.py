@@ -31,6 +31,7 @@ from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
 
 
@@ -144,7 +145,7 @@ def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, pr
     progress.restart()
     result, path = fit(settings, progress)
     if result.stop_reasons == ["interrupted"]:
-        progress.say(f"the fit of the whole robot was interrupted: scripts/fit.py --resume {path} goes on with it")
+        progress.say(f"the fit of the whole robot was interrupted: {command('fit')} --resume {path} goes on with it")
     return path
 
 

@@ -14,6 +14,7 @@ import torch
 
 from pace_optim.run.history import History
 from pace_optim.terminal.atomic import write_atomically, write_json, write_tensors
+from pace_optim.terminal.cli import command
 
 if TYPE_CHECKING:
     from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
@@ -28,10 +29,10 @@ best_trajectory.pt   commanded, measured and simulated positions of the best par
 mean_xxx.pt          mean of the search after generation xxx, physical, in the layout of config.pt
 config.pt            joints, bounds and layout of the parameter vector
 history.json         scores over iterations
-comparison.json      where the model fails, once scripts/compare.py was run
-diagnosis.json       which physical effect is missing, once scripts/diagnose.py was run
+comparison.json      where the model fails, once {compare} was run
+diagnosis.json       which physical effect is missing, once {diagnose} was run
 events.out.*         TensorBoard: tensorboard --logdir {folder}
-settings.json, checkpoint.npz   what `scripts/fit.py --resume {folder}` needs
+settings.json, checkpoint.npz   what `{fit} --resume {folder}` needs
 """
 
 
@@ -76,6 +77,7 @@ class RunFolder:
             task=problem.task,
             started=datetime.now().strftime("%Y-%m-%d %H:%M"),
             folder=self.path,
+            **{verb: command(verb) for verb in ("fit", "compare", "diagnose")},
         )
         write_atomically(self.path / "README.txt", lambda file: file.write(text.encode()))
 

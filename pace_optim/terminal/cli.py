@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -20,6 +21,8 @@ from typing import NoReturn
 
 USER_ERROR = 2
 INTERRUPTED = 130
+_CONSOLE = "pace "
+"""What the name of the program begins with where the console command was called."""
 
 
 def run_cli(main: Callable[[], int | None]) -> int:
@@ -42,8 +45,20 @@ def run_cli(main: Callable[[], int | None]) -> int:
     except (ValueError, KeyError, OSError) as error:
         if os.environ.get("PACE_TRACEBACK"):
             raise
-        print(f"error: {_one_line(error)}", file=sys.stderr)
+        print(f"error: {as_called(_one_line(error))}", file=sys.stderr)
         return USER_ERROR
+
+
+def command(verb: str) -> str:
+    """How the user calls a command: ``pace fit`` where this one was called so, else ``scripts/fit.py``."""
+    return as_called(f"scripts/{verb}.py")
+
+
+def as_called(text: str) -> str:
+    """The text with the commands in it as the user calls them."""
+    if not sys.argv[0].startswith(_CONSOLE):
+        return text
+    return re.sub(r"scripts/(\w+)\.py", lambda found: _CONSOLE + found[1].replace("_", "-"), text)
 
 
 def import_task(task: str) -> str:
@@ -88,8 +103,9 @@ class Parser(argparse.ArgumentParser):
 def make_parser(description: str, *, example: str) -> Parser:
     """A parser whose ``--help`` ends with an example."""
     return Parser(
-        description=description,
-        epilog=f"example:\n  {example}",
+        prog=sys.argv[0] if sys.argv[0].startswith(_CONSOLE) else None,
+        description=as_called(description),
+        epilog=as_called(f"example:\n  {example}"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )

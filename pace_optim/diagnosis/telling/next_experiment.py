@@ -17,6 +17,7 @@ from pace_optim.excitation import make_excitation
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import make_dataset
+from pace_optim.terminal.cli import command
 
 _MOTIONS = ("chirp", "multisine", "ramp", "steps")
 _DURATION = 10.0
@@ -113,7 +114,7 @@ def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
     times = _range([each.times for each in told], "{:.0f}")
     return (
         f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
-        f"mrad, {times} times the noise. scripts/data_collection.py --task {problem.task} {choice.arguments} "
+        f"mrad, {times} times the noise. {command('data_collection')} --task {problem.task} {choice.arguments} "
         "--command_only --export_command next.csv"
     )
 

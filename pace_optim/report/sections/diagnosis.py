@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_optim.report.number_text import angle_unit, three_figures
+from pace_optim.terminal.cli import command
 
 from ..markup import Section, bullets, esc, figure, table
 from ..run_data import RunData
@@ -21,7 +22,7 @@ _PARTLY = 0.8
 """Effects that explain less than this part of the error above the floor are not all that is missing."""
 _SHOWN = 10
 """Effects in the chart, at most."""
-_COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py )")
+_COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py |\bpace [a-z]+(?:-[a-z]+)? --)")
 
 
 def diagnosis(run: RunData) -> Section | None:
@@ -54,7 +55,7 @@ def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
         add = "<p>This run is the fit with it.</p>"
     elif effects:
         why = "Add it" if content["added"] else "Until it is known, this lowers the error"
-        add = f"<p>{why}: <code>scripts/fit.py … --effects {esc(' '.join(effects))}</code></p>"
+        add = f"<p>{why}: <code>{command('fit')} … --effects {esc(' '.join(effects))}</code></p>"
     return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
 
 

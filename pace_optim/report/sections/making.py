@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
+from pace_optim.terminal.cli import command
+
 from ..markup import Section, esc
 from ..run_data import RunData
 from ..wording import count_in_short, duration
@@ -42,13 +44,19 @@ _DELAY_MODES = {
     "effort": "the whole torque is delayed, feedback included",
 }
 
+_WITHOUT_FLAG = ("start", "check_consistency")
+"""Settings that no flag of the same name makes."""
+
 
 def _command(settings: dict[str, Any]) -> str:
     """The command line of these settings; what was left to the robot's configuration is left out."""
     if "task" not in settings:
         return ""
-    words = ["python", "scripts/fit.py"]
-    for name, value in settings.items():
+    words = ["python", *command("fit").split()]
+    words = words if words[1].endswith(".py") else words[1:]
+    flags = {name: value for name, value in settings.items() if name not in _WITHOUT_FLAG}
+    flags["no_consistency"] = settings.get("check_consistency") is False
+    for name, value in flags.items():
         if value is None or value is False or value == []:
             continue
         words.append(f"--{name}")

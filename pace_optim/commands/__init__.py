@@ -1,0 +1,77 @@
+"""The command lines: ``pace VERB …`` is the ``main`` of the module of that name here, and so is ``scripts/VERB.py``.
+
+A verb is imported when it is called, and no other: a file more in this folder is a verb more.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import sys
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from pace_optim.terminal.cli import USER_ERROR, run_cli
+
+_SPELT = {"import_log": "import"}
+"""Verbs that are no good name for a module."""
+
+
+def main() -> int:
+    """The console command ``pace``; returns its exit code."""
+    words = sys.argv[1:]
+    if not words or words[0] in ("-h", "--help"):
+        print(_help())
+        return 0
+    if words[0] in ("-V", "--version"):
+        print(f"pace-mujoco {package_version()}")
+        return 0
+    verb = words[0].replace("-", "_")
+    verb = next((name for name, spelt in _SPELT.items() if spelt == verb), verb)
+    if verb not in verbs():
+        close = difflib.get_close_matches(verb, verbs(), n=1)
+        meant = f"; did you mean {_spelt(close[0])}?" if close else "."
+        print(f"error: there is no command {words[0]!r}{meant} See pace --help.", file=sys.stderr)
+        return USER_ERROR
+    sys.argv = [f"pace {_spelt(verb)}", *words[1:]]
+    return run_cli(import_module(f"{__name__}.{verb}").main)
+
+
+def verbs() -> dict[str, str]:
+    """What each command does, by the name of its module; nothing is imported to find out."""
+    return {file.stem: _first_line(file) for file in sorted(Path(__file__).parent.glob("[a-z]*.py"))}
+
+
+def package_version() -> str:
+    """Version of this package; ``unknown`` in a checkout that was not installed."""
+    try:
+        return version("pace-mujoco")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _first_line(file: Path) -> str:
+    text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0]
+
+
+def _spelt(verb: str) -> str:
+    return _SPELT.get(verb, verb).replace("_", "-")
+
+
+def _help() -> str:
+    width = max(len(verb) for verb in verbs())
+    lines = [f"  {_spelt(verb):<{width}}  {what}" for verb, what in verbs().items()]
+    return "\n".join(
+        [
+            "usage: pace VERB [options]; pace VERB --help says more",
+            "",
+            "Identify a robot's drives from recordings, find the effect that is missing, train with the result.",
+            "",
+            *lines,
+            "",
+            "example:",
+            "  pace fit --task Pace-AnymalD-v0",
+        ]
+    )

@@ -1,0 +1,28 @@
+"""Say where a run's model fails, and put several runs side by side."""
+
+from pathlib import Path
+
+import torch
+
+from pace_optim.comparison import compare, comparison_text
+from pace_optim.terminal.cli import make_parser
+
+
+def main() -> None:
+    """Parse the command line, compare, print what was found."""
+    parser = make_parser(
+        "Where the model fails: the error that noise does not explain, by frequency, speed, reversals, position, load\n"
+        "and acceleration. Writes comparison.json into each run's folder and its report.html anew; several runs, base\n"
+        "model first, also become the ladder of the error in the last one's.",
+        example="scripts/compare.py logs/pace/anymal_d/26_01_01_12-00-00",
+    )
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run, as fit.py prints it")
+    parser.add_argument("--data", nargs="+", default=[], metavar="FILE", help="simulate these recordings instead")
+    parser.add_argument("--physics_dt", type=float, metavar="S", help="simulate at this physics step instead")
+    args = parser.parse_args()
+
+    torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
+    content = compare(args.runs, args.data, args.physics_dt)
+    print(comparison_text(content))
+    print(f"report: {Path(content['run']) / 'report.html'}")
+    print(f"run: {content['run']}")

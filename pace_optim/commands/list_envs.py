@@ -1,0 +1,42 @@
+"""List the registered environments."""
+
+from pathlib import Path
+
+from pace_envs import load_env_cfg, registered_tasks
+from pace_optim.terminal.cli import make_parser
+
+HEADER = ("task", "robot", "joints", "physics/control", "sample recording")
+
+
+def rows() -> list[tuple[str, ...]]:
+    """One per environment."""
+    result: list[tuple[str, ...]] = []
+    for task in registered_tasks():
+        cfg = load_env_cfg(task)
+        sim2real = getattr(cfg, "sim2real", None)
+        robot = sim2real.robot_name if sim2real else Path(cfg.scene.robot.mjcf_path).stem
+        joints = cfg.scene.robot.joint_order
+        rates = f"{1 / cfg.sim.dt:g}/{1 / (cfg.sim.dt * cfg.decimation):g} Hz"
+        recording = sample_recording(Path(sim2real.data_dir)) if sim2real else "-"
+        result.append((task, robot, str(len(joints)) if joints else "all", rates, recording))
+    return result
+
+
+def sample_recording(path: Path) -> str:
+    """Where the sample lies, as seen from here."""
+    if not path.is_file():
+        return f"missing: {path}"
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
+def main() -> None:
+    """Print the table."""
+    make_parser(
+        "List the registered environments: robot, number of joints, rates of physics and control, sample recording.",
+        example="scripts/list_envs.py",
+    ).parse_args()
+    table = [HEADER, *rows()]
+    widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
+    for row in table:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -1,0 +1,51 @@
+"""Play a trained policy: figures, a film, a window, an export. Or replay a fit where it is to be trained with."""
+
+import os
+import sys
+from ctypes.util import find_library
+
+HAS_SCREEN = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported: films need no screen
+
+from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
+from pace_optim.run.training_replay import replay_in_training  # noqa: E402
+from pace_optim.terminal.cli import import_task, make_parser  # noqa: E402
+from pace_optim.terminal.options import add_common_options  # noqa: E402
+
+
+def main() -> None:
+    """Parse the command line, play, print the figures."""
+    parser = make_parser(
+        "Let a trained policy walk and print how well it follows the commanded velocity, how often it falls, and its "
+        "cost of transport.",
+        example="scripts/play.py --checkpoint logs/rsl_rl/anymal_d_velocity/<run> --video walk.mp4",
+    )
+    parser.add_argument("--checkpoint", metavar="FILE", help="model_<n>.pt, or a run for its last one")
+    add_common_options(parser, run=True)
+    parser.add_argument("--num_envs", type=int, default=256, help="robots that are judged (default 256)")
+    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long (default 20)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command", type=float, nargs=3, metavar=("VX", "VY", "WZ"), help="one command for all robots")
+    parser.add_argument("--video", metavar="FILE", help="film of the first robot, .mp4 or .gif; without a screen too")
+    parser.add_argument("--viewer", action="store_true", help="open a window instead")
+    parser.add_argument("--export", metavar="DIR", help="write the policy as TorchScript and ONNX")
+    parser.add_argument("--identified", metavar="FILE", help="walk on the drives of this fit: its result.json")
+    parser.add_argument(
+        "--replay", metavar="RUN", help="instead, replay the recordings of this fit in --task, the base held"
+    )
+    parser.add_argument("--physics_dt", type=float, metavar="S", help="with --replay: step of physics and drives")
+    args = vars(parser.parse_args())
+    args["task"] = import_task(args["task"]) if args["task"] else None
+    run, physics_dt = args.pop("replay"), args.pop("physics_dt")
+    if run is not None:
+        if args["task"] is None:
+            raise ValueError("--replay needs --task, the environment that is to be trained in.")
+        print(replay_in_training(run, load_cfg(RunSettings(task=args["task"], identified=run, physics_dt=physics_dt))))
+        return
+    if args["checkpoint"] is None:
+        raise ValueError("--checkpoint is missing: name a model_<n>.pt or a training's folder, or a fit with --replay.")
+    args["command"] = tuple(args["command"]) if args["command"] else None
+    result = play(PlaySettings(**args))
+    if result is not None:
+        print(result)

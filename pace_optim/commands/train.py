@@ -1,0 +1,42 @@
+"""Train a policy with rsl-rl."""
+
+import os
+
+# Before torch is imported: threads that wait for work must not keep the cores from the physics, or from other programs.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from pace_envs.rl import RunSettings, resume, train
+from pace_optim.terminal.cli import import_task, make_parser
+from pace_optim.terminal.options import add_common_options
+
+
+def main() -> None:
+    """Parse the command line, train, print the run's folder."""
+    parser = make_parser(
+        "Train a policy that walks after a commanded velocity, with rsl-rl.",
+        example="scripts/train.py --task Pace-AnymalD-Velocity-v0 --max_iterations 500",
+    )
+    add_common_options(parser)
+    parser.add_argument("--num_envs", type=int, help="robots at once (default: the task's)")
+    parser.add_argument("--max_iterations", type=int, help="iterations in all (default: the task's)")
+    parser.add_argument("--seed", type=int, default=42)
+    parser.add_argument("--reward", default="velocity", help="reward set: velocity (default) or energy")
+    parser.add_argument("--randomize", action="store_true", help="train with pushes, over many frictions and loads")
+    parser.add_argument("--identified", metavar="FILE", help="train with the drives of this fit: its result.json")
+    parser.add_argument(
+        "--randomize_identified", type=float, metavar="K", help="drives within K of their error bars (usually 1)"
+    )
+    parser.add_argument("--physics_dt", type=float, metavar="S", help="step of physics and drives (default: the fit's)")
+    parser.add_argument(
+        "--start_from", metavar="CHECKPOINT", help="go on from this policy in a new run, such as with other drives"
+    )
+    parser.add_argument("--log_dir", default="logs/rsl_rl", metavar="DIR", help="where runs are kept")
+    parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted or finished run")
+    args = vars(parser.parse_args())
+    if run := args.pop("resume"):
+        folder = resume(run, args["max_iterations"])
+    else:
+        if args["task"] is None:
+            raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
+        folder = train(RunSettings(**args | {"task": import_task(args["task"])}))
+    print(f"run: {folder}")
