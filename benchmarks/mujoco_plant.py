@@ -95,9 +95,10 @@ def simulate(command: np.ndarray, kp: float, base: Sizes, sizes: Sizes, friction
         asked = kp * (late[max(step, 0)] - encoder) - KD * data.qvel[0]
         for _ in range(round(CONTROL_DT / PLANT_DT)):
             v = data.qvel[0]
-            most = min(SATURATION_EFFORT * (1 - v / VELOCITY_LIMIT), EFFORT_LIMIT)
-            least = max(SATURATION_EFFORT * (-1 - v / VELOCITY_LIMIT), -EFFORT_LIMIT)
-            effort = min(max(asked * (1 + sizes.get("gain", 0.0)), least), most)
+            most = max(SATURATION_EFFORT * (1 - v / VELOCITY_LIMIT), -EFFORT_LIMIT)
+            least = min(SATURATION_EFFORT * (-1 - v / VELOCITY_LIMIT), EFFORT_LIMIT)
+            effort = min(max(asked, -EFFORT_LIMIT), EFFORT_LIMIT)  # what is asked of the motor
+            effort = min(max(effort * (1 + sizes.get("gain", 0.0)), least), most)
             effort -= sizes.get("quadratic", 0.0) * v * abs(v)
             if "ripple" in sizes:
                 effort += sizes["ripple"] * np.sin(sizes["turns"] * data.qpos[0] + sizes["phase"])

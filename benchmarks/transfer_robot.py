@@ -60,12 +60,12 @@ class RealDrive(PaceDCMotor):
             self._calls_until_control = self.cfg.control_decimation
             self._control(control_action.joint_positions.numpy(), joint_pos.numpy(), speed)
         self._calls_until_control -= 1
-        torque = self._asked
-        for effect in self._effects:
-            torque = effect.drive(torque, None)  # type: ignore[arg-type]
         stall, no_load, largest = self._limits
+        torque = np.clip(self._asked, -largest, largest)
+        for effect in sorted(self._effects, key=lambda each: each.drive_rank):
+            torque = effect.drive(torque, None)  # type: ignore[arg-type]
         drop = stall / no_load * speed
-        torque = np.clip(np.clip(torque, -stall - drop, stall - drop), -largest, largest)
+        torque = np.clip(torque, np.minimum(-stall - drop, largest), np.maximum(stall - drop, -largest))
         self.computed_effort = torch.from_numpy(self._asked)
         self.applied_effort = self._held_effort = torch.from_numpy(torque)
         return replace(control_action, joint_positions=None, joint_velocities=None, joint_efforts=self.applied_effort)

@@ -48,3 +48,33 @@ def clip_effort(
     drop = saturation_effort / velocity_limit * joint_vel
     within_curve = torch.clamp(effort, (saturation_effort + drop).neg_(), saturation_effort - drop)
     return torch.clamp(within_curve, -effort_limit, effort_limit)
+
+
+def clip_to_line(
+    effort: torch.Tensor,
+    joint_vel: torch.Tensor,
+    saturation_effort: torch.Tensor,
+    effort_limit: torch.Tensor,
+    velocity_limit: torch.Tensor,
+) -> torch.Tensor:
+    """What the supply's voltage leaves of a motor's torque: the torque-speed line alone.
+
+        τ = clip(τ, min(-τ_s (1 + v / v_0), τ_c), max(τ_s (1 - v / v_0), -τ_c))
+
+    Of a torque that was clipped to ± τ_c before, it makes what :func:`clip_effort` does, exactly; between the two, what
+    is asked of a motor can become another torque.
+
+    Args:
+        effort: τ [N m], shape (num_envs, num_joints).
+        joint_vel: v [rad/s], same shape.
+        saturation_effort: τ_s [N m].
+        effort_limit: τ_c, with which it brakes beyond its speeds [N m].
+        velocity_limit: v_0 [rad/s]; infinite means no dependence on speed.
+
+    Returns:
+        τ [N m], shape (num_envs, num_joints).
+    """
+    drop = saturation_effort / velocity_limit * joint_vel
+    lower = torch.minimum((saturation_effort + drop).neg_(), effort_limit)
+    upper = torch.maximum(saturation_effort - drop, -effort_limit)
+    return torch.clamp(effort, lower, upper)

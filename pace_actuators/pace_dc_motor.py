@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pace_actuators.dc_motor import clip_effort, pd_effort
+from pace_actuators.dc_motor import clip_effort, clip_to_line, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.drive_parameters import DriveParameters
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
@@ -32,11 +32,13 @@ class PaceDCMotor:
         τ     = kp (q* - q_enc) + kd (q̇* - q̇) + τ_ff        q*, q̇*, τ_ff delayed  (delay_mode "command")
         τ     = τ(t - delay)                                  the torque delayed     (delay_mode "effort")
         ------- held for ``control_decimation`` calls -------
-        τ     = clip(τ, τ_min(v), τ_max(v))                   four-quadrant torque-speed limit
+        τ     = clip(τ, ± effort_limit)                       limit of what is asked, a current limit
+        τ     = clip(τ, τ_min(v), τ_max(v))                   torque-speed line
         τ     = 0 where the drive is disabled
 
-    Effects of ``cfg.effects`` act on this way, each at its stage: command, measurement, controller, drive (before the
-    limit), friction and transmission (after it). What they ask the simulator to apply itself is in ``joint_armature``,
+    The two limits make Isaac Lab's four-quadrant clip. Effects of ``cfg.effects`` act on this way, each at its stage:
+    command, measurement, controller, drive (between the two limits: current loop, torque constant), friction and
+    transmission (after them). What they ask the simulator to apply itself is in ``joint_armature``,
     ``joint_friction`` and ``joint_viscous_friction``.
 
     Source: Bjelonic et al., PACE (arXiv 2509.06342); torque-speed limit as Isaac Lab's ``DCMotor``.
@@ -127,8 +129,8 @@ class PaceDCMotor:
         self.velocity_limit = parameters.read("velocity_limit", velocity_limit)
         self.velocity_limit_sim = self.velocity_limit.clone()
         if cfg.saturation_effort is None:
-            # no torque-speed curve was asked for: a (finite) stall torque at the limit and no fall with speed
-            self.saturation_effort = self.effort_limit.clamp(max=torch.finfo(dtype).max)
+            # no torque-speed line was asked for: a stall torque (finite) beyond all others and no fall with speed
+            self.saturation_effort = torch.full_like(self.effort_limit, torch.finfo(dtype).max)
             self.velocity_limit = torch.full_like(self.velocity_limit, torch.inf)
         else:
             self.saturation_effort = parameters.read("saturation_effort", torch.inf)
@@ -262,13 +264,16 @@ class PaceDCMotor:
             The motor's torque [N m], (num_envs, num_joints).
         """
         asked, slope = effort_command, None
-        if self.effects is not None:
-            asked, slope = self.effects.given_by_drive(asked)
         speed = joint_vel if self.effects is None else self.effects.state.motor_vel
-        effort = clip_effort(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
+        clip = clip_effort
+        if self.effects is not None and self.effects.acts_in_drive:
+            asked = torch.clamp(asked, -self.effort_limit, self.effort_limit)
+            asked, slope = self.effects.given_by_drive(asked)
+            clip = clip_to_line
+        effort = clip(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
         if self.holds_line:
             line = self.saturation_effort / self.velocity_limit
-            free = effort.abs() < self.effort_limit
+            free = effort.abs() != self.effort_limit
             self._speed_slope = torch.where(effort == asked, 0.0 if slope is None else slope, line * free)
         if self.torque_enable is not None:
             effort = effort * self.torque_enable

@@ -6,7 +6,8 @@ import pytest
 import torch
 from effect_envs import EFFECTS
 
-from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg, clip_effort
+from pace_actuators.dc_motor import clip_to_line
 from pace_actuators.effects import (
     Effect,
     EffectCfg,
@@ -279,6 +280,42 @@ def test_limits_of_the_drive():
     assert drive.one(1.0) == pytest.approx(20.0)
     assert drive.one(1.0, v=12.0) == 0.0
     assert drive.one(-1.0, v=4.0) == pytest.approx(-100.0)  # it brakes with all it is asked for
+
+
+def test_what_is_asked_is_limited_before_the_current_loop_and_the_torque_constant_and_the_line_comes_last():
+    limited = {"stiffness": 100.0, "damping": 0.0, "effort_limit": 8.0, "saturation_effort": 20.0}
+    limited["velocity_limit"] = 10.0
+    weak = Drive(["torque_gain"], {"torque_gain.gain": -0.5}, **limited)
+    assert weak.one(1.0) == pytest.approx(0.5 * 8.0)  # not min(50, 8)
+    strong = Drive(["torque_gain"], {"torque_gain.gain": 4.0}, **limited)
+    assert strong.one(1.0) == pytest.approx(20.0)  # of 40 the supply leaves the stall torque
+    assert strong.one(1.0, v=5.0) == pytest.approx(10.0)
+    lag = Drive(["drive_bandwidth"], {"drive_bandwidth.time_constant": 0.01}, **limited)
+    lag.one(0.0)
+    rise = 1 - math.exp(-DT / 0.01)
+    mean = 1 - rise / (DT / 0.01)
+    assert lag.one(1.0) == pytest.approx(8.0 * mean)  # of the 8 that flow at last, not of the 100 asked for
+    assert lag.one(1.0) == pytest.approx(8.0 * (rise + (1 - rise) * mean))
+    order = ("torque_speed_limit", "torque_gain", "torque_limit", "drive_bandwidth")  # as named, not as they act
+    values = {"torque_gain.gain": -0.5, "torque_limit.effort": 6.0, "drive_bandwidth.time_constant": 0.0}
+    values |= {"torque_speed_limit.velocity": 10.0, "torque_speed_limit.effort": 5.0}
+    every = Drive(order, values, **limited)
+    assert every.one(1.0) == pytest.approx(3.0)
+    assert every.one(1.0, v=8.0) == pytest.approx(1.0)
+
+
+def test_the_two_limits_without_anything_between_them_are_the_four_quadrant_clip_bit_for_bit():
+    generator = torch.Generator().manual_seed(0)
+    effort, speed = (60 * torch.randn(20000, generator=generator, dtype=torch.float64) for _ in range(2))
+    stall, most, fastest = (torch.rand(20000, generator=generator, dtype=torch.float64) for _ in range(3))
+    line = (100 * stall, 60 * most, 1 + 30 * fastest)
+    whole = clip_effort(effort, speed, *line)
+    assert torch.equal(clip_to_line(effort.clamp(-line[1], line[1]), speed, *line), whole)
+    values = {"torque_gain.gain": 0.0, "drive_bandwidth.time_constant": 0.0}
+    limits = {"saturation_effort": 140.0, "effort_limit": 89.0, "velocity_limit": 8.5}
+    plain, with_null = Drive([], **limits), Drive(["torque_gain", "drive_bandwidth"], values, **limits)
+    for target, v in ((0.5, 0.0), (3.0, 2.0), (3.0, 12.0), (3.0, 20.0), (-3.0, 20.0), (-3.0, -20.0)):
+        assert plain.one(target, v=v) == with_null.one(target, v=v)
 
 
 def test_gains_torques_and_encoders():

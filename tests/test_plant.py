@@ -237,6 +237,13 @@ def test_the_four_quadrant_limit_holds_at_every_instant():
     assert np.abs(motion.torque).max() <= 89.0
 
 
+def test_a_request_is_limited_before_the_torque_constant_makes_torque_of_it():
+    weak = Truth(base=BASE, effects={"torque_gain": {"gain": -0.5}})
+    limited = run_of(chirp(amplitude=0.8), drive=Drive(effort_limit=np.array([20.0])))
+    motion = simulate_motions(ROBOT, [limited], [weak], EXACT)[0][0]
+    assert np.abs(motion.torque).max() == pytest.approx(10.0)
+
+
 def test_truths_side_by_side_are_the_truths_alone():
     one = Truth(base=BASE, effects={"torque_offset": {"tau_0": 1.0}})
     other = Truth(base=replace(BASE, friction=0.1), effects={"torque_offset": {"tau_0": -0.5}})

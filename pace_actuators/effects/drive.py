@@ -15,7 +15,7 @@ _RIPPLE_PERIODS = sorted({round(5 * 40 ** (i / 26)) for i in range(27)})
 
 @register_effect
 class TorqueGain(Effect):
-    """The drive gives more or less torque than it is asked for: τ -> (1 + g) τ."""
+    """The drive gives more or less torque than it is asked for, of the limited torque too: τ -> (1 + g) τ."""
 
     name = "torque_gain"
     stage = "drive"
@@ -35,12 +35,12 @@ class TorqueGain(Effect):
 
 @register_effect
 class DriveBandwidth(Effect):
-    """The drive's torque follows the command with a first-order lag: T τ̇ + τ = τ_cmd, exact for a held command."""
+    """The torque follows what is asked, within its limit, with a first-order lag: T τ̇ + τ = τ_cmd, exact if held."""
 
     name = "drive_bandwidth"
     stage = "drive"
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
-    equation = "T dτ/dt + τ = τ_cmd"
+    equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
     looks = "phase falls beyond what the delay explains"
     source = "current loop of a motor drive"
     probes = ({"time_constant": 0.001}, {"time_constant": 0.005}, {"time_constant": 0.015})
@@ -56,7 +56,7 @@ class DriveBandwidth(Effect):
         if not hasattr(self, "_torque"):
             self._torque = self.zeros()
 
-    def drive(self, s: DriveState) -> None:
+    def current_loop(self, s: DriveState) -> None:
         """Give the mean torque over the coming step; the first counts as settled."""
         new = self.take_new_rows()
         if new is not None:
@@ -98,14 +98,14 @@ class TorqueRipple(Effect):
 
 @register_effect
 class TorqueLimit(Effect):
-    """The drive limits its torque more than the configuration says: |τ| <= τ_max."""
+    """The drive limits what is asked of it more than the configuration says: |τ_cmd| <= τ_max."""
 
     name = "torque_limit"
     stage = "drive"
     parameters = (
         EffectParameter(name="effort", unit="N m", lower=0.1, upper=200.0, null=_INFINITE, start=20.0, scale="log"),
     )
-    equation = "|τ| <= τ_max"
+    equation = "|τ_cmd| <= τ_max, before current loop and torque constant"
     looks = "peaks are cut, in the fast parts only"
     source = "current limit of a drive"
     probes = tuple({"effort": e} for e in (60.0, 40.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.0, 1.0, 0.5, 0.3))
@@ -113,9 +113,8 @@ class TorqueLimit(Effect):
     separates = "a larger and faster motion"
     effort: torch.Tensor
 
-    def drive(self, s: DriveState) -> None:
+    def current_limit(self, s: DriveState) -> None:
         """Clip."""
-        s.speed_slope *= s.effort.abs() <= self.effort
         s.effort = torch.clamp(s.effort, -self.effort, self.effort)
 
 
@@ -159,7 +158,7 @@ class TorqueSpeedLimit(Effect):
         self._stall = self.effort.clamp(max=torch.finfo(self.effort.dtype).max)
         self._on = ~(self.effort.isinf() | self.velocity.isinf())
 
-    def drive(self, s: DriveState) -> None:
+    def torque_speed(self, s: DriveState) -> None:
         """Clip by quadrant."""
         fall = self._stall / self.velocity
         most = (self._stall - fall * s.motor_vel.abs()).clamp_(min=0.0)

@@ -179,8 +179,17 @@ class Effect:
     def effort_command(self, s: DriveState) -> None:
         """Once per control step, after the controller and its delay: change ``s.effort``."""
 
+    def current_limit(self, s: DriveState) -> None:
+        """Once per physics step, where the drive limits what is asked of it: change ``s.effort``."""
+
+    def current_loop(self, s: DriveState) -> None:
+        """Once per physics step, after that limit: how the current follows; change ``s.effort``."""
+
     def drive(self, s: DriveState) -> None:
-        """Once per physics step, before the torque-speed limit: change ``s.effort``."""
+        """Once per physics step, after the current loop: what torque comes of it; change ``s.effort``."""
+
+    def torque_speed(self, s: DriveState) -> None:
+        """Once per physics step, before the torque-speed line: what the supply leaves; change ``s.effort``."""
 
     def friction(self, s: DriveState) -> None:
         """Once per physics step: change ``s.friction`` (level of Coulomb friction) and ``s.viscous_friction``."""

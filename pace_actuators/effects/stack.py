@@ -12,6 +12,9 @@ from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.effect_cfg import EffectCfg
 from pace_actuators.joint_values import resolve_joint_values
 
+_IN_DRIVE = ("current_limit", "current_loop", "drive", "torque_speed")
+"""The way of a torque through the drive: what is asked, what flows, what comes of it, what the supply leaves."""
+
 _STAGES = (
     "advance",
     "command",
@@ -20,7 +23,7 @@ _STAGES = (
     "controller",
     "controller_effort",
     "effort_command",
-    "drive",
+    *_IN_DRIVE,
     "friction",
     "transmission",
     "armature",
@@ -90,6 +93,8 @@ class EffectStack:
             for stage in _STAGES
         }
         self._step_begun = False
+        self.acts_in_drive = any(self._at[stage] for stage in _IN_DRIVE)
+        """Whether what is asked of the motor becomes another torque between its two limits."""
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
         """Whether friction or viscous friction change from step to step."""
         self.changes_armature = any(effect.changes_armature for effect in self.effects)
@@ -221,13 +226,16 @@ class EffectStack:
         return self.state.effort.clone()
 
     def given_by_drive(self, effort: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The torque before the motor's limits [N m], and how fast it falls with the speed where effects limit it."""
-        if not self._at["drive"]:
-            return effort, None
+        """The torque before the torque-speed line [N m], and how fast it falls with the speed where effects limit it.
+
+        Args:
+            effort: What is asked of the motor, within its limit [N m].
+        """
         s = self.state
         s.effort = effort
         s.speed_slope.zero_()
-        self.run("drive")
+        for stage in _IN_DRIVE:
+            self.run(stage)
         return s.effort, s.speed_slope
 
     def at_the_joint(

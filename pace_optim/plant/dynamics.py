@@ -140,17 +140,19 @@ class Dynamics:
         state.clock += h
 
     def _motor_output(self, command: np.ndarray, state: State) -> np.ndarray:
-        """The drive's stages, then the four-quadrant curve of a DC motor at the motor's speed.
+        """What a drive makes of a torque asked for: its limit, its stages, then what the supply's voltage leaves.
 
-        min(τ_s (1 - v / v_0), τ_c) above, max(τ_s (-1 - v / v_0), -τ_c) below.
+        The request stays within ± τ_c; the outcome between τ_s (-1 - v / v_0) and τ_s (1 - v / v_0) at the motor's
+        speed v, except that a motor turned faster than it could run brakes with τ_c at most.
         """
-        drives = self.drives
-        torque = command
+        drives, most = self.drives, self.drives.effort_limit
+        torque = np.maximum(np.minimum(command, most), -most)
         for effect in self._drive:
             torque = effect.drive(torque, state)
         drop = self._slope * state.motor_vel
-        torque = np.maximum(np.minimum(torque, drives.saturation_effort - drop), -drives.saturation_effort - drop)
-        return np.maximum(np.minimum(torque, drives.effort_limit), -drives.effort_limit)
+        ceiling = np.maximum(drives.saturation_effort - drop, -most)
+        floor = np.minimum(-drives.saturation_effort - drop, most)
+        return np.maximum(np.minimum(torque, ceiling), floor)
 
     def _step_motor(
         self, torque: np.ndarray, forward: np.ndarray, backward: np.ndarray, motor_mid: np.ndarray, h: float

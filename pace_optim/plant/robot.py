@@ -15,6 +15,7 @@ from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import PaceCfg
 
 _REFERENCE_EFFORT = 89.0  # effort limit of the drive that the effects' sizes were chosen for [N m]
+_NO_STALL = 1e9  # stall torque of a drive without a torque-speed line [N m]
 DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 
 
@@ -90,8 +91,8 @@ def plant_robot(task: str) -> PlantRobot:
     if not wanted.all():
         missing = [name for name, fine in zip(names, wanted, strict=True) if not fine]
         raise ValueError(f"{task}: no gains for {', '.join(missing)}. Give the joints an actuator with gains.")
-    no_curve = ~np.isfinite(drive["saturation_effort"])  # stall torque at the limit, no fall with speed
-    drive["saturation_effort"][no_curve] = np.minimum(drive["effort_limit"][no_curve], 1e9)
+    no_curve = ~np.isfinite(drive["saturation_effort"])  # a stall torque beyond all others, no fall with speed
+    drive["saturation_effort"][no_curve] = _NO_STALL
     drive["velocity_limit"][no_curve] = np.inf
     return PlantRobot(
         name=pace.robot_name,

@@ -211,7 +211,10 @@ class Rollout:
             for name in _DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
                 if value is not None:
-                    getattr(actuator, name)[rows] = torch.as_tensor(value)[actuator.joint_indices]
+                    own = torch.as_tensor(value)[actuator.joint_indices]
+                    if name == "saturation_effort":
+                        own = own.clamp(max=torch.finfo(own.dtype).max)  # infinite: no torque-speed line
+                    getattr(actuator, name)[rows] = own
         load = {
             key: value
             for key in ("load_mass", "load_length", "arm_mass")

@@ -64,14 +64,14 @@ class TorqueRipple(HiddenEffect):
 
 @hidden
 class TorqueLimit(HiddenEffect):
-    """|τ| <= τ_max."""
+    """|τ_cmd| <= τ_max: the request is cut, before current loop and torque constant."""
 
     name = "torque_limit"
     draws = draws_of(tau_max=Draw(unit="N m", low=18.0, high=45.0, log=True, role="inverse", torque=True, null=np.inf))
-    drive_rank = 3
+    drive_rank = -1
 
     def drive(self, torque: np.ndarray, state: State) -> np.ndarray:
-        """The torque cut [N m]."""
+        """The request cut [N m]."""
         return np.clip(torque, -self.tau_max, self.tau_max)
 
 

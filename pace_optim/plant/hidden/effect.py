@@ -67,7 +67,7 @@ class HiddenEffect:
     """Whether it is no effect of the library: nothing the diagnosis can name."""
     draws: ClassVar[Mapping[str, Draw]]
     drive_rank: ClassVar[int] = 0
-    """Order of the `drive` stages: bandwidth 0, gain 1, ripple 2, limits 3."""
+    """Order of the `drive` stages: limit of the request -1, bandwidth 0, gain 1, ripple 2, torque-speed limit 3."""
 
     def __init__(self, values: Mapping[str, np.ndarray]):
         """Keep the values, {parameter: (R, n)}."""
