@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import torch
@@ -12,9 +11,11 @@ from pace_actuators import ActuatorActions, PaceDCMotor, resolve_joint_values
 from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
+from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, find_names, indices, pick, zeros_like
 from pace_envs.joint_layout import JointLayout
 from pace_envs.link_model import LinkModel
+from pace_envs.model_file import read_model_file
 from pace_envs.simulation import Simulation
 
 
@@ -24,13 +25,7 @@ def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
     Raises:
         ValueError: If the file is missing or no MJCF.
     """
-    path = Path(cfg.mjcf_path)
-    if not path.is_file():
-        raise ValueError(f"The model file {path} does not exist. Correct mjcf_path in the robot's configuration.")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {path}: {error}") from None
+    spec = read_model_file(cfg.mjcf_path).spec
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if cfg.fix_base:
         for joint in free:
@@ -68,7 +63,7 @@ class Articulation:
                 limits[i] = torch.as_tensor(sim.model.joint(name).range)
         middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
         zeros = torch.zeros(sim.num_envs, n, dtype=torch.float64, device=device)
-        default_pos = resolve_joint_values(init.joint_pos, self.joint_names, field="init_state.joint_pos", default=0.0)
+        default_pos, self._passive_pos = self._initial_positions()
         default_vel = resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
         self.data = ArticulationData(
             joint_pos=sim.qpos[:, self._layout.qpos_view] if self._layout.side_by_side else zeros.clone(),
@@ -88,6 +83,7 @@ class Articulation:
                 sim.qvel[:, v : v + 3],
                 sim.qvel[:, v + 3 : v + 6],
             )
+        self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
         self._link_model: LinkModel | None = None
         self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=torch.float64)
         self._build_actuators()
@@ -141,6 +137,8 @@ class Articulation:
                 torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64),
                 env_ids,
             )
+        if len(self._layout.passive_names):
+            assign(self._sim.qpos, rows, self._layout.passive_columns, self._passive_pos)
         self.write_joint_state_to_sim(
             self.data.default_joint_pos[rows], self.data.default_joint_vel[rows], env_ids=env_ids
         )
@@ -158,9 +156,15 @@ class Articulation:
         joint_ids: JointIds = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable."""
+        """Write positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable.
+
+        The passive joints of closed chains go where they close them, from where they are.
+        """
         self._write(self._sim.qpos, self._layout.qpos_columns, position, joint_ids, env_ids)
         self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids)
+        if self._loops is not None:
+            rows = slice(None) if env_ids is None else self._sim.resolve_env_ids(env_ids)
+            self._sim.qpos[rows], self._sim.qvel[rows] = self._loops.closed(self._sim.qpos[rows], self._sim.qvel[rows])
         self._refresh()
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
@@ -259,6 +263,11 @@ class Articulation:
         self._refresh()
 
     @property
+    def closed_loops(self) -> ClosedLoops | None:
+        """What closes the robot's kinematic loops; ``None`` where it has none."""
+        return self._loops
+
+    @property
     def load_effort(self) -> torch.Tensor:
         """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
         return -self._sim.qfrc_bias[:, self._layout.dof_view if self._layout.side_by_side else self._layout.dof_columns]
@@ -344,6 +353,16 @@ class Articulation:
         self._write_passive(actuator)
         if effect.overrides("write_model"):
             self._write_model(actuator, effect)
+
+    def _initial_positions(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Initial positions [rad] of the joints, (num_joints,), and of the passive ones."""
+        value, layout = self.cfg.init_state.joint_pos, self._layout
+        if not isinstance(value, Mapping):
+            own = resolve_joint_values(value, self.joint_names, field="init_state.joint_pos", default=0.0)
+            return own, torch.as_tensor(self._sim.model.qpos0)[layout.passive_columns]
+        names = [*self.joint_names, *layout.passive_names]
+        every = resolve_joint_values(value, names, field="init_state.joint_pos", default=0.0)
+        return every[: self.num_joints], every[self.num_joints :]
 
     def _joint_list(self, actuator: PaceDCMotor) -> list[int]:
         ids = actuator.joint_indices

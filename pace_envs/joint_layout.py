@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -23,6 +23,10 @@ class JointLayout:
     """Column of each joint in ``qvel`` and all that belongs to degrees of freedom, (num_joints,)."""
     root: tuple[int, int] | None
     """First columns of a floating base in ``qpos`` and ``qvel``; ``None`` for a fixed one."""
+    passive_names: tuple[str, ...] = ()
+    """Hinge and slide joints of the model that are not among them: they move as their loads and loops do."""
+    passive_columns: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
+    """Column of each passive joint in ``qpos``."""
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel, joint_order: Sequence[str] | None, path: str | Path) -> JointLayout:
@@ -34,7 +38,7 @@ class JointLayout:
             path: The model's file, for messages.
 
         Raises:
-            ValueError: If the model has no joints to drive or a ball joint, or the order names unknown ones.
+            ValueError: If the model has no joints to drive, or the order names unknown ones.
         """
         root, single = None, {}
         for j in range(model.njnt):
@@ -43,7 +47,7 @@ class JointLayout:
                 root = (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
             elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
                 single[name] = j
-            else:
+            elif joint_order is None or name in joint_order:
                 raise ValueError(f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives.")
         if not single:
             raise ValueError(f"The model {path} has no joints to drive.")
@@ -53,11 +57,14 @@ class JointLayout:
             wrong = f"names unknown joints: {', '.join(unknown)}" if unknown else "names a joint twice"
             raise ValueError(f"joint_order {wrong}. Joints of the model: {', '.join(single)}.")
         ids = [single[name] for name in order]
+        passive = {name: j for name, j in single.items() if name not in order}
         return cls(
             joint_names=tuple(order),
             qpos_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in ids]),
             dof_columns=torch.tensor([int(model.jnt_dofadr[j]) for j in ids]),
             root=root,
+            passive_names=tuple(passive),
+            passive_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in passive.values()], dtype=torch.long),
         )
 
     @cached_property

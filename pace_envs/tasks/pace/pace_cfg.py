@@ -88,6 +88,9 @@ class PaceCfg:
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
+    notes: tuple[str, ...] = ()
+    """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
+
     def __post_init__(self) -> None:
         """Check the shape and order of the bounds."""
         expected = (4 * len(self.joint_order) + 1, 2)

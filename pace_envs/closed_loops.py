@@ -1,0 +1,156 @@
+"""Closed kinematic chains: passive joints that put a posture onto the model's equality constraints."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+
+_STEPS = 40
+"""Newton steps from one posture to the next."""
+_LARGEST_STEP = 0.3
+"""Largest change of a passive joint in a Newton step [rad or m]."""
+_CLOSED = 1e-9
+"""A loop is closed when its constraints are met within this [m or rad]."""
+_ON_THE_WAY = 20
+"""Intermediate postures between a closed one and one that Newton's method does not reach at once."""
+
+
+@dataclass(eq=False)
+class ClosedLoops:
+    """Moves a model's passive joints so that its equality constraints hold: connect, weld, joint and tendon.
+
+    With r(q) the constraints' residual and J_p its derivative with respect to the passive degrees of freedom,
+    Newton's method takes q_p ← q_p - J_p⁺ r until r = 0, from the passive joints' present positions; where that does
+    not lead there, the joints are taken there step by step from the model's own closed posture, so that a loop keeps
+    the assembly that it has in the model.
+    """
+
+    model: mujoco.MjModel
+    """The model; only its kinematics are used."""
+    passive: np.ndarray
+    """Its degrees of freedom that are free to close the loops."""
+
+    @classmethod
+    def of_model(cls, model: mujoco.MjModel, driven: Sequence[int]) -> ClosedLoops | None:
+        """The loops of a model; ``None`` if no active constraint ties passive joints.
+
+        Args:
+            model: The model.
+            driven: Degrees of freedom whose positions are given.
+        """
+        passive = np.setdiff1d(np.arange(model.nv), np.asarray(driven, dtype=int))
+        if not len(passive) or not model.neq or not model.eq_active0.any():
+            return None
+        own = copy.copy(model)
+        own.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        loops = cls(model=own, passive=passive)
+        loops._data = mujoco.MjData(own)
+        jacobian, _ = loops._constraints(own.qpos0)
+        return loops if np.abs(jacobian[:, passive]).any() else None
+
+    def __post_init__(self) -> None:
+        """Make room for one posture."""
+        self._data = mujoco.MjData(self.model)
+
+    def closed(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Postures and speeds with the passive joints where the loops close, as far as they can be closed.
+
+        Args:
+            qpos: Postures, (m, nq).
+            qvel: Speeds, (m, nv).
+
+        Returns:
+            Both, with new passive parts.
+        """
+        postures, speeds = qpos.numpy().copy(), qvel.numpy().copy()
+        last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        for row in range(len(postures)):
+            if last is not None and np.array_equal(postures[row], last[0]) and np.array_equal(speeds[row], last[1]):
+                postures[row], speeds[row] = postures[row - 1], speeds[row - 1]
+                continue
+            last = postures[row].copy(), speeds[row].copy(), postures[row]
+            postures[row] = self.close(postures[row])
+            jacobian, _ = self._constraints(postures[row])
+            own = speeds[row].copy()
+            own[self.passive] = 0.0
+            speeds[row][self.passive] = -np.linalg.lstsq(jacobian[:, self.passive], jacobian @ own, rcond=1e-9)[0]
+        return torch.from_numpy(postures), torch.from_numpy(speeds)
+
+    def close(self, qpos: np.ndarray) -> np.ndarray:
+        """The posture (nq,) with its passive joints where the loops close, or come nearest to closing."""
+        here, gap = self._newton(qpos, self.passive)
+        if gap <= _CLOSED:
+            return here
+        start, own = self._newton(self.model.qpos0.copy(), np.arange(self.model.nv))
+        if own > _CLOSED:
+            return here
+        way = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, way, 1.0, start, qpos)
+        way[self.passive] = 0.0
+        there = start
+        for _ in range(_ON_THE_WAY):
+            there = self._moved(there, way / _ON_THE_WAY)
+            there, other = self._newton(there, self.passive)
+        return there if other < gap else here
+
+    def gap(self, qpos: np.ndarray) -> tuple[float, str]:
+        """How far the loops of a posture (nq,) are from closed [m or rad], and the worst constraint's name."""
+        _, residual = self._constraints(qpos)
+        worst = int(np.abs(residual).argmax())
+        return float(np.abs(residual[worst])), self._name(int(self._data.efc_id[worst]))
+
+    def closable(self, qpos: np.ndarray, slack: np.ndarray) -> bool:
+        """Whether the loops close when each degree of freedom may be off by some slack (nv,) [rad or m]."""
+        moved, gap = self._newton(qpos, np.arange(self.model.nv))
+        off = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, off, 1.0, qpos, moved)
+        return gap <= _CLOSED and bool((np.abs(off) <= slack).all())
+
+    def _newton(self, qpos: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, float]:
+        """A posture on the constraints, moving some degrees of freedom, and what of them is left."""
+        best, least = qpos, np.inf
+        for _ in range(_STEPS):
+            jacobian, residual = self._constraints(qpos)
+            gap = float(np.abs(residual).max(initial=0.0))
+            if gap < least:
+                best, least = qpos, gap
+            if gap <= _CLOSED:
+                break
+            step = np.zeros(self.model.nv)
+            step[free] = -np.linalg.lstsq(jacobian[:, free], residual, rcond=1e-9)[0]
+            qpos = self._moved(qpos, step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12)))
+        return best, least
+
+    def _constraints(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivative (ne, nv) and residual (ne,) of the equality constraints at a posture."""
+        data = self._data
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        count = data.ne
+        return data.efc_J.reshape(-1, self.model.nv)[:count].copy(), data.efc_pos[:count].copy()
+
+    def _moved(self, qpos: np.ndarray, step: np.ndarray) -> np.ndarray:
+        moved = qpos.copy()
+        mujoco.mj_integratePos(self.model, moved, step, 1.0)
+        return moved
+
+    def _name(self, e: int) -> str:
+        model = self.model
+        if model.eq(e).name:
+            return model.eq(e).name
+        kind = mujoco.mjtEq(int(model.eq_type[e])).name.removeprefix("mjEQ_").lower()
+        obj = {mujoco.mjtObj.mjOBJ_BODY: model.body, mujoco.mjtObj.mjOBJ_SITE: model.site}
+        one, other = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        if kind == "joint":
+            names = [model.joint(j).name for j in (one, other) if j >= 0]
+        elif kind == "tendon":
+            names = [model.tendon(t).name for t in (one, other) if t >= 0]
+        else:
+            names = [obj[mujoco.mjtObj(int(model.eq_objtype[e]))](i).name for i in (one, other)]
+        return f"{kind} of {' and '.join(names)}"

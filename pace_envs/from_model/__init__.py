@@ -1,0 +1,5 @@
+"""An identification environment from a model file alone."""
+
+from pace_envs.from_model.robot import Robot, cfg_from_model, read_robot
+
+__all__ = ["Robot", "cfg_from_model", "read_robot"]

@@ -1,0 +1,149 @@
+"""What a model says of each driven joint: inertia, gravity, friction, range, home."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from pace_envs.from_model import defaults
+from pace_envs.from_model.actuators import FileDrive, Kind
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFacts:
+    """A driven joint; of a slide, lengths [m] stand for angles and forces [N] for torques."""
+
+    name: str
+    """Its name."""
+    is_slide: bool
+    """Whether it slides."""
+    inertia: float
+    """Inertia of what it moves at the home posture, without its rotor [kg m^2]."""
+    gravity: float
+    """Size of gravity's torque at the home posture [N m]."""
+    armature: float
+    """The file's rotor inertia [kg m^2]; 0 where it has none."""
+    viscous_friction: float
+    """The file's damping [N m s/rad]."""
+    friction: float
+    """The file's Coulomb friction [N m]."""
+    range: tuple[float, float]
+    """Lower and upper limit [rad]; infinite where it has none."""
+    home: float
+    """Position at the home posture [rad]."""
+    drive: FileDrive | None
+    """Its drive in the file; ``None`` where the file has no gains for it."""
+    command: Kind
+    """What its drive is commanded by."""
+    velocity_limit: float
+    """Largest speed [rad/s]; infinite where the file has none."""
+    effort_limit: float
+    """Largest torque of its drive [N m]; infinite where the file has none."""
+    effort: float
+    """The same, or what it needs at least where the file has none: the scale of all that is in torques [N m]."""
+
+
+_KINDS: dict[str, Kind] = {"velocity": "velocity", "effort": "effort"}
+
+
+def joint_facts(
+    model: mujoco.MjModel,
+    home: np.ndarray,
+    names: Sequence[str],
+    drives: Mapping[str, FileDrive],
+    velocity_limits: Mapping[str, float],
+    command: Mapping[str, str],
+) -> list[JointFacts]:
+    """Read the facts of some joints.
+
+    Args:
+        model: The compiled model.
+        home: Its home posture, (nq,).
+        names: The joints.
+        drives: Drives by joint.
+        velocity_limits: Largest speeds by joint, where known.
+        command: What joints without a drive in the file are commanded by, where known.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = home
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    result = []
+    for name in names:
+        joint = model.joint(name)
+        j, dof = joint.id, int(model.jnt_dofadr[joint.id])
+        limited = bool(model.jnt_limited[j])
+        drive = drives.get(name)
+        effort = drive.effort_limit if drive else _joint_effort_limit(model, j)
+        armature = float(model.dof_armature[dof])
+        result.append(
+            JointFacts(
+                name=name,
+                is_slide=int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_SLIDE,
+                inertia=max(float(mass[dof, dof]) - armature, 0.0),
+                gravity=abs(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])),
+                armature=armature,
+                viscous_friction=float(model.dof_damping[dof]),
+                friction=float(model.dof_frictionloss[dof]),
+                range=tuple(model.jnt_range[j].tolist()) if limited else (-np.inf, np.inf),
+                home=float(home[model.jnt_qposadr[j]]),
+                drive=drive,
+                command=drive.kind if drive else _KINDS.get(command.get(name, ""), "position"),
+                velocity_limit=velocity_limits.get(name, np.inf),
+                effort_limit=effort if effort > 0 else np.inf,
+                effort=0.0,
+            )
+        )
+    return _with_efforts(result)
+
+
+def _with_efforts(joints: Sequence[JointFacts]) -> list[JointFacts]:
+    """Give each joint a scale of its torque: its limit, or what it needs and no less than a part of the strongest."""
+    least = [joint.effort_limit if np.isfinite(joint.effort_limit) else _least_effort(joint) for joint in joints]
+    floor = defaults.SMALLEST_SHARE * max(least)
+    return [
+        replace(joint, effort=effort if np.isfinite(joint.effort_limit) else max(effort, floor))
+        for joint, effort in zip(joints, least, strict=True)
+    ]
+
+
+def _least_effort(joint: JointFacts) -> float:
+    """What holds the joint against gravity three times, swings it, and breaks it loose [N m]."""
+    length = defaults.SLIDE_LENGTH if joint.is_slide else 1.0
+    stiffness = 0.0 if joint.drive is None else joint.drive.stiffness
+    swing = (2 * np.pi * defaults.NATURAL_FREQUENCY) ** 2 * defaults.LARGEST_AMPLITUDE * length
+    needed = 3.0 * joint.gravity + swing * (joint.inertia + joint.armature)
+    return float(max(needed, 0.5 * stiffness * length, 2.0 * joint.friction, 1e-3))
+
+
+def _joint_effort_limit(model: mujoco.MjModel, j: int) -> float:
+    return float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
+
+
+HOME_NAMES = ("home", "stand", "standing", "init", "initial", "rest")
+"""Names of keyframes that are taken for the home posture, in this order; else the first one is."""
+
+
+def home_posture(model: mujoco.MjModel) -> tuple[np.ndarray, str]:
+    """The home posture (nq,) and where it comes from: a keyframe's name, or nothing.
+
+    Without a keyframe it is the model's own zero posture; joints whose range does not hold it are in its middle.
+    """
+    names = [model.key(k).name for k in range(model.nkey)]
+    for wanted in HOME_NAMES:
+        for k, name in enumerate(names):
+            if name.lower() == wanted:
+                return model.key_qpos[k].copy(), name
+    if names:
+        return model.key_qpos[0].copy(), names[0] or "the first keyframe"
+    home = model.qpos0.copy()
+    for j in range(model.njnt):
+        low, high = model.jnt_range[j]
+        single = int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        if single and model.jnt_limited[j] and not low < home[model.jnt_qposadr[j]] < high:
+            home[model.jnt_qposadr[j]] = 0.5 * (low + high)
+    return home, ""

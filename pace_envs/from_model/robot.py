@@ -1,0 +1,204 @@
+"""From a model file to an identification environment's configuration."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from pace_actuators import PaceDCMotorCfg
+from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
+from pace_envs.from_model import defaults
+from pace_envs.from_model.actuators import read_drives
+from pace_envs.from_model.couplings import followers
+from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
+from pace_envs.from_model.scaling import base_bounds, gains, motion, sample_values
+from pace_envs.model_file import ModelFile, read_model_file
+from pace_envs.simulation import SimulationCfg
+from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
+from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
+
+_UNNAMED = {"", "mujoco model", "robot", "model", "scene"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Robot:
+    """A robot as its model file states it."""
+
+    file: ModelFile
+    """The file."""
+    model: mujoco.MjModel
+    """The compiled model, its base as in the file."""
+    name: str
+    """Its name, fit for a folder."""
+    joints: tuple[JointFacts, ...]
+    """The driven joints, in the order of the model."""
+    home: np.ndarray
+    """The home posture, (nq,)."""
+    notes: tuple[str, ...]
+    """What was assumed and what was left out, in plain sentences."""
+
+
+def read_robot(path: str | Path) -> Robot:
+    """Read a robot from a model file.
+
+    Args:
+        path: MJCF or URDF.
+
+    Raises:
+        ValueError: If the file is missing, is no model, or has no joints that a drive could move.
+    """
+    file = read_model_file(path)
+    try:
+        model = file.spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {path}: {error}") from None
+    drives, notes = read_drives(model)
+    names = [drive.joint for drive in drives] or _to_drive(model, file)
+    if not names:
+        raise ValueError(f"The model {path} has no hinge or slide joint that a drive could move.")
+    home, key = home_posture(model)
+    stated = {drive.joint: drive for drive in drives}
+    velocity, command = ({}, {}) if file.urdf is None else (file.urdf.velocity_limits, file.urdf.command)
+    joints = joint_facts(model, home, names, stated, velocity, command)
+    return Robot(
+        file=file,
+        model=model,
+        name=_folder_name(file),
+        joints=tuple(joints),
+        home=home,
+        notes=(*file.notes, *notes, *_assumptions(joints, key, model)),
+    )
+
+
+def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
+    """The identification environment of the robot in a model file, its base held in the air.
+
+    Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
+    bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
+    (:mod:`pace_envs.from_model.defaults`) and told in ``sim2real.notes``.
+
+    Args:
+        path: MJCF (``.xml``) or URDF (``.urdf``).
+
+    Raises:
+        ValueError: If the file cannot be used; the message says what to do.
+    """
+    robot = read_robot(path)
+    joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
+    position, orientation = _base_pose(robot)
+    articulation = ArticulationCfg(
+        mjcf_path=Path(path),
+        init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
+        actuators={"drives": _drive_cfg(joints)},
+        joint_order=names,
+    )
+    rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
+    moves = [motion(joint) for joint in joints]
+    samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
+    return PaceSim2realEnvCfg(
+        scene=PaceSim2realSceneCfg(robot=articulation),
+        sim=SimulationCfg(dt=defaults.CONTROL_DT, gravity=_gravity(robot.model)),
+        sim2real=PaceCfg(
+            robot_name=robot.name,
+            data_dir=Path("data") / robot.name / "chirp.npz",
+            joint_order=names,
+            bounds_params=torch.tensor([*rows, (0.0, _longest_delay())], dtype=torch.float64),
+            excitation=ExcitationCfg(
+                bias=tuple(centre / amplitude for centre, amplitude in moves),
+                direction=(1.0,) * len(joints),
+                scale=tuple(amplitude for _, amplitude in moves),
+            ),
+            sample_params={**samples, "delay": 2.0},
+            notes=robot.notes,
+        ),
+    )
+
+
+def _drive_cfg(joints: Sequence[JointFacts]) -> PaceDCMotorCfg:
+    pairs = [gains(joint) for joint in joints]
+    limits = [joint.effort_limit for joint in joints]
+    speeds = [joint.velocity_limit for joint in joints]
+    return PaceDCMotorCfg(
+        joint_names_expr=[re.escape(joint.name) for joint in joints],
+        stiffness=[stiffness for stiffness, _ in pairs],
+        damping=[damping for _, damping in pairs],
+        effort_limit=limits if np.isfinite(limits).any() else None,
+        velocity_limit=speeds if np.isfinite(speeds).any() else None,
+        max_delay=_longest_delay(),
+    )
+
+
+def _longest_delay() -> float:
+    return defaults.LONGEST_DELAY / defaults.CONTROL_DT
+
+
+def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
+    """Joints to drive where the file has no actuators: those that it names, else all that follow no other."""
+    if file.urdf is not None and file.urdf.driven:
+        return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    follow = followers(model)
+    return [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in single and j not in follow]
+
+
+def _base_pose(robot: Robot) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """Pose of a floating base at home; a fixed one is where the file has it."""
+    model = robot.model
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE:
+            x, y, z, *turn = robot.home[model.jnt_qposadr[j] : model.jnt_qposadr[j] + 7].tolist()
+            return (x, y, z), (turn[0], turn[1], turn[2], turn[3])
+    return (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+
+
+def _home_positions(robot: Robot) -> dict[str, float]:
+    """Positions of the hinge and slide joints at home, by name, where they are not 0."""
+    model, result = robot.model, {}
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            value = float(robot.home[model.jnt_qposadr[j]])
+            if value:
+                result[re.escape(model.joint(j).name)] = value
+    return result
+
+
+def _gravity(model: mujoco.MjModel) -> tuple[float, float, float]:
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+        return (0.0, 0.0, 0.0)
+    x, y, z = model.opt.gravity.tolist()
+    return (x, y, z)
+
+
+def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) -> list[str]:
+    notes = [f"home posture: {f'keyframe {key}' if key else 'all joints at 0, or in the middle of a range without it'}"]
+    if any(joint.drive is None for joint in joints):
+        notes.append(
+            f"gains: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least {defaults.NATURAL_FREQUENCY:g} Hz "
+            f"with the joint's inertia; kd for a damping ratio of {defaults.DAMPING_RATIO:g}; state the real ones in "
+            "the recording (stiffness, damping)"
+        )
+    without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
+    if without:
+        notes.append(f"effort limit: none ({_listed(without)})")
+    if not any(np.isfinite(joint.velocity_limit) for joint in joints):
+        notes.append("speed limit: none")
+    notes.append(f"control rate: {1 / defaults.CONTROL_DT:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms")
+    if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
+        notes.append("the base is held in the air, and nothing touches")
+    return notes
+
+
+def _folder_name(file: ModelFile) -> str:
+    stated = file.spec.modelname
+    name = stated if stated.lower() not in _UNNAMED else file.path.stem
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "robot"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -1,0 +1,110 @@
+"""Gains, bounds and motion of a joint, from what its model file says of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pace_envs.from_model import defaults
+from pace_envs.from_model.joints import JointFacts
+
+_ACCELERATION, _SLIDE_ACCELERATION = 25.0, 10.0
+"""A drive's largest torque over its rotor inertia is above this [rad/s^2] (a slide: [m/s^2])."""
+_OF_EFFORT = 0.2
+"""Largest Coulomb friction, as a part of the drive's largest torque."""
+_SEEN_BY_FILE = 10.0
+"""How much larger than the file says a parameter may be."""
+_SAFE = 0.7
+"""Part of the torque that gravity leaves, and of the speed limit, that the excitation may use."""
+_MARGIN = 0.05
+"""Part of the joint's range at each end that the excitation stays away from."""
+
+Bounds = tuple[float, float]
+
+
+def unit_length(joint: JointFacts) -> float:
+    """What counts as a radian: 1 for a hinge, some metres for a slide."""
+    return defaults.SLIDE_LENGTH if joint.is_slide else 1.0
+
+
+def gains(joint: JointFacts) -> tuple[float, float]:
+    """Stiffness kp [N m/rad] and damping kd [N m s/rad]: the file's, or the named defaults."""
+    if joint.drive is not None:
+        return joint.drive.stiffness, joint.drive.damping
+    inertia, length = joint.inertia + joint.armature, unit_length(joint)
+    natural = (2 * math.pi * defaults.NATURAL_FREQUENCY) ** 2 * inertia
+    stiffness = max(joint.effort / (defaults.ERROR_AT_LIMIT * length), natural)
+    damping = 2 * defaults.DAMPING_RATIO * math.sqrt(stiffness * inertia)
+    if joint.command == "effort":
+        return 0.0, 0.0
+    return (0.0 if joint.command == "velocity" else stiffness), damping
+
+
+def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
+    """Bounds of armature, viscous friction, Coulomb friction and encoder bias."""
+    effort, length = joint.effort, unit_length(joint)
+    slowest = effort / (_SLIDE_ACCELERATION if joint.is_slide else _ACCELERATION)
+    armature = max(_SEEN_BY_FILE * joint.armature, 0.25 * slowest) if joint.armature else slowest
+    speed = joint.velocity_limit if math.isfinite(joint.velocity_limit) else defaults.USUAL_SPEED * length
+    viscous = max(4.0 * joint.viscous_friction, effort / speed)
+    friction = max(4.0 * joint.friction, _OF_EFFORT * effort)
+    bias = defaults.LARGEST_BIAS
+    if joint.is_slide:
+        low, high = joint.range
+        bias = min(defaults.LARGEST_SLIDE_BIAS, 0.1 * (high - low))
+    return {
+        "armature": (1e-5 * armature, armature),
+        "viscous_friction": (0.0, viscous),
+        "friction": (0.0, friction),
+        "encoder_bias": (-bias, bias),
+    }
+
+
+def motion(joint: JointFacts) -> tuple[float, float]:
+    """Centre and amplitude of the excitation's target [rad]: around home, within range, speed and torque."""
+    low, high = _target_range(joint)
+    width, length = high - low, unit_length(joint)
+    amplitude = min(defaults.LARGEST_AMPLITUDE * length, 0.25 * width, safe_amplitude(joint))
+    if not math.isfinite(width):
+        return joint.home, amplitude
+    keep = _MARGIN * width + amplitude
+    return min(max(joint.home, low + keep), high - keep), amplitude
+
+
+def safe_amplitude(joint: JointFacts) -> float:
+    """Largest amplitude of a target [rad] whose sine, up to the top frequency, needs neither torque nor speed too much.
+
+    The joint alone, with inertia I (armature included), follows a target q* = a sin(ω t) as
+
+        q / q* = kp / (kp - I ω² + i ω (kd + d)),     τ = (i ω d - I ω²) q,     q̇ = i ω q
+    """
+    kp, kd = gains(joint)
+    if kp == 0:
+        return math.inf
+    omega = 2 * math.pi * np.geomspace(0.1, defaults.TOP_FREQUENCY, 200)
+    inertia, viscous = joint.inertia + joint.armature, joint.viscous_friction
+    answer = kp / (kp - inertia * omega**2 + 1j * omega * (kd + viscous))
+    torque = float(np.abs((1j * omega * viscous - inertia * omega**2) * answer).max())
+    speed = float(np.abs(omega * answer).max())
+    left = max(joint.effort - joint.gravity - joint.friction, 0.1 * joint.effort)
+    return _SAFE * min(left / max(torque, 1e-12), joint.velocity_limit / speed)
+
+
+def sample_values(joint: JointFacts) -> dict[str, float]:
+    """True parameters of a simulated recording: the file's, or small parts of the bounds."""
+    bounds = base_bounds(joint)
+    return {
+        "armature": joint.armature or 0.05 * bounds["armature"][1],
+        "viscous_friction": joint.viscous_friction or 0.05 * bounds["viscous_friction"][1],
+        "friction": joint.friction or 0.05 * bounds["friction"][1],
+        "encoder_bias": 0.2 * bounds["encoder_bias"][1],
+    }
+
+
+def _target_range(joint: JointFacts) -> tuple[float, float]:
+    """Where position targets may be: the joint's range and the actuator's control range."""
+    low, high = joint.range
+    if joint.drive is not None:
+        low, high = max(low, joint.drive.target_range[0]), min(high, joint.drive.target_range[1])
+    return low, high

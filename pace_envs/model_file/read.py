@@ -1,0 +1,79 @@
+"""Reading a model file into an ``MjSpec``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+
+from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
+from pace_envs.model_file.urdf import UrdfFacts, read_urdf
+
+MODEL_SUFFIXES = (".xml", ".urdf", ".mjcf")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ModelFile:
+    """A robot's model and what its file says beside it."""
+
+    path: Path
+    """The file."""
+    spec: mujoco.MjSpec
+    """The model; meshes and surfaces that the dynamics do not need are left out of it."""
+    notes: tuple[str, ...]
+    """What was left out although the file names it, in plain sentences."""
+    urdf: UrdfFacts | None = None
+    """What only a URDF says; ``None`` for an MJCF."""
+
+    @property
+    def format(self) -> str:
+        """``"MJCF"`` or ``"URDF"``."""
+        return "MJCF" if self.urdf is None else "URDF"
+
+
+def is_model_file(text: str) -> bool:
+    """Whether a text names a model file by its ending (``.xml``, ``.mjcf``, ``.urdf``)."""
+    return Path(text).suffix.lower() in MODEL_SUFFIXES
+
+
+def read_model_file(path: str | Path) -> ModelFile:
+    """Read an MJCF or a URDF.
+
+    Mesh geoms of bodies whose inertia is stated are left out: the dynamics do not need them. A mesh that is needed for
+    a mass and that is missing takes its mass with it, which is noted.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ValueError: If the file is missing or is no model.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"The model file {path} does not exist. Correct its path.")
+    text = path.read_bytes().decode("utf-8", errors="replace")
+    facts = read_urdf(text, path) if "<robot" in text and "<mujoco model" not in text[: text.find("<robot")] else None
+    try:
+        spec = mujoco.MjSpec.from_file(str(path)) if facts is None else mujoco.MjSpec.from_string(facts.xml)
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {path}: {error}") from None
+    if facts is not None:
+        spec.modelname = spec.modelname or facts.name
+        _write_urdf_facts(spec, facts)
+    notes = [*(() if facts is None else facts.notes), *leave_out_meshes(spec, path)]
+    leave_out_surfaces(spec, path)
+    return ModelFile(path=path, spec=spec, notes=tuple(notes), urdf=facts)
+
+
+def _write_urdf_facts(spec: mujoco.MjSpec, facts: UrdfFacts) -> None:
+    """Give the model what MuJoCo's reader of URDF leaves out: mimic joints, and no mass where none is stated."""
+    for mimic in facts.mimics:
+        equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=mimic.joint, name2=mimic.leader)
+        equality.data = [mimic.offset, mimic.multiplier, *[0.0] * (len(equality.data) - 2)]
+        equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
+        equality.solref, equality.solimp = [0.005, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+    for body in spec.bodies:
+        if not body.explicitinertial:
+            for geom in body.geoms:
+                geom.density = 0.0

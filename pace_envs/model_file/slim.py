@@ -1,0 +1,84 @@
+"""Leaving out of a model what its dynamics do not need: meshes, surfaces, pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+
+_FROM_GEOMS = 1
+"""``compiler/inertiafromgeom="true"``: stated inertias are not used."""
+
+
+def leave_out_meshes(spec: mujoco.MjSpec, path: Path) -> list[str]:
+    """Delete geoms of meshes where no mass comes from them, and where their files are missing.
+
+    Args:
+        spec: The model; it is changed.
+        path: Its file.
+
+    Returns:
+        What was left out although it is needed, in plain sentences.
+    """
+    files = {mesh.name or Path(mesh.file).stem: mesh.file for mesh in spec.meshes}
+    missing = {name for name, file in files.items() if file and not _exists(spec, path, file)}
+    gone, massless = set(), []
+    for body in spec.bodies:
+        stated = body.explicitinertial and int(spec.compiler.inertiafromgeom) != _FROM_GEOMS
+        for geom in [geom for geom in body.geoms if geom.meshname]:
+            if stated or geom.meshname in missing:
+                if not stated and geom.meshname in missing and _has_mass(geom):
+                    massless.append(body.name or "world")
+                gone.add(geom.name)
+                spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms if geom.meshname}
+    for mesh in [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) not in used]:
+        spec.delete(mesh)
+    _delete_references(spec, gone - {""})
+    notes = []
+    if missing:
+        first = ", ".join(sorted(Path(files[name]).name for name in missing)[:2])
+        notes.append(f"{len(missing)} mesh files are missing ({first}{', …' if len(missing) > 2 else ''}): left out.")
+    fixed = [name for name in dict.fromkeys(massless) if name != "world"]
+    if fixed:
+        notes.append(f"The mass of {_listed(fixed)} was to come from a missing mesh and is taken as 0.")
+    return notes
+
+
+def leave_out_surfaces(spec: mujoco.MjSpec, path: Path) -> None:
+    """Delete skins, height fields, textures and materials where one of their files is missing; colours stay."""
+    files = [element.file for element in [*spec.skins, *spec.hfields, *spec.textures] if element.file]
+    files += [file for texture in spec.textures for file in texture.cubefiles if file]
+    if all(_exists(spec, path, file) for file in files):
+        return
+    for element in [*spec.geoms, *spec.sites, *spec.tendons]:
+        element.material = ""
+    for geom in [geom for geom in spec.geoms if geom.hfieldname]:
+        spec.delete(geom)
+    for element in [*spec.skins, *spec.materials, *spec.textures, *spec.hfields]:
+        spec.delete(element)
+
+
+def _exists(spec: mujoco.MjSpec, path: Path, file: str) -> bool:
+    name = Path(file).name if spec.strippath else file
+    folders = ("", spec.meshdir, spec.texturedir)
+    return any((path.parent / folder / name).is_file() for folder in folders)
+
+
+def _has_mass(geom: mujoco.MjsGeom) -> bool:
+    return geom.mass > 0 if geom.mass == geom.mass else geom.density > 0
+
+
+def _delete_references(spec: mujoco.MjSpec, geoms: set[str]) -> None:
+    """Delete sensors and contact pairs of geoms that are gone."""
+    for sensor in list(spec.sensors):
+        named = ((sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname))
+        if any(kind == mujoco.mjtObj.mjOBJ_GEOM and name in geoms for kind, name in named):
+            spec.delete(sensor)
+    for pair in list(spec.pairs):
+        if pair.geomname1 in geoms or pair.geomname2 in geoms:
+            spec.delete(pair)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -1,0 +1,65 @@
+"""Closed chains: passive joints start where the loops close."""
+
+import numpy as np
+import pytest
+import torch
+
+from pace_envs import ManagerBasedRLEnv
+from pace_envs.from_model import cfg_from_model
+
+FOUR_BAR = """
+<mujoco model="four_bar">
+  <compiler angle="radian"/>
+  <default><joint axis="0 1 0"/><geom type="capsule" size="0.008"/></default>
+  <worldbody>
+    <body><joint name="crank" range="0.3 1.3"/><geom fromto="0 0 0 0 0 0.08"/>
+      <body pos="0 0 0.08"><joint name="coupler"/><geom fromto="0 0 0 0.2 0 0"/><site name="tip" pos="0.2 0 0"/></body>
+    </body>
+    <body pos="0.2 0 0"><joint name="rocker"/><geom fromto="0 0 0 0 0 0.12"/><site name="end" pos="0 0 0.12"/></body>
+  </worldbody>
+  <equality><connect site1="tip" site2="end"/></equality>
+  <actuator><position joint="crank" kp="8" kv="0.2" forcerange="-3 3"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def four_bar(tmp_path):
+    path = tmp_path / "four_bar.xml"
+    path.write_text(FOUR_BAR)
+    cfg = cfg_from_model(path)
+    cfg.scene.num_envs = 3
+    env = ManagerBasedRLEnv(cfg)
+    yield env
+    env.close()
+
+
+def test_a_closed_chain_starts_closed_wherever_its_crank_is(four_bar):
+    robot, sim = four_bar.scene["robot"], four_bar.sim
+    for position in (0.31, 0.8, 1.29):
+        robot.write_joint_state_to_sim(
+            torch.tensor([[position], [position - 1e-3], [position]], dtype=torch.double), torch.zeros(3, 1)
+        )
+        assert sim.qpos[:, 0].tolist() == pytest.approx([position, position - 1e-3, position], abs=1e-7)
+        for row in sim.qpos.numpy():
+            assert robot.closed_loops.gap(row)[0] < 1e-8
+
+
+def test_passive_speeds_keep_the_chain_closed(four_bar):
+    robot, sim = four_bar.scene["robot"], four_bar.sim
+    robot.write_joint_state_to_sim(torch.full((3, 1), 0.8), torch.full((3, 1), 2.0))
+    before, speed = sim.qpos[0].numpy().copy(), sim.qvel[0].numpy()
+    assert np.abs(speed[1:]).min() > 0.1
+    assert robot.closed_loops.gap(before + 1e-5 * speed)[0] < 1e-9
+
+
+def test_the_assembly_is_the_one_that_the_model_or_the_configuration_has(four_bar):
+    robot, sim = four_bar.scene["robot"], four_bar.sim
+    robot.write_joint_state_to_sim(torch.full((3, 1), 0.8), torch.zeros(3, 1))
+    own = sim.qpos[0].clone()
+    cfg = four_bar.cfg
+    cfg.scene.robot.init_state.joint_pos = {"crank": 0.8, "coupler": 0.2, "rocker": -2.8}
+    other = ManagerBasedRLEnv(cfg)
+    assert other.scene["robot"].closed_loops.gap(other.sim.qpos[0].numpy())[0] < 1e-8
+    assert (other.sim.qpos[0, 1:] - own[1:]).abs().min() > 0.3
+    other.close()

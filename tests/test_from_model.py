@@ -1,0 +1,191 @@
+"""A configuration from a model file alone."""
+
+import mujoco
+import pytest
+import torch
+
+from pace_envs import ManagerBasedRLEnv
+from pace_envs.from_model import cfg_from_model
+
+ARM = """
+<mujoco model="two link arm">
+  <compiler angle="radian"/>
+  <option gravity="0 0 -3.7"/>
+  <default>
+    <default class="big"><position kp="120" kv="6" forcerange="-60 60"/></default>
+    <geom type="capsule" size="0.02"/>
+  </default>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body name="base" pos="0 0 1"><freejoint/><geom size="0.05" type="sphere"/>
+      <body name="upper"><joint name="arm/shoulder" axis="0 1 0" range="-2 1" armature="0.05" damping="0.4"
+          frictionloss="0.3"/><geom fromto="0 0 0 0.3 0 0"/>
+        <body name="fore" pos="0.3 0 0"><joint name="elbow (left)" axis="0 1 0" actuatorfrcrange="-9 9"/>
+          <geom fromto="0 0 0 0.2 0 0"/>
+          <body name="tool" pos="0.2 0 0"><joint name="rail" type="slide" axis="1 0 0" range="0 0.1"/>
+            <geom fromto="0 0 0 0.1 0 0"/></body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <general name="e" joint="elbow (left)" gear="2" gainprm="0.5" biastype="affine" biasprm="0.2 -10 -1"
+      ctrlrange="0 255"/>
+    <position class="big" name="s" joint="arm/shoulder" ctrlrange="-1.5 0.9"/>
+    <motor name="r" joint="rail" gear="50" ctrlrange="-1 1"/>
+  </actuator>
+  <keyframe><key name="other" qpos="0 0 2 1 0 0 0 0 0 0"/>
+    <key name="home" qpos="0 0 1.5 0.7071067811865476 0.7071067811865476 0 0 -0.7 0.4 0.02"/></keyframe>
+</mujoco>
+"""
+
+
+def cfg_of(tmp_path, text, name="robot.xml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return cfg_from_model(path)
+
+
+def drive_of(cfg):
+    return cfg.scene.robot.actuators["drives"]
+
+
+def made(cfg):
+    cfg.scene.num_envs = 2
+    return ManagerBasedRLEnv(cfg)
+
+
+def test_drives_are_those_of_the_actuators_in_the_joints_own_coordinates(tmp_path):
+    drive = drive_of(cfg := cfg_of(tmp_path, ARM))
+    assert cfg.sim2real.joint_order == ("arm/shoulder", "elbow (left)", "rail")
+    assert drive.stiffness == [120, 40, 0]  # kp G²
+    assert drive.damping == [6, 4, 0]
+    assert drive.effort_limit == [60, 9, 50]  # forcerange, actuatorfrcrange, gear x ctrlrange
+
+
+def test_an_affine_servo_gives_the_force_that_mujoco_computes(tmp_path):
+    cfg = cfg_of(tmp_path, ARM)
+    model = mujoco.MjModel.from_xml_string(ARM)
+    data = mujoco.MjData(model)
+    q, v, u = 0.3, 0.2, 17.0
+    data.joint("elbow (left)").qpos, data.joint("elbow (left)").qvel, data.actuator("e").ctrl = q, v, u
+    mujoco.mj_forward(model, data)
+    target = (0.5 * u + 0.2) / (10 * 2)
+    kp, kd = drive_of(cfg).stiffness[1], drive_of(cfg).damping[1]
+    assert kp * (target - q) - kd * v == pytest.approx(data.joint("elbow (left)").qfrc_actuator[0])
+
+
+def test_gravity_home_and_the_pose_of_the_base_are_the_files(tmp_path):
+    cfg = cfg_of(tmp_path, ARM)
+    assert cfg.sim.gravity == (0, 0, -3.7)
+    env = made(cfg)
+    robot = env.scene["robot"]
+    assert robot.is_fixed_base
+    assert robot.data.default_joint_pos[0].tolist() == [-0.7, 0.4, 0.02]
+    assert env.sim.model.body("base").pos.tolist() == [0, 0, 1.5]
+    assert env.sim.model.body("base").quat.tolist() == pytest.approx([0.5**0.5, 0.5**0.5, 0, 0])
+    assert robot.actuators["drives"].armature[0].tolist() == [0.05, 0, 0]
+    assert robot.actuators["drives"].friction[0].tolist() == [0.3, 0, 0]
+    env.close()
+
+
+def test_bounds_scale_with_each_joints_drive(tmp_path):
+    cfg = cfg_of(tmp_path, ARM)
+    upper = cfg.sim2real.bounds_params[:-1, 1].reshape(4, 3)
+    assert upper[0, 0] >= 10 * 0.05 > upper[0, 1] and upper[2, 0] > 5 * upper[2, 1]
+    assert upper[3].tolist() == pytest.approx([0.1, 0.1, 0.01])
+
+
+def test_the_excitation_stays_within_range_and_command_range(tmp_path):
+    excitation = cfg_of(tmp_path, ARM).sim2real.excitation
+    scale, bias = torch.tensor(excitation.scale), torch.tensor(excitation.bias)
+    low, high = scale * (bias - 1), scale * (bias + 1)
+    assert -1.5 < low[0] < high[0] < 0.9 and bias[0] * scale[0] == pytest.approx(-0.7, abs=0.1)
+    assert 0 < low[2] < high[2] < 0.1
+
+
+URDF = """<robot name="leg">
+  <link name="base"/>
+  <link name="thigh"><inertial><origin xyz="0 0 -0.1"/><mass value="1"/>
+    <inertia ixx="0.006" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.001"/></inertial>
+    <visual><geometry><mesh filename="package://not/there.dae"/></geometry></visual>
+    <collision><geometry><mesh filename="package://not/there.stl"/></geometry></collision></link>
+  <link name="shank"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/>
+    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.0003"/></inertial></link>
+  <link name="foot"/>
+  <link name="toe"><inertial><mass value="0.1"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial></link>
+  <joint name="hip" type="revolute"><parent link="base"/><child link="thigh"/><axis xyz="0 1 0"/>
+    <limit lower="-1.5" upper="1.5" effort="23.7" velocity="30.1"/><dynamics damping="0.1" friction="0.2"/></joint>
+  <joint name="knee" type="revolute"><parent link="thigh"/><child link="shank"/><origin xyz="0 0 -0.2"/>
+    <axis xyz="0 1 0"/><limit lower="-2.5" upper="0" effort="35.5" velocity="20.1"/></joint>
+  <joint name="sole" type="fixed"><parent link="shank"/><child link="foot"/></joint>
+  <joint name="toe" type="revolute"><parent link="foot"/><child link="toe"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="knee" multiplier="-0.5" offset="0.1"/></joint>
+</robot>
+"""
+
+
+def test_limits_and_dynamics_of_a_urdf_are_read_and_its_meshes_are_not_needed(tmp_path):
+    cfg = cfg_of(tmp_path, URDF, "leg.urdf")
+    drive = drive_of(cfg)
+    assert cfg.sim2real.joint_order == ("hip", "knee")  # the toe follows the knee
+    assert drive.effort_limit == [23.7, 35.5] and drive.velocity_limit == [30.1, 20.1]
+    assert any("there.dae" in note for note in cfg.sim2real.notes)
+    assert any(note.startswith("gains:") for note in cfg.sim2real.notes)
+    env = made(cfg)
+    robot = env.scene["robot"]
+    assert robot.data.joint_pos_limits.tolist() == [[-1.5, 1.5], [-2.5, 0]]
+    assert robot.actuators["drives"].viscous_friction[0].tolist() == [0.1, 0]
+    assert robot.actuators["drives"].friction[0].tolist() == [0.2, 0]
+    assert "foot" in robot.body_names  # a load can be bolted to a fixed link
+    knee = float(robot.data.joint_pos[0, 1])
+    assert env.sim.qpos[0, 2] == pytest.approx(0.1 - 0.5 * knee)  # the mimic joint starts where it must be
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("<motor", "<muscle"), "muscle"),
+        (("-10 -1", "10 -1"), "pushes away"),
+        (('axis="0 1 0"', 'axis="0 1'), "cannot read"),
+    ],
+)
+def test_what_no_drive_can_follow_is_refused_in_one_line(tmp_path, change, message):
+    text = ARM.replace(*change)
+    if "muscle" in message:
+        text = text.replace('<muscle name="r" joint="rail" gear="50" ctrlrange="-1 1"/>', '<muscle joint="rail"/>')
+    with pytest.raises(ValueError, match=message):
+        cfg_of(tmp_path, text)
+
+
+XACRO = "http://www.ros.org/wiki/xacro"
+
+
+def test_a_xacro_is_told_apart(tmp_path):
+    with pytest.raises(ValueError, match=r"xacro robot\.xacro\.urdf > robot\.urdf"):
+        cfg_of(tmp_path, f'<robot name="a" xmlns:xacro="{XACRO}"><xacro:arm/></robot>', "robot.xacro.urdf")
+
+
+MISSING_MESH = """
+<mujoco model="m">
+  <asset><mesh name="a" file="gone.stl"/><texture name="t" type="2d" file="gone.png"/><material name="m" texture="t"/>
+  </asset>
+  <worldbody><body><joint name="j" axis="0 1 0"/><inertial pos="0 0 -0.1" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/>
+    <geom name="g" type="mesh" mesh="a" material="m"/><geom type="sphere" size="0.01" material="m"/>
+    <body name="pad"><geom type="mesh" mesh="a"/></body></body></worldbody>
+  <contact><pair geom1="g" geom2="g2"/></contact>
+  <actuator><position joint="j" kp="1"/></actuator>
+</mujoco>
+""".replace('<pair geom1="g" geom2="g2"/>', "")
+
+
+def test_missing_meshes_and_pictures_are_left_out_and_inertias_kept(tmp_path):
+    cfg = cfg_of(tmp_path, MISSING_MESH)
+    assert any("gone.stl" in note for note in cfg.sim2real.notes)
+    assert any("The mass of pad" in note for note in cfg.sim2real.notes)
+    env = made(cfg)
+    assert env.sim.model.body(1).mass[0] == 0.3
+    env.close()
