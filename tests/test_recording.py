@@ -1,7 +1,6 @@
 """Recordings: what is read is what was written, every fault has its message, and the grid does not lie."""
 
 import json
-import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import CONTROL_DT, JOINTS, conform, fields_of, position, recording, says, written
 
 from pace_optim.recording import (
     Drive,
     Load,
     Recording,
-    conform_recording,
     load_recording,
     save_recording,
     validation_start,
@@ -23,25 +22,6 @@ from pace_optim.recording import (
 from pace_optim.recording.resample import hold_on_grid, interpolate_smooth
 
 SHARED = Path(__file__).parents[2] / "shared"
-JOINTS = ("hip", "knee", "ankle")
-CONTROL_DT = 0.0025
-
-
-def position(time, joints=3):
-    """A smooth motion, different for every joint."""
-    return np.stack([0.5 * np.sin(2 * np.pi * (1.0 + j) * time + j) for j in range(joints)], axis=1)
-
-
-def recording(time=None, **changes) -> Recording:
-    time = CONTROL_DT * np.arange(400) if time is None else time
-    base = Recording(
-        name="leg",
-        joint_names=JOINTS,
-        time=time,
-        dof_pos=position(time),
-        des_dof_pos=position(time + 0.01),
-    )
-    return replace(base, **changes)
 
 
 def full_recording() -> Recording:
@@ -57,25 +37,6 @@ def full_recording() -> Recording:
     )
 
 
-def fields_of(**changes) -> dict:
-    time = CONTROL_DT * np.arange(100)
-    fine = {
-        "time": time,
-        "dof_pos": position(time),
-        "des_dof_pos": position(time),
-        "joint_names": list(JOINTS),
-    }
-    return {key: value for key, value in {**fine, **changes}.items() if value is not None}
-
-
-def written(tmp_path, **changes) -> Path:
-    """A .pt file with the given fields changed (None: left out)."""
-    path = tmp_path / "leg.pt"
-    tensors = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in fields_of(**changes).items()}
-    torch.save(tensors, path)
-    return path
-
-
 def assert_same(one, other, ignore=()):
     for field in fields(one):
         if field.name in ignore:
@@ -87,11 +48,6 @@ def assert_same(one, other, ignore=()):
             assert a.dtype == b.dtype and np.array_equal(a, b), field.name
         else:
             assert a == b, field.name
-
-
-def says(*words):
-    """A pattern that finds all the words, in any order, in a message without line breaks."""
-    return r"(?s)\A(?!.*\n)" + "".join(f"(?=.*{re.escape(word)})" for word in words)
 
 
 # Files ------------------------------------------------------------------------------------------------------
@@ -312,10 +268,6 @@ def test_keys_that_are_not_ours_are_noted(tmp_path):
 
 
 # Against the robot ------------------------------------------------------------------------------------------
-
-
-def conform(rec, joint_order=JOINTS, control_dt=CONTROL_DT, **kwargs):
-    return conform_recording(rec, joint_order=joint_order, control_dt=control_dt, **kwargs)
 
 
 LIMITS = np.array([[-1.0, 1.0], [-1.0, 1.0], [-np.inf, np.inf]])

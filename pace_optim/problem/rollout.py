@@ -207,6 +207,7 @@ class Rollout:
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]
         rows = slice(r, None, self.dataset.num_recordings)
+        position, velocity = recording.has_position_command, recording.has_velocity_command
         for actuator in self.robot.actuators.values():
             for name in _DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
@@ -215,6 +216,9 @@ class Rollout:
                     if name == "saturation_effort":
                         own = own.clamp(max=torch.finfo(own.dtype).max)  # infinite: no torque-speed line
                     getattr(actuator, name)[rows] = own
+            for name, loop in (("stiffness", position), ("damping", position | velocity)):  # without a target, no loop
+                gain = getattr(actuator, name)[rows]
+                gain[:, ~torch.as_tensor(loop)[actuator.joint_indices]] = 0.0
         load = {
             key: value
             for key in ("load_mass", "load_length", "arm_mass")

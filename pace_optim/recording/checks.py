@@ -9,7 +9,8 @@ import numpy as np
 
 from .data import Recording
 from .facts import drive_of, joint_names_of, load_of
-from .keys import FACTS, JOINT_SERIES, REQUIRED_SERIES, SERIES, closest, listed
+from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, SERIES, closest, listed
+from .stamps import seconds_of
 
 MIN_SAMPLES = 20
 """Fewer samples than this are not a recording."""
@@ -27,42 +28,51 @@ def check_recording(
         found: What the file calls its fields (a CSV's columns), for messages; default: the keys.
     """
     notes = _check_keys(fields, source, found or tuple(fields))
-    time = _numeric("time", fields["time"], source)
-    if time.ndim != 1:
-        raise ValueError(f"{source}: time has shape {time.shape}; expected (T,). Store time as one column.")
+    time, origin, kind = _stamps("time", fields["time"], source)
+    notes += [f"time holds {kind}: counted from its first sample here."] if kind else []
+    des_time = _command_time(fields.get("des_time"), time, origin, source)
     given = [key for key in JOINT_SERIES if fields.get(key) is not None]
-    series: dict[str, Any] = {key: _joint_series(key, fields[key], len(time), source) for key in given}
-    shape = series["dof_pos"].shape
+    series: dict[str, Any] = {
+        key: _joint_series(
+            key, fields[key], time if des_time is None or key not in COMMAND_SERIES else des_time, source
+        )
+        for key in given
+    }
+    num_joints = series["dof_pos"].shape[1]
     for key, array in series.items():
-        if array.shape != shape:
+        if array.shape[1] != num_joints:
             raise ValueError(
-                f"{source}: {key} has {array.shape[1]} columns but dof_pos has {shape[1]}. "
+                f"{source}: {key} has {array.shape[1]} columns but dof_pos has {num_joints}. "
                 "Give every series one column per joint."
             )
-    joint_names = joint_names_of(fields.get("joint_names"), shape[1], source)
+    joint_names = joint_names_of(fields.get("joint_names"), num_joints, source)
     enable = fields.get("torque_enable")
     torque_enable = None if enable is None else _torque_enable(enable, len(time), source)
-    for key, array in (("time", time), *series.items()):
+    for key, array in series.items():
         _check_finite(key, array, joint_names, source)
     if len(time) < MIN_SAMPLES:
         raise ValueError(
             f"{source}: found {len(time)} samples; expected at least {MIN_SAMPLES}. Record for longer (20 s is usual)."
         )
-    _check_time(time, source)
+    _check_time("time", time, source)
     name = fields.get("name", default_name)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{source}: name is {name!r}; expected text. Correct it or leave it out.")
-    return Recording(
+    recording = Recording(
         name=name,
         joint_names=joint_names,
         time=time,
         **series,
+        des_time=des_time,
         torque_enable=torque_enable,
-        drive=drive_of(fields, joint_names, shape[1], source),
+        time_origin=_origin(fields.get("time_origin"), origin, source),
+        drive=drive_of(fields, joint_names, num_joints, source),
         load=load_of(fields, source),
         notes=tuple(notes),
         source=source,
     )
+    _check_commands(recording)
+    return recording
 
 
 def _check_keys(fields: Mapping[str, Any], source: str, found: Sequence[str]) -> list[str]:
@@ -76,12 +86,16 @@ def _check_keys(fields: Mapping[str, Any], source: str, found: Sequence[str]) ->
                 f"{source}: unknown key '{key}', did you mean '{meant}'? Rename it, or leave it out. "
                 f"Found: {listed(found)}."
             )
-    if missing := [key for key in REQUIRED_SERIES if fields.get(key) is None]:
+    commands = [key for key in COMMAND_SERIES if fields.get(key) is not None]
+    missing = [key for key in ("time", "dof_pos") if fields.get(key) is None] + ([] if commands else ["des_dof_pos"])
+    if missing:
         raise ValueError(
             f"{source}: {listed(missing)} missing; expected time (T,) [s], dof_pos (T, n) and des_dof_pos "
-            "(T, n) [rad]; in a CSV the columns are time, dof_pos/<joint>, des_dof_pos/<joint>. Found: "
-            f"{listed(found)}. Rename or add what is missing."
+            "(T, n) [rad] (or des_dof_vel [rad/s], des_dof_effort [N m]); in a CSV the columns are time, "
+            f"dof_pos/<joint>, des_dof_pos/<joint>. Found: {listed(found)}. Rename or add what is missing."
         )
+    if fields.get("des_time") is not None and not commands:
+        raise ValueError(f"{source}: des_time has no commands to go with it. Add des_dof_pos, or leave it out.")
     return [f"Not used, because no recording has such a key: {listed(ignored)}."] if ignored else []
 
 
@@ -98,19 +112,74 @@ def _numeric(key: str, value: Any, source: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _joint_series(key: str, value: Any, num_samples: int, source: str) -> np.ndarray:
+def _stamps(key: str, value: Any, source: str) -> tuple[np.ndarray, float, str]:
+    """Stamps [s], the clock at zero [s], and what kind of stamps they were."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "UMiuf":
+        array = _numeric(key, value, source)
+    if array.ndim != 1:
+        raise ValueError(f"{source}: {key} has shape {array.shape}; expected (T,). Store {key} as one column.")
+    if array.dtype.kind == "f":
+        _check_finite(key, array, (), source)
+        array = array.astype(np.float64)
+        _check_precision(key, array, source)
+    try:
+        return seconds_of(array)
+    except ValueError as error:
+        raise ValueError(
+            f"{source}: {key} holds text such as '{array[0]}' ({error}); expected seconds, or dates as in "
+            "2026-11-25T10:30:00.125. Correct it."
+        ) from error
+
+
+def _command_time(value: Any, time: np.ndarray, origin: float, source: str) -> np.ndarray | None:
+    """The instants of commands on the clock of `time`, (T',) [s]."""
+    if value is None:
+        return None
+    own, own_origin, _ = _stamps("des_time", value, source)
+    if bool(origin) != bool(own_origin):
+        raise ValueError(
+            f"{source}: des_time is {'Unix time' if own_origin else 'not Unix time'} but time is "
+            f"{'Unix time' if origin else 'not'}. Give both on one clock."
+        )
+    own = own + (own_origin - origin)
+    if not len(own) or own[0] > time[-1] or own[-1] < time[0] - 3600.0:
+        raise ValueError(f"{source}: commands (des_time) and samples (time) do not meet. Give both on one clock [s].")
+    _check_time("des_time", own, source)
+    return own
+
+
+def _origin(value: Any, of_stamps: float, source: str) -> float:
+    """What the clock shows at zero [s], of the fact `time_origin` and of the stamps."""
+    if value is None:
+        return of_stamps
+    if of_stamps:
+        raise ValueError(f"{source}: holds time_origin, but time is Unix time already. Leave time_origin out.")
+    array = np.atleast_1d(np.asarray(value))
+    if array.shape == (1,) and array.dtype.kind in "UM":
+        return _stamps("time_origin", array, source)[1]
+    if array.shape != (1,) or array.dtype.kind not in "iuf" or not np.isfinite(array[0]):
+        raise ValueError(
+            f"{source}: time_origin is {value!r}; expected what the log's clock shows where time is 0 [s], or a date. "
+            "Correct it."
+        )
+    return float(array[0])
+
+
+def _joint_series(key: str, value: Any, time: np.ndarray, source: str) -> np.ndarray:
+    num_samples, stamps = len(time), "des_time" if key in COMMAND_SERIES else "time"
     array = _numeric(key, value, source)
     if array.ndim == 1 and len(array) == num_samples:
         array = array[:, None]  # one joint
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
             f"{source}: {key} has shape {array.shape}; expected (T, n) with T = {num_samples} samples (as in "
-            "time) and one column per joint. Reshape it."
+            f"{stamps}) and one column per joint. Reshape it."
         )
     if len(array) != num_samples:
         cure = "Transpose it." if array.shape[1] == num_samples else "Cut the series to the same length."
         raise ValueError(
-            f"{source}: {key} has shape {array.shape} but time has {num_samples} samples; "
+            f"{source}: {key} has shape {array.shape} but {stamps} has {num_samples} samples; "
             f"expected ({num_samples}, n). {cure}"
         )
     return array
@@ -134,7 +203,12 @@ def _torque_enable(value: Any, num_samples: int, source: str) -> np.ndarray:
 
 
 def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], source: str) -> None:
-    faults = np.argwhere(~np.isfinite(array))
+    finite = np.isfinite(array)
+    if finite.all():
+        return
+    if array.ndim == 2 and key != "dof_pos":
+        finite |= np.isnan(array).all(axis=0)  # joints that have none of it
+    faults = np.argwhere(~finite)
     if not len(faults):
         return
     where = f"at sample {faults[0][0]}"
@@ -146,25 +220,53 @@ def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], sou
     )
 
 
-def _check_time(time: np.ndarray, source: str) -> None:
+def _check_commands(recording: Recording) -> None:
+    """Refuse joints that nothing commands, and a position loop that has no target."""
+    names = recording.joint_names or tuple(f"column {j}" for j in range(recording.num_joints))
+    position = recording.has_position_command
+    commanded = position | recording.has_velocity_command | recording.has_effort_command
+    if not commanded.all():
+        idle = [name for name, flag in zip(names, commanded, strict=True) if not flag]
+        raise ValueError(
+            f"{recording.source}: {listed(idle)}: no command (des_dof_pos, des_dof_vel and des_dof_effort are NaN or "
+            "missing). Add one, or leave the joint out."
+        )
+    stiffness = recording.drive.stiffness
+    if stiffness is not None and np.any(loop := ~position & (stiffness > 0.0)):
+        joint = int(np.argmax(loop))
+        raise ValueError(
+            f"{recording.source}: {names[joint]} has a stiffness of {stiffness[joint]:g} but no des_dof_pos. Add its "
+            "position targets, or state a stiffness of 0."
+        )
+
+
+def _check_precision(key: str, time: np.ndarray, source: str) -> None:
+    step = np.diff(time)
+    if np.any(step <= 0.0) and abs(time[0]) > 1e5 and np.all(time == time.astype(np.float32)):
+        first = int(np.argmax(step <= 0.0)) + 1
+        raise ValueError(
+            f"{source}: {key} does not increase at sample {first} ({time[first - 1]:.9g} s, then {time[first]:.9g} s): "
+            "time stamps this large do not fit in float32. Subtract the first before storing them."
+        )
+
+
+def _check_time(key: str, time: np.ndarray, source: str) -> None:
     step = np.diff(time)
     if np.any(step <= 0.0):
         first = int(np.argmax(step <= 0.0)) + 1
-        precision = ""
-        if abs(time[0]) > 1e5 and np.all(time == time.astype(np.float32)):
-            precision = " Time stamps this large do not fit in float32: subtract the first before storing them."
         raise ValueError(
-            f"{source}: time does not increase at sample {first} ({time[first - 1]:.9g} s, then "
-            f"{time[first]:.9g} s); expected strictly increasing time. Sort the samples and drop repeated "
-            f"ones.{precision}"
+            f"{source}: {key} does not increase at sample {first} ({time[first - 1]:.9g} s, then "
+            f"{time[first]:.9g} s); expected strictly increasing time. Sort the samples and drop repeated ones."
         )
+    if not len(step):
+        return
     median = float(np.median(step))
     for threshold, unit, factor in (
         (5e5, "nanoseconds", 1e9),
         (500.0, "microseconds", 1e6),
         (0.5, "milliseconds", 1e3),
     ):
-        if median >= threshold:
+        if median >= threshold and key == "time":
             raise ValueError(
                 f"{source}: time steps by {median:g}, which looks like {unit}; expected seconds. "
                 f"Divide time by {factor:g}."

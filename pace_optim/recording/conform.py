@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from .checks import MIN_SAMPLES
+from .commands import GRID_COMMANDS, commands_on_grid
 from .data import Drive, Recording
-from .keys import JOINT_SERIES, listed
+from .keys import JOINT_SERIES, MEASURED_SERIES, listed
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base
@@ -31,7 +33,8 @@ def conform_recording(
     2. Check the motion: limits, units, wraps; note what is odd.
     3. Compare the time stamps with the grid of spacing `sample_stride * control_dt`: keep the samples bit for
        bit when they lie on it, else resample them.
-    4. Fill `command` and `command_torque_enable` on the control grid.
+    4. Fill `command`, `command_vel`, `command_effort` and `command_torque_enable` on the control grid. Commands with
+       a clock of their own are held at their true instants; samples before the first of them are left out.
 
     A recording that is already conformed to `control_dt` keeps its samples and commands.
 
@@ -58,13 +61,17 @@ def conform_recording(
     if recording.command is not None:
         _check_conformed(recording, control_dt)
         return recording
+    recording = _from_first_command(recording)
+    origin = recording.start_stamp
     base = fit_time_base(recording.time, control_dt, recording.label)
     on_grid = _kept(recording, base) if base.exact else _resampled(recording, base, control_dt)
+    on_grid |= commands_on_grid(recording, base, control_dt)
     time = base.sample_stride * control_dt * np.arange(base.num_samples)
     return replace(
         recording,
         **on_grid,
         time=time,
+        time_origin=origin,
         sample_stride=base.sample_stride,
         notes=(*recording.notes, *base.notes, *notes),
     )
@@ -77,7 +84,7 @@ def with_columns(recording: Recording, columns: Sequence[int], joint_order: tupl
     def take(array: np.ndarray | None) -> np.ndarray | None:
         return None if array is None else array[..., columns]
 
-    series: dict[str, Any] = {key: take(getattr(recording, key)) for key in (*JOINT_SERIES, "command")}
+    series: dict[str, Any] = {key: take(getattr(recording, key)) for key in (*JOINT_SERIES, *GRID_COMMANDS.values())}
     drive = Drive(**{f.name: take(getattr(recording.drive, f.name)) for f in fields(Drive)})
     return replace(recording, joint_names=joint_order, drive=drive, **series)
 
@@ -91,23 +98,36 @@ def _check_conformed(recording: Recording, control_dt: float) -> None:
         )
 
 
+def _from_first_command(recording: Recording) -> Recording:
+    """The recording from where it is known what is commanded."""
+    first = recording.time[0] if recording.des_time is None else recording.des_time[0]
+    before = int(np.searchsorted(recording.time, first))
+    if not before:
+        return recording
+    if recording.num_samples - before < MIN_SAMPLES:
+        raise ValueError(
+            f"{recording.label}: {before} of {recording.num_samples} samples come before the first command, so too "
+            "few are left. Record the commands from the beginning on."
+        )
+    cut = {key: value[before:] for key in ("time", *MEASURED_SERIES, "torque_enable")
+           if (value := getattr(recording, key)) is not None}  # fmt: skip
+    note = f"The first {recording.time[before] - recording.time[0]:.4g} s were left out: no command is known there."
+    return replace(recording, **cut, notes=(*recording.notes, note))
+
+
 def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:
-    """The samples as they are; commands repeated over the control steps of a sample."""
-    stride, count = base.sample_stride, (base.num_samples - 1) * base.sample_stride + 1
+    """The samples as they are; whether the drive is on repeated over the control steps of a sample."""
+    stride, count = base.sample_stride, base.num_steps
     enable = recording.torque_enable
-    return {
-        "command": np.repeat(recording.des_dof_pos, stride, axis=0)[:count],
-        "command_torque_enable": None if enable is None else np.repeat(enable, stride)[:count],
-    }
+    return {"command_torque_enable": None if enable is None else np.repeat(enable, stride)[:count]}
 
 
 def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
-    """The samples on the grid; what was commanded at a sample is what the control has there."""
-    stride, count = base.sample_stride, (base.num_samples - 1) * base.sample_stride + 1
+    """The samples on the grid."""
+    stride, count = base.sample_stride, base.num_steps
     stamps = recording.time - recording.time[0]
     at = np.minimum(stride * control_dt * np.arange(base.num_samples), stamps[-1])
-    command = hold_on_grid(stamps, recording.des_dof_pos, control_dt, count)
-    result: dict[str, Any] = {"command": command, "des_dof_pos": command[::stride]}
+    result: dict[str, Any] = {}
     for key, interpolate in (
         ("dof_pos", interpolate_smooth),
         ("dof_vel", interpolate_smooth),

@@ -1,17 +1,24 @@
-"""The CSV form of a recording: columns `time`, `torque_enable`, and `<series>/<joint>`."""
+"""The CSV form of a recording: columns `time`, `torque_enable`, and `<series>/<joint>`.
+
+Commands with a clock of their own have a column `des_time`; whichever clock has fewer rows leaves the last cells empty.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import itertools
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from .keys import JOINT_SERIES, listed
+from .keys import COMMAND_SERIES, JOINT_SERIES, listed
 
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
+_WHOLE = re.compile(r"\d{13,19}$")
 _WORDS = {"true": 1.0, "false": 0.0}
 
 
@@ -26,14 +33,22 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         columns.setdefault(series, {})[joint] = index
     joints = list(columns.get("dof_pos", {}))
     fields: dict[str, Any] = {}
+    two_clocks = "des_time" in columns
     for series, index_of in columns.items():
-        if series in ("time", "torque_enable"):
+        clock = "des_time" if two_clocks and series in ("des_time", *COMMAND_SERIES) else "time"
+        own = rows[: _length(rows, list(columns.get(clock, {}).values()))] if two_clocks else rows
+        if series in ("time", "des_time"):
+            fields[series] = _stamps(path, series, own, next(iter(index_of.values())))
+        elif series == "torque_enable":
             indices = list(index_of.values())
-            values = np.stack([_numbers(path, header[i], rows, i) for i in indices], axis=1)
+            values = np.stack([_numbers(path, header[i], own, i) for i in indices], axis=1)
             fields[series] = values[:, 0] if len(indices) == 1 else values
         elif series in JOINT_SERIES and joints:
             _check_joints(path, series, list(index_of), joints, header)
-            fields[series] = np.stack([_numbers(path, f"{series}/{j}", rows, index_of[j]) for j in joints], axis=1)
+            none = np.full(len(own), np.nan)
+            fields[series] = np.stack(
+                [_numbers(path, f"{series}/{j}", own, index_of[j]) if j in index_of else none for j in joints], axis=1
+            )
         else:
             fields[series] = ()  # the check of the keys says what becomes of it
     if joints:
@@ -51,13 +66,15 @@ def write_csv(file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tu
         if values.ndim == 1:
             header.append(key)
             columns.append((values.astype(int) if values.dtype == bool else values).tolist())
-        else:
-            header += [f"{key}/{joint}" for joint in joints]
-            columns += values.T.tolist()
+            continue
+        for joint, column in zip(joints, values.T, strict=True):
+            if not np.isnan(column).all():
+                header.append(f"{key}/{joint}")
+                columns.append(column.tolist())
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerows(itertools.zip_longest(*columns, fillvalue=""))
     text.flush()
     text.detach()
 
@@ -91,11 +108,30 @@ def _check_joints(path: Path, series: str, found: list[str], joints: list[str], 
             f"{path}: the column '{series}' names no joint; expected '{series}/<joint>'. Rename it. "
             f"Columns found: {listed(header)}."
         )
-    if joints and set(found) != set(joints):
+    if not set(found) <= set(joints):
         raise ValueError(
             f"{path}: {series} has the joints {listed(found)} but dof_pos has {listed(joints)}. "
-            f"Give every series the same joints. Columns found: {listed(header)}."
+            f"Give every series the same joints (or leave out those without). Columns found: {listed(header)}."
         )
+
+
+def _length(rows: list[list[str]], indices: list[int]) -> int:
+    """Rows up to the last that has a value in one of the columns."""
+    count = len(rows)
+    while count and not any(rows[count - 1][i].strip() for i in indices):
+        count -= 1
+    return count
+
+
+def _stamps(path: Path, column: str, rows: list[list[str]], index: int) -> np.ndarray:
+    """Stamps as numbers, whole numbers exactly; as text where they are dates."""
+    cells = [row[index].strip() for row in rows]
+    if cells and (_DATE.match(cells[0]) or _WHOLE.match(cells[0])):
+        try:
+            return np.array(cells) if _DATE.match(cells[0]) else np.array([int(cell) for cell in cells])
+        except (ValueError, OverflowError):  # told below
+            pass
+    return _numbers(path, column, rows, index)
 
 
 def _numbers(path: Path, column: str, rows: list[list[str]], index: int) -> np.ndarray:

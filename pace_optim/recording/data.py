@@ -42,9 +42,10 @@ class Load:
 class Recording:
     """One recording of n joints over T samples.
 
-    `dof_pos[k]` is measured at `time[k]`, the instant at which `des_dof_pos[k]` is issued. A target holds
-    until the next sample. `load_recording` gives a recording as its file has it; `conform_recording` puts it
-    on a simulation's grid and fills `command`.
+    `dof_pos[k]` is measured at `time[k]`. What is commanded (`des_...`: at least one of the three) is issued at the
+    same instants, or at those of `des_time`, and holds until the next, as drives hold it. In every series but `dof_pos`
+    a column of NaN says that the joint has none. `load_recording` gives a recording as its file has it;
+    `conform_recording` puts it on a simulation's grid and fills `command`, `command_vel` and `command_effort`.
     """
 
     name: str
@@ -55,14 +56,22 @@ class Recording:
     """Instants, (T,) [s]; starts at 0 once conformed."""
     dof_pos: np.ndarray
     """Encoder positions, (T, n) [rad]."""
-    des_dof_pos: np.ndarray
-    """Commanded positions, (T, n) [rad]."""
+    des_dof_pos: np.ndarray | None = None
+    """Commanded positions, (T, n) or (T', n) [rad]."""
+    des_dof_vel: np.ndarray | None = None
+    """Commanded speeds, (T, n) or (T', n) [rad/s]."""
+    des_dof_effort: np.ndarray | None = None
+    """Commanded torques (feed-forward, or all there is), (T, n) or (T', n) [N m]."""
+    des_time: np.ndarray | None = None
+    """Instants of the commands on the clock of `time`, (T',) [s]; None: those of `time`."""
     dof_vel: np.ndarray | None = None
     """Measured speeds, (T, n) [rad/s]."""
     dof_effort: np.ndarray | None = None
-    """Measured torques, (T, n) [N m]."""
+    """Torques that the drive measures or asks for, (T, n) [N m]."""
     torque_enable: np.ndarray | None = None
     """False where the drive gives no torque, (T,) bool."""
+    time_origin: float = 0.0
+    """What the log's own clock showed at `time` = 0 [s]: Unix time where the log has it."""
     drive: Drive = field(default_factory=Drive)
     """The drive in force."""
     load: Load = field(default_factory=Load)
@@ -72,8 +81,12 @@ class Recording:
     command: np.ndarray | None = None
     """Commanded positions on the control grid, ((T - 1) * sample_stride + 1, n) [rad]; None until conformed.
 
-    `command[::sample_stride]` is `des_dof_pos`.
+    A joint without position commands (see `has_position_command`) keeps its first position here.
     """
+    command_vel: np.ndarray | None = None
+    """Commanded speeds on the control grid [rad/s], zero for joints that have none; None where no joint has any."""
+    command_effort: np.ndarray | None = None
+    """Commanded torques on the control grid [N m], zero for joints that have none; None where no joint has any."""
     command_torque_enable: np.ndarray | None = None
     """`torque_enable` on the control grid, or None."""
     notes: tuple[str, ...] = ()
@@ -97,6 +110,33 @@ class Recording:
         return float(self.time[-1] - self.time[0])
 
     @property
+    def start_stamp(self) -> float:
+        """What the log's own clock showed at the first sample [s]: Unix time where the log has it."""
+        return self.time_origin + float(self.time[0])
+
+    @property
+    def has_position_command(self) -> np.ndarray:
+        """Which joints have position commands, (n,) bool; the others have no position loop."""
+        return _has_values(self.des_dof_pos, self.num_joints)
+
+    @property
+    def has_velocity_command(self) -> np.ndarray:
+        """Which joints have velocity commands, (n,) bool."""
+        return _has_values(self.des_dof_vel, self.num_joints)
+
+    @property
+    def has_effort_command(self) -> np.ndarray:
+        """Which joints have torque commands, (n,) bool."""
+        return _has_values(self.des_dof_effort, self.num_joints)
+
+    @property
+    def sampled_command(self) -> np.ndarray:
+        """`command` at the samples, (T, n) [rad]."""
+        if self.command is None:
+            raise ValueError(f"{self.label}: not on the control grid. Call conform_recording first.")
+        return self.command[:: self.sample_stride]
+
+    @property
     def label(self) -> str:
         """How messages call this recording: its path, or its name when it came from no file."""
         return self.source or self.name
@@ -115,3 +155,7 @@ def validation_start(recording: Recording, fraction: float = 0.7) -> int:
             "Use 0.7 to validate on the last 30 %."
         )
     return min(max(round(fraction * recording.num_samples), 1), recording.num_samples - 1)
+
+
+def _has_values(series: np.ndarray | None, num_joints: int) -> np.ndarray:
+    return np.zeros(num_joints, dtype=bool) if series is None else ~np.isnan(series).all(axis=0)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pace_optim.recording import Recording, validation_start, with_columns
+from pace_optim.recording.sessions import session_starts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,7 +22,11 @@ class Dataset:
     recordings: tuple[Recording, ...]
     """The recordings, conformed."""
     command: torch.Tensor
-    """Position targets, (T, R, n) [rad]."""
+    """Position targets, (T, R, n) [rad]; for joints without, their first position (they have no position loop)."""
+    command_vel: torch.Tensor | None
+    """Velocity targets, (T, R, n) [rad/s], zero for joints without; ``None`` where there are none at all."""
+    command_effort: torch.Tensor | None
+    """Torques commanded, (T, R, n) [N m], zero for joints without; ``None`` where there are none at all."""
     measured: torch.Tensor
     """Encoder positions, (T, R, n) [rad]; zero where there is no sample."""
     measured_vel: torch.Tensor
@@ -35,7 +40,8 @@ class Dataset:
     validation_only: tuple[bool, ...]
     """For each recording, whether none of it is trained on."""
     session_start: torch.Tensor
-    """When each recording began, as if they had been made one after another in this order, (R,) [s]."""
+    """When each recording began since the first of its session, (R,) [s]: by time stamps where all have them, else as
+    if they had been made one after another in this order."""
     start_time: torch.Tensor
     """When its first sample was taken, since the recording began, (R,) [s]; not zero of a window."""
     start_vel: torch.Tensor
@@ -57,6 +63,8 @@ class Dataset:
         return Dataset(
             recordings=tuple(self.recordings[r] for r in chosen),
             command=self.command[:, chosen],
+            command_vel=None if self.command_vel is None else self.command_vel[:, chosen],
+            command_effort=None if self.command_effort is None else self.command_effort[:, chosen],
             measured=self.measured[:, chosen],
             measured_vel=self.measured_vel[:, chosen],
             sampled=self.sampled[:, chosen],
@@ -76,6 +84,8 @@ class Dataset:
             self,
             recordings=tuple(with_columns(recording, chosen, names) for recording in self.recordings),
             command=self.command[..., chosen],
+            command_vel=None if self.command_vel is None else self.command_vel[..., chosen],
+            command_effort=None if self.command_effort is None else self.command_effort[..., chosen],
             measured=self.measured[..., chosen],
             measured_vel=self.measured_vel[..., chosen],
             start_vel=self.start_vel[..., chosen],
@@ -120,6 +130,8 @@ def make_dataset(
     every = (*recordings, *validation)
     if not recordings:
         raise ValueError("There is no recording to train on. Name at least one with --data.")
+    session_start, notes = session_starts(every)
+    every = tuple(replace(r, notes=(*r.notes, note)) if note else r for r, note in zip(every, notes, strict=True))
     steps, n = max(len(_command(r)) for r in every), every[0].num_joints
     shape = (steps, len(every))
     command = torch.zeros(*shape, n, dtype=torch.float64)
@@ -127,18 +139,13 @@ def make_dataset(
     sampled, train = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
     enable = torch.ones(shape, dtype=torch.bool)
     for r, recording in enumerate(every):
-        held = torch.as_tensor(_command(recording))
-        command[: len(held), r], command[len(held) :, r] = held, held[-1]
+        _hold(command[:, r], _command(recording))
         at = torch.arange(recording.num_samples) * recording.sample_stride
         measured[at, r] = torch.as_tensor(recording.dof_pos)
-        speed = recording.dof_vel
-        if speed is None:
-            speed = np.gradient(recording.dof_pos, recording.time, axis=0)
-        measured_vel[at, r] = torch.as_tensor(speed)
+        measured_vel[at, r] = torch.as_tensor(_speed(recording))
         sampled[at, r] = True
         if recording.command_torque_enable is not None:
-            flags = torch.as_tensor(recording.command_torque_enable)
-            enable[: len(flags), r], enable[len(flags) :, r] = flags, flags[-1]
+            _hold(enable[:, r], recording.command_torque_enable)
         if r < len(recordings):
             whole = bool(validation) or train_fraction >= 1
             end = recording.num_samples if whole else validation_start(recording, train_fraction)
@@ -146,16 +153,51 @@ def make_dataset(
     return Dataset(
         recordings=every,
         command=command,
+        command_vel=_further([r.command_vel for r in every], command),
+        command_effort=_further([r.command_effort for r in every], command),
         measured=measured,
         measured_vel=measured_vel,
         sampled=sampled,
         train=train,
         torque_enable=None if bool(enable.all()) else enable,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
-        session_start=torch.tensor([0.0, *(r.duration for r in every[:-1])], dtype=torch.float64).cumsum(0),
+        session_start=torch.as_tensor(session_start),
         start_time=torch.zeros(len(every), dtype=torch.float64),
-        start_vel=torch.stack([v * (r.dof_vel is not None) for v, r in zip(measured_vel[0], every, strict=True)]),
+        start_vel=torch.stack([_start_vel(v, r) for v, r in zip(measured_vel[0], every, strict=True)]),
     )
+
+
+def _further(commands: Sequence[np.ndarray | None], position: torch.Tensor) -> torch.Tensor | None:
+    """Commands beside those of position, laid out like these; zero where a recording has none."""
+    if all(each is None for each in commands):
+        return None
+    result = torch.zeros_like(position)
+    for r, each in enumerate(commands):
+        if each is not None:
+            _hold(result[:, r], each)
+    return result
+
+
+def _hold(row: torch.Tensor, values: np.ndarray) -> None:
+    """Fill a row over time, and hold the last value to its end."""
+    row[: len(values)], row[len(values) :] = torch.as_tensor(values), torch.as_tensor(values[-1])
+
+
+def _speed(recording: Recording) -> np.ndarray:
+    """Speeds as recorded, by differences where they were not, (T, n) [rad/s]."""
+    if recording.dof_vel is not None and not np.isnan(recording.dof_vel).any():
+        return recording.dof_vel
+    difference = np.gradient(recording.dof_pos, recording.time, axis=0)
+    return (
+        difference
+        if recording.dof_vel is None
+        else np.where(np.isnan(recording.dof_vel), difference, recording.dof_vel)
+    )
+
+
+def _start_vel(speed: torch.Tensor, recording: Recording) -> torch.Tensor:
+    recorded = np.zeros(recording.num_joints) if recording.dof_vel is None else ~np.isnan(recording.dof_vel[0])
+    return speed * torch.as_tensor(recorded)
 
 
 def _command(recording: Recording) -> np.ndarray:

@@ -95,6 +95,8 @@ def _suffix(path: Path) -> str:
 def _facts_of(recording: Recording) -> dict[str, Any]:
     """The facts as plain numbers, text, lists and dicts; what is unknown is left out."""
     facts: dict[str, Any] = {"name": recording.name}
+    if recording.time_origin:
+        facts["time_origin"] = recording.time_origin
     if recording.joint_names:
         facts["joint_names"] = list(recording.joint_names)
     for key in DRIVE_FACTS:

@@ -5,17 +5,25 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-REQUIRED_SERIES = ("time", "dof_pos", "des_dof_pos")
-JOINT_SERIES = ("dof_pos", "des_dof_pos", "dof_vel", "dof_effort")
-SERIES = ("time", *JOINT_SERIES, "torque_enable")
+COMMAND_SERIES = ("des_dof_pos", "des_dof_vel", "des_dof_effort")
+"""What a drive may be told; at least one of them is in every recording."""
+MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
+JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort")
+SERIES = ("time", *JOINT_SERIES, "torque_enable", "des_time")
+UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
+UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
+"""Unit of each series of joints."""
 DRIVE_FACTS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
-FACTS = ("name", "joint_names", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "comment")
+FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "comment")
 
 _OTHER_WORDS = {
     "time": ("t", "timestamp", "timestamps", "stamp"),
     "dof_pos": ("q", "pos", "position", "positions", "joint_pos", "joint_position", "dof_position"),
     "des_dof_pos": ("q_des", "target", "targets", "goal_position", "command", "cmd", "joint_pos_target"),
+    "des_dof_vel": ("qd_des", "dq_des", "vel_des", "target_velocity", "joint_vel_target"),
+    "des_dof_effort": ("tau_ff", "tau_des", "feed_forward", "feedforward", "target_torque", "joint_effort_target"),
+    "des_time": ("command_time", "target_time", "t_des"),
     "dof_vel": ("qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity", "speed"),
     "dof_effort": ("tau", "effort", "torque", "torques", "joint_effort", "joint_torque"),
     "torque_enable": ("enable", "enabled", "torque_enabled", "torque_on"),

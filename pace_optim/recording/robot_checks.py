@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from .data import Recording
-from .keys import did_you_mean, listed
+from .keys import COMMAND_SERIES, did_you_mean, listed
 
 _STILL = 2e-3  # [rad]
 _FAR = 0.5  # [rad]
@@ -63,7 +63,8 @@ def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: 
     if limits is not None:
         notes += _check_limits(recording, np.asarray(limits, dtype=np.float64), limit_margin)
     names = recording.joint_names
-    position, target = recording.dof_pos, recording.des_dof_pos
+    position, commanded = recording.dof_pos, recording.has_position_command
+    target = np.where(commanded, position[:1] if recording.des_dof_pos is None else recording.des_dof_pos, position[:1])
     if turning := _those(names, np.abs(position).max(axis=0) > 8.0 * np.pi):
         notes.append(f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}")
     if still := _those(names, np.ptp(position, axis=0) < _STILL):
@@ -71,7 +72,7 @@ def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: 
             f"{listed(still)}: moves less than {_STILL * 1e3:g} mrad, so its parameters cannot be found from "
             "this recording."
         )
-    if uncommanded := _those(names, (np.ptp(target, axis=0) == 0.0) & (np.ptp(position, axis=0) >= _STILL)):
+    if uncommanded := _those(names, commanded & _still_commanded(recording) & (np.ptp(position, axis=0) >= _STILL)):
         notes.append(f"{listed(uncommanded)}: moves although its command never changes.")
     if far := _those(names, np.abs(position[0] - target[0]) > _FAR):
         notes.append(
@@ -104,10 +105,11 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> li
     excess = {
         key: np.maximum(limits[:, 0] - values.min(axis=0), values.max(axis=0) - limits[:, 1])
         for key, values in (("dof_pos", recording.dof_pos), ("des_dof_pos", recording.des_dof_pos))
+        if values is not None
     }
     for key, allowed in (("dof_pos", margin), ("des_dof_pos", 2.0 * np.pi)):
-        if np.any(excess[key] > allowed):
-            joint = int(np.argmax(excess[key]))
+        if key in excess and np.any(excess[key] > allowed):
+            joint = int(np.nanargmax(excess[key]))
             values = getattr(recording, key)[:, joint]
             cure = "Check the column order, the signs and the zero, or the model's limits."
             if np.abs(values).max() > 2.0 * np.pi:
@@ -117,9 +119,18 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> li
                 f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} rad, the joint's limits (and at "
                 f"most {allowed:.3g} beyond). {cure}"
             )
-    if beyond := _those(names, excess["des_dof_pos"] > 0.0):
-        return [f"{listed(beyond)}: commanded beyond the joint limits, by {excess['des_dof_pos'].max():.3f} rad."]
+    if "des_dof_pos" in excess and (beyond := _those(names, excess["des_dof_pos"] > 0.0)):
+        return [f"{listed(beyond)}: commanded beyond the joint limits, by {np.nanmax(excess['des_dof_pos']):.3f} rad."]
     return []
+
+
+def _still_commanded(recording: Recording) -> np.ndarray:
+    """Which joints are told the same all the time, (n,) bool."""
+    still = np.ones(recording.num_joints, dtype=bool)
+    for key in COMMAND_SERIES:
+        if (values := getattr(recording, key)) is not None:
+            still &= ~(np.ptp(values, axis=0) > 0.0)
+    return still
 
 
 def _those(names: Sequence[str], where: np.ndarray) -> list[str]:

@@ -30,6 +30,11 @@ class TimeBase:
     notes: tuple[str, ...]
     """Rate, jitter, gaps, and what follows from them."""
 
+    @property
+    def num_steps(self) -> int:
+        """Control steps up to and including the last sample."""
+        return (self.num_samples - 1) * self.sample_stride + 1
+
 
 def fit_time_base(time: np.ndarray, control_dt: float, source: str) -> TimeBase:
     """Compare time stamps with the control grid.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from pace_optim.recording.dataset import Dataset
@@ -64,6 +65,8 @@ class Windows:
             dataset,
             recordings=tuple(dataset.recordings[r] for r in recording),
             command=dataset.command[at],
+            command_vel=None if dataset.command_vel is None else dataset.command_vel[at],
+            command_effort=None if dataset.command_effort is None else dataset.command_effort[at],
             measured=dataset.measured[at],
             measured_vel=dataset.measured_vel[at],
             sampled=self.mask(dataset.sampled),
@@ -103,7 +106,7 @@ def _speed(dataset: Dataset, r: int, step: int, control_dt: float) -> torch.Tens
     """Speed of a recording at a sample, (n,) [rad/s]."""
     if step == 0:
         return dataset.start_vel[r]
-    if dataset.recordings[r].dof_vel is not None:
+    if (recorded := dataset.recordings[r].dof_vel) is not None and not np.isnan(recorded).any():
         return dataset.measured_vel[step, r]
     samples = dataset.sampled[:, r].nonzero()[:, 0]
     place = int((samples == step).nonzero())

@@ -84,7 +84,7 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
             {
                 "name": recording.name,
                 "time": torch.as_tensor(recording.time)[: len(measured)],
-                "des_dof_pos": torch.as_tensor(recording.des_dof_pos)[: len(measured)],
+                "des_dof_pos": torch.as_tensor(recording.sampled_command)[: len(measured)],
                 "dof_pos": measured,
                 "sim_dof_pos": measured + residuals.error[0, at, r],
                 "train": data.train[residuals.step][at, r],

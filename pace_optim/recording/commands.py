@@ -1,0 +1,43 @@
+"""What was commanded, on the control grid: held from each instant to the next, as drives hold it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .data import Recording
+from .keys import COMMAND_SERIES
+from .resample import hold_on_grid
+from .time_base import TimeBase
+
+GRID_COMMANDS = {"des_dof_pos": "command", "des_dof_vel": "command_vel", "des_dof_effort": "command_effort"}
+"""The field of a conformed recording that holds each command on the control grid."""
+
+
+def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
+    """The commands of a recording on the control grid, and as its own series.
+
+    Args:
+        recording: Before its samples were put on the grid; no sample comes before its first command.
+        base: How they are put there.
+        control_dt: Control step [s].
+    """
+    stride, count = base.sample_stride, base.num_steps
+    result: dict[str, Any] = {"command": np.repeat(recording.dof_pos[:1], count, axis=0)}
+    instants = (recording.time if recording.des_time is None else recording.des_time) - recording.time[0]
+    if base.exact:  # the grid has the clock's drift
+        instants = instants * ((base.num_samples - 1) * stride * control_dt / recording.duration)
+    for key in COMMAND_SERIES:
+        if (values := getattr(recording, key)) is None:
+            continue
+        if recording.des_time is None and base.exact:
+            held = np.repeat(values, stride, axis=0)[:count]
+        else:
+            held = hold_on_grid(instants, values, control_dt, count)
+        none = np.isnan(values).all(axis=0)
+        result[key] = held if recording.des_time is not None else held[::stride]
+        result[GRID_COMMANDS[key]] = np.where(none, result["command"] if key == "des_dof_pos" else 0.0, held)
+    if recording.des_time is not None:
+        result["des_time"] = control_dt * np.arange(count)
+    return result
