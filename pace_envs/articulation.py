@@ -50,21 +50,23 @@ class Articulation:
         """
         self.cfg = cfg
         self._sim = sim
-        layout = JointLayout.of_model(sim.model, cfg.joint_order, cfg.mjcf_path)
+        layout = JointLayout.of_model(sim.model, cfg.joint_order, cfg.mjcf_path, sim.device)
         self._layout, self.joint_names, self.dof_columns = layout, list(layout.joint_names), layout.dof_columns
         self._body_ids = list(range(1, sim.model.nbody))
         self.body_names = [sim.model.body(i).name for i in self._body_ids]
-        n, device = self.num_joints, sim.device
+        n, device, dtype = self.num_joints, sim.device, sim.dtype
         init = cfg.init_state
-        limits = torch.full((n, 2), torch.inf, dtype=torch.float64, device=device)
+        limits = torch.full((n, 2), torch.inf, dtype=dtype, device=device)
         limits[:, 0] = -torch.inf
         for i, name in enumerate(self.joint_names):
             if sim.model.joint(name).limited[0]:
-                limits[i] = torch.as_tensor(sim.model.joint(name).range)
+                limits[i] = sim.tensor(sim.model.joint(name).range)
         middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
-        zeros = torch.zeros(sim.num_envs, n, dtype=torch.float64, device=device)
+        zeros = torch.zeros(sim.num_envs, n, dtype=dtype, device=device)
         default_pos, self._passive_pos = self._initial_positions()
-        default_vel = resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
+        default_vel = sim.tensor(
+            resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
+        )
         self.data = ArticulationData(
             joint_pos=sim.qpos[:, self._layout.qpos_view] if self._layout.side_by_side else zeros.clone(),
             joint_vel=sim.qvel[:, self._layout.dof_view] if self._layout.side_by_side else zeros.clone(),
@@ -85,7 +87,9 @@ class Articulation:
             )
         self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
         self._link_model: LinkModel | None = None
-        self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=torch.float64)
+        self._columns: dict[PaceDCMotor, torch.Tensor] = {}
+        self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=dtype, device=device)
+        self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
         self._build_actuators()
         self.reset()
 
@@ -130,13 +134,9 @@ class Articulation:
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put all or some environments' robots back to their initial state and clear their drives."""
-        rows = slice(None) if env_ids is None else torch.as_tensor(self._sim.resolve_env_ids(env_ids)).long()
-        init = self.cfg.init_state
+        rows = self._sim.rows(env_ids)
         if self._layout.root is not None:
-            self.write_root_state_to_sim(
-                torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64),
-                env_ids,
-            )
+            self.write_root_state_to_sim(self._initial_root, env_ids)
         if len(self._layout.passive_names):
             assign(self._sim.qpos, rows, self._layout.passive_columns, self._passive_pos)
         self.write_joint_state_to_sim(
@@ -208,10 +208,8 @@ class Articulation:
     def add_body_mass(self, name_keys: str | Sequence[str], mass: float, env_ids: EnvIds = None) -> None:
         """Add a known mass to bodies, at their centres of mass [kg]; effects on the model do not scale it."""
         rows, (ids, _) = indices(env_ids), self.find_bodies(name_keys)
-        assign(self._added_mass, rows, torch.tensor(ids), self._added_mass[rows][:, ids] + mass)
-        assign(
-            self._sim.expand("body_mass"), rows, torch.tensor(ids), self._sim.expand("body_mass")[rows][:, ids] + mass
-        )
+        for field in (self._added_mass, self._sim.expand("body_mass")):
+            assign(field, rows, torch.tensor(ids, device=field.device), field[rows][:, ids] + mass)
         self._sim.constants_changed()
 
     def set_joint_position_target(
@@ -322,7 +320,7 @@ class Articulation:
             ValueError: If no drive has the effect, or it has no such parameter.
         """
         wanted = list(range(self.num_joints)) if joint_ids is None else list(joint_ids)
-        values = values.expand(-1, len(wanted))
+        values = self._sim.tensor(values).expand(-1, len(wanted))
         found = False
         for actuator in self.actuators.values():
             if actuator.effects is None or effect not in [e.name for e in actuator.effects.effects]:
@@ -333,7 +331,8 @@ class Articulation:
             pairs = [(own.index(j), k) for k, j in enumerate(wanted) if j in own]
             if pairs:
                 local, chosen = zip(*pairs, strict=True)
-                here.set_parameter(parameter, values[here.rows][:, list(chosen)], joints=torch.tensor(local))
+                joints = torch.tensor(local, device=self._sim.device)
+                here.set_parameter(parameter, values[here.rows][:, list(chosen)], joints=joints)
             self._write_passive(actuator)
             if here.overrides("write_model"):
                 self._write_model(actuator, here)
@@ -359,9 +358,9 @@ class Articulation:
         value, layout = self.cfg.init_state.joint_pos, self._layout
         if not isinstance(value, Mapping):
             own = resolve_joint_values(value, self.joint_names, field="init_state.joint_pos", default=0.0)
-            return own, torch.as_tensor(self._sim.model.qpos0)[layout.passive_columns]
+            return self._sim.tensor(own), self._sim.tensor(self._sim.model.qpos0)[layout.passive_columns]
         names = [*self.joint_names, *layout.passive_names]
-        every = resolve_joint_values(value, names, field="init_state.joint_pos", default=0.0)
+        every = self._sim.tensor(resolve_joint_values(value, names, field="init_state.joint_pos", default=0.0))
         return every[: self.num_joints], every[self.num_joints :]
 
     def _joint_list(self, actuator: PaceDCMotor) -> list[int]:
@@ -369,7 +368,9 @@ class Articulation:
         return list(range(self.num_joints)) if isinstance(ids, slice) else torch.as_tensor(ids).tolist()
 
     def _columns_of(self, actuator: PaceDCMotor) -> torch.Tensor:
-        return self._layout.dof_columns[actuator.joint_indices]
+        if actuator not in self._columns:
+            self._columns[actuator] = self._layout.dof_columns[actuator.joint_indices]
+        return self._columns[actuator]
 
     def _place_of(self, actuator: PaceDCMotor) -> torch.Tensor | slice:
         """Its columns in the model's arrays; a slice, which is faster, where it drives all joints side by side."""
@@ -414,7 +415,7 @@ class Articulation:
             "friction": "dof_frictionloss",
         }
         model_values = {
-            key: torch.as_tensor(getattr(self._sim.model, field))[self._layout.dof_columns]
+            key: self._sim.tensor(getattr(self._sim.model, field))[self._layout.dof_columns]
             for key, field in columns.items()
         }
         self.actuators: dict[str, PaceDCMotor] = {}
@@ -428,7 +429,7 @@ class Articulation:
                         "Make their joint_names_expr exclusive."
                     )
                 owner[name] = group
-            joint_ids = slice(None) if ids == list(range(n)) else torch.tensor(ids)
+            joint_ids = slice(None) if ids == list(range(n)) else torch.tensor(ids, device=self._sim.device)
             self.actuators[group] = (cfg.class_type or PaceDCMotor)(
                 cfg,
                 names,
@@ -436,7 +437,7 @@ class Articulation:
                 self.num_envs,
                 self._sim.device,
                 physics_dt=self._sim.cfg.dt,
-                dtype=torch.float64,
+                dtype=self._sim.dtype,
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
@@ -456,7 +457,7 @@ class Articulation:
     def _write_parameter(
         self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
     ) -> None:
-        tensor = torch.as_tensor(value, dtype=torch.float64)
+        tensor = self._sim.tensor(value)
         bad = ~((tensor >= 0) & tensor.isfinite())
         if bool(bad.any()):
             raise ValueError(f"{name} is {tensor[bad][0].item():g}, expected a finite number >= 0.")

@@ -9,7 +9,7 @@ from pace_envs.quaternions import down, rotate_inverse
 
 @dataclass(kw_only=True)
 class ArticulationData:
-    """State, targets and defaults; joints in the articulation's ``joint_names`` order, all float64.
+    """State, targets and defaults; joints in the articulation's ``joint_names`` order, of the simulation's type.
 
     Tensors of the state may share memory with the simulation: clone them to keep them.
     """

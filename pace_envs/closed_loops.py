@@ -68,7 +68,7 @@ class ClosedLoops:
         Returns:
             Both, with new passive parts.
         """
-        postures, speeds = qpos.numpy().copy(), qvel.numpy().copy()
+        postures, speeds = qpos.double().cpu().numpy().copy(), qvel.double().cpu().numpy().copy()
         last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         for row in range(len(postures)):
             if last is not None and np.array_equal(postures[row], last[0]) and np.array_equal(speeds[row], last[1]):
@@ -80,7 +80,7 @@ class ClosedLoops:
             own = speeds[row].copy()
             own[self.passive] = 0.0
             speeds[row][self.passive] = -np.linalg.lstsq(jacobian[:, self.passive], jacobian @ own, rcond=1e-9)[0]
-        return torch.from_numpy(postures), torch.from_numpy(speeds)
+        return torch.from_numpy(postures).to(qpos), torch.from_numpy(speeds).to(qvel)
 
     def close(self, qpos: np.ndarray) -> np.ndarray:
         """The posture (nq,) with its passive joints where the loops close, or come nearest to closing."""

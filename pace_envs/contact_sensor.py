@@ -55,7 +55,7 @@ class ContactSensor:
         shape = (sim.num_envs, count)
         self.in_contact = torch.zeros(shape, dtype=torch.bool, device=sim.device)
         self.first_contact = torch.zeros_like(self.in_contact)
-        self.current_air_time = torch.zeros(shape, dtype=torch.float64, device=sim.device)
+        self.current_air_time = torch.zeros(shape, dtype=sim.dtype, device=sim.device)
         self.last_air_time = torch.zeros_like(self.current_air_time)
         self.current_contact_time = torch.zeros_like(self.current_air_time)
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.envs.registration import EnvSpec
 
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
@@ -41,18 +40,19 @@ class PaceVectorEnv(gym.vector.VectorEnv):
         """Reset all environments; ``options={"reset_mask": mask}`` resets some of them."""
         mask = (options or {}).get("reset_mask")
         obs, _ = self.env.reset(seed=seed, env_ids=None if mask is None else np.flatnonzero(mask))
-        return obs["policy"].numpy(), {}
+        return obs["policy"].cpu().numpy(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance all environments; those that are done start anew in the same step."""
-        obs, reward, terminated, truncated, extras = self.env.step(torch.as_tensor(actions, dtype=torch.float64))
+        obs, reward, terminated, truncated, extras = self.env.step(self.env.sim.tensor(actions))
         infos: dict[str, Any] = {}
         if "final_obs" in extras:
-            done = extras["_final_obs"].numpy()
+            done = extras["_final_obs"].cpu().numpy()
             # an array of numbers, not of objects: NumpyToTorch can convert it
-            last = extras["final_obs"]["policy"].numpy()
+            last = extras["final_obs"]["policy"].cpu().numpy()
             infos = {"final_obs": last, "_final_obs": done, "final_info": {}, "_final_info": done}
-        return obs["policy"].numpy(), reward.numpy(), terminated.numpy(), truncated.numpy(), infos
+        seen = (value.cpu().numpy() for value in (obs["policy"], reward, terminated, truncated))
+        return *seen, infos  # type: ignore[return-value]
 
     def render(self) -> tuple[np.ndarray | None, ...]:  # type: ignore[override]
         """A picture of environment 0."""

@@ -40,9 +40,9 @@ def assign(
 ) -> None:
     """``field[rows][:, columns] = value`` for any mix of slices and indices."""
     if isinstance(rows, slice) or isinstance(columns, slice):
-        field[rows, columns] = torch.as_tensor(value, dtype=field.dtype)
+        field[rows, columns] = torch.as_tensor(value, dtype=field.dtype, device=field.device)
     else:
-        field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype)
+        field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype, device=field.device)
 
 
 def find_names(

@@ -29,13 +29,20 @@ class JointLayout:
     """Column of each passive joint in ``qpos``."""
 
     @classmethod
-    def of_model(cls, model: mujoco.MjModel, joint_order: Sequence[str] | None, path: str | Path) -> JointLayout:
+    def of_model(
+        cls,
+        model: mujoco.MjModel,
+        joint_order: Sequence[str] | None,
+        path: str | Path,
+        device: torch.device | str = "cpu",
+    ) -> JointLayout:
         """Find the joints in a model.
 
         Args:
             model: The model.
             joint_order: Their order; ``None`` means the model's.
             path: The model's file, for messages.
+            device: Device of the columns.
 
         Raises:
             ValueError: If the model has no joints to drive, or the order names unknown ones.
@@ -60,11 +67,13 @@ class JointLayout:
         passive = {name: j for name, j in single.items() if name not in order}
         return cls(
             joint_names=tuple(order),
-            qpos_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in ids]),
-            dof_columns=torch.tensor([int(model.jnt_dofadr[j]) for j in ids]),
+            qpos_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in ids], device=device),
+            dof_columns=torch.tensor([int(model.jnt_dofadr[j]) for j in ids], device=device),
             root=root,
             passive_names=tuple(passive),
-            passive_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in passive.values()], dtype=torch.long),
+            passive_columns=torch.tensor(
+                [int(model.jnt_qposadr[j]) for j in passive.values()], dtype=torch.long, device=device
+            ),
         )
 
     @cached_property
@@ -90,4 +99,4 @@ def _span(columns: torch.Tensor) -> slice:
 
 def _are_a_span(columns: torch.Tensor) -> bool:
     view = _span(columns)
-    return torch.equal(columns, torch.arange(view.start, view.stop))
+    return torch.equal(columns.cpu(), torch.arange(view.start, view.stop))

@@ -81,8 +81,8 @@ class Link:
 
     def rotate_mass(self, angle: torch.Tensor) -> None:
         """Turn the mass of the link, and of all that is fixed to it, about the joint's axis by (rows,) [rad]."""
-        axis = torch.as_tensor(self.model.axis(self.joint))
-        anchor = torch.as_tensor(self.model.anchor(self.joint))
+        axis = self.model.sim.tensor(self.model.axis(self.joint))
+        anchor = self.model.sim.tensor(self.model.anchor(self.joint))
         turn = _quaternion(axis, angle)
         own = (self.model.body(self.joint), "body_ipos", "body_iquat")
         for body, place, pose in [own, *((b, "body_pos", "body_quat") for b in self.model.fixed_children(self.joint))]:

@@ -75,16 +75,17 @@ class ManagerBasedEnv(gym.Env):
             raise ValueError(f"decimation is {cfg.decimation!r}, expected an integer >= 1.")
         self.cfg = cfg
         self.render_mode = render_mode
-        self._generator = torch.Generator()
-        self.seed(cfg.seed)
         self.scene = InteractiveScene(cfg.scene, cfg.sim)
         self.sim = self.scene.sim
+        self._generator = torch.Generator(self.device)
+        self.seed(cfg.seed)
         for name, actuator in self.scene["robot"].actuators.items():
             if cfg.decimation % actuator.cfg.control_decimation:
                 raise ValueError(
                     f"decimation is {cfg.decimation}, expected a multiple of the actuator group {name!r}'s "
                     f"control_decimation = {actuator.cfg.control_decimation}."
                 )
+        self._constants: dict[tuple[float, ...], torch.Tensor] = {}
         self.extras: dict[str, Any] = {}
         self.common_step_counter = 0
         self._renderer: Any = None
@@ -101,6 +102,11 @@ class ManagerBasedEnv(gym.Env):
     def device(self) -> torch.device:
         """Device of all tensors."""
         return self.sim.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of all tensors: float64 on the processor, float32 on a GPU."""
+        return self.sim.dtype
 
     @property
     def physics_dt(self) -> float:
@@ -124,10 +130,16 @@ class ManagerBasedEnv(gym.Env):
         self._generator.manual_seed(seed)
         return seed
 
+    def constant(self, values: tuple[float, ...]) -> torch.Tensor:
+        """Numbers as a tensor, copied to the device once."""
+        if values not in self._constants:
+            self._constants[values] = self.sim.tensor(values)
+        return self._constants[values]
+
     def uniform(self, shape: tuple[int, ...], low: Any = 0.0, high: Any = 1.0) -> torch.Tensor:
-        """Uniform draws from the environment's own generator, float64."""
-        draws = torch.rand(shape, generator=self._generator, dtype=torch.float64)
-        return low + (high - low) * draws.to(self.device)
+        """Uniform draws from the environment's own generator, on its device and of its type."""
+        draws = torch.rand(shape, generator=self._generator, dtype=self.dtype, device=self.device)
+        return low + (high - low) * draws
 
     def reset(
         self,
@@ -148,7 +160,7 @@ class ManagerBasedEnv(gym.Env):
         """
         if seed is not None:
             self.seed(seed)
-        ids = torch.as_tensor(self.sim.resolve_env_ids(env_ids)).long()
+        ids = torch.arange(self.num_envs, device=self.device)[self.sim.rows(env_ids)]
         self.extras = {}
         self._reset_idx(ids)
         self.sim.forward(ids)

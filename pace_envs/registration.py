@@ -82,6 +82,7 @@ def make_env(
     delay_mode: str | None = None,
     seed: int | None = None,
     render_mode: str | None = None,
+    device: str | None = None,
 ) -> ManagerBasedRLEnv:
     """Build an environment; ``gym.make`` calls this.
 
@@ -93,12 +94,15 @@ def make_env(
         delay_mode: ``"command"`` or ``"effort"``, for all drives.
         seed: Seed of all random draws.
         render_mode: ``None`` or ``"rgb_array"``.
+        device: ``"cpu"`` or a GPU, ``"cuda:0"``.
     """
     env_cfg = copy.deepcopy(cfg) if cfg is not None else _load(env_cfg_entry_point)
     if num_envs is not None:
         env_cfg.scene.num_envs = num_envs
     if seed is not None:
         env_cfg.seed = seed
+    if device is not None:
+        env_cfg.sim.device = device
     if physics_dt is not None:
         set_physics_dt(env_cfg, physics_dt)
     if delay_mode is not None:

@@ -18,7 +18,7 @@ class OffscreenRenderer:
         self._sim = sim
         cameras = [sim.model.camera(i).name for i in range(sim.model.ncam)]
         self._camera: str | int = "track" if "track" in cameras else -1
-        self._model = sim.batch.get_model(0)
+        self._model = sim.model_of(0)
         self._data = mujoco.MjData(self._model)
         try:
             self._renderer = mujoco.Renderer(self._model, height, width)
@@ -29,7 +29,7 @@ class OffscreenRenderer:
 
     def render(self) -> np.ndarray:
         """The picture, (height, width, 3) uint8."""
-        self._sim.batch.get_data(0, self._data)
+        self._sim.read_data(0, self._data)
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, camera=self._camera)
         return self._renderer.render()

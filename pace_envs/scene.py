@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import mujoco
-import torch
 
 from pace_actuators import match_names
 from pace_envs.articulation import Articulation, load_robot_spec
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
-from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
+from pace_envs.simulation import EnvIds, SimulationCfg, make_simulation
 
 
 @dataclass(kw_only=True)
@@ -59,7 +58,7 @@ class InteractiveScene:
             _add_terrain(spec, cfg.terrain)
         for name, sensor in cfg.contact_sensors.items():
             add_contact_sensor(spec, name, sensor)
-        self.sim = (sim_cfg.class_type or Simulation)(sim_cfg, spec, cfg.num_envs)
+        self.sim = make_simulation(sim_cfg, spec, cfg.num_envs)
         self.articulations = {"robot": Articulation(cfg.robot, self.sim)}
         self.sensors = {name: ContactSensor(c, name, self.sim) for name, c in cfg.contact_sensors.items()}
 
@@ -79,7 +78,7 @@ class InteractiveScene:
         self.sim.reset(env_ids)
         for articulation in self.articulations.values():
             articulation.reset(env_ids)
-        rows = slice(None) if env_ids is None else torch.as_tensor(self.sim.resolve_env_ids(env_ids)).long()
+        rows = self.sim.rows(env_ids)
         for sensor in self.sensors.values():
             sensor.reset(rows)
 

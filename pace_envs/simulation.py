@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -58,8 +58,26 @@ class SimulationCfg:
     num_threads: int = 0
     """Threads of the physics; 0 means one per processor that the process may use. Results do not depend on it."""
 
+    device: str = "cpu"
+    """Where it runs: ``"cpu"`` in float64, or ``"cuda:0"``, ``"cuda:1"``, … in float32 by MuJoCo Warp."""
+
     class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None
-    """What builds the simulation; ``None`` means :class:`Simulation`."""
+    """What builds the simulation; ``None`` means :class:`Simulation`, or on a GPU ``WarpSimulation``."""
+
+
+def make_simulation(cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int) -> Simulation:
+    """Build what the configuration asks for.
+
+    Raises:
+        ValueError: If the device or a package is missing, or a value of the configuration or the model is unusable.
+    """
+    if cfg.class_type is not None:
+        return cfg.class_type(cfg, spec, num_envs)
+    if cfg.device == "cpu":
+        return Simulation(cfg, spec, num_envs)
+    from pace_envs.warp_simulation import WarpSimulation  # only where it is asked for
+
+    return WarpSimulation(cfg, spec, num_envs)
 
 
 def available_processors() -> int:
@@ -68,7 +86,16 @@ def available_processors() -> int:
 
 
 class Simulation:
-    """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (float64, no copies)."""
+    """Steps ``num_envs`` copies of a model and exposes their fields as torch tensors (no copies).
+
+    Attributes:
+        device: Device of all tensors.
+        dtype: Type of all tensors.
+        model: The compiled model.
+    """
+
+    dtype = torch.float64
+    batch: Any
 
     @property
     def is_trapezoidal(self) -> bool:
@@ -94,11 +121,9 @@ class Simulation:
             raise ValueError(f"Unknown integrator {cfg.integrator!r}. Available: {', '.join(_INTEGRATORS)}.")
         self.cfg = cfg
         self.num_envs = num_envs
-        self.device = torch.device("cpu")
+        self.device = self._find_device()
         self.model = self._compile(spec)
-        if mujoco.get_mju_user_warning() is None:
-            mujoco.set_mju_user_warning(_ignore_warning)
-        self.batch = batch.Batch(self.model, num_envs, nthread=cfg.num_threads or available_processors())
+        self._start()
         self.qpos = self.bind("qpos")
         self.qvel = self.bind("qvel")
         self.qfrc_applied = self.bind("qfrc_applied")
@@ -106,6 +131,7 @@ class Simulation:
         self._constants_changed = False
         self._expanded: dict[str, torch.Tensor] = {}
         self._link_fields: dict[str, torch.Tensor] = {}
+        self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
 
     def bind(self, field: str) -> torch.Tensor:
         """A live tensor over an ``MjData`` field, shape (num_envs, ...).
@@ -164,18 +190,26 @@ class Simulation:
             Inertia without armature [kg m²], how fast gravity pulls back with the angle [N m/rad], and what of the
             inertia does not couple to other joints [kg m²].
         """
-        model, ids = self.model, columns.numpy()
-        joints, bodies = model.dof_jntid[ids], model.dof_bodyid[ids]
         if not self._link_fields:  # they hold what is computed after they were bound
             self._link_fields = {name: self.bind(name) for name in ("M", "xaxis", "xanchor", "subtree_com")}
             self.forward()
         fields = self._link_fields
-        diagonal = fields["M"][:, model.M_rowadr[ids] + model.M_rownnz[ids] - 1]
+        _, entries, joints, bodies, gravity = self._link_place(columns)
+        diagonal = fields["M"][:, entries]
         inertia = (diagonal - self.expand("dof_armature")[:, columns]).clamp(min=0.0)
         axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
-        weight = self.expand("body_subtreemass")[:, bodies, None] * torch.tensor(model.opt.gravity)
+        weight = self.expand("body_subtreemass")[:, bodies, None] * gravity
         turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
         return inertia, -(axis * turned).sum(dim=-1), inertia * self._stands_alone[columns]
+
+    def _link_place(self, columns: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Where the fields of degrees of freedom are: entries of M, joints, bodies, and gravity; looked up once."""
+        if id(columns) not in self._link_places:
+            model, ids = self.model, columns.cpu().numpy()
+            places = (model.M_rowadr[ids] + model.M_rownnz[ids] - 1, model.dof_jntid[ids], model.dof_bodyid[ids])
+            on_device = [torch.as_tensor(place, device=self.device).long() for place in places]
+            self._link_places[id(columns)] = (columns, *on_device, self.tensor(model.opt.gravity))
+        return self._link_places[id(columns)]
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Note that an effect has written to the bodies of joints with these degrees of freedom."""
@@ -201,6 +235,22 @@ class Simulation:
         ids = None if env_ids is None else self.resolve_env_ids(env_ids)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
 
+    def tensor(self, value: object) -> torch.Tensor:
+        """A value as a tensor where, and of the type that, the simulation's are."""
+        return torch.as_tensor(value, dtype=self.dtype, device=self.device)
+
+    def model_of(self, env_id: int) -> mujoco.MjModel:
+        """A copy of the model as one environment has it."""
+        return self.batch.get_model(env_id)
+
+    def read_data(self, env_id: int, data: mujoco.MjData) -> None:
+        """Read the state of one environment, such as to draw it."""
+        self.batch.get_data(env_id, data)
+
+    def rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
+        """What selects environments in tensors: all of them, or indices, sorted and unique."""
+        return slice(None) if env_ids is None else torch.as_tensor(self.resolve_env_ids(env_ids)).long()
+
     def resolve_env_ids(self, env_ids: EnvIds) -> np.ndarray:
         """Environment indices, sorted and unique, as an int32 array, of indices or a mask of any kind.
 
@@ -211,7 +261,7 @@ class Simulation:
             return np.arange(self.num_envs, dtype=np.int32)
         if isinstance(env_ids, slice):
             return np.sort(np.arange(self.num_envs, dtype=np.int32)[env_ids])
-        ids = np.asarray(env_ids)
+        ids = np.asarray(env_ids.cpu() if isinstance(env_ids, torch.Tensor) else env_ids)
         if ids.dtype == bool:
             if ids.shape != (self.num_envs,):
                 raise ValueError(f"The mask env_ids has shape {ids.shape}, expected ({self.num_envs},).")
@@ -225,7 +275,7 @@ class Simulation:
     def _stands_alone(self) -> torch.Tensor:
         """Which degrees of freedom follow no other, and are followed by none, (nv,) bool."""
         parents = self.model.dof_parentid
-        return torch.as_tensor((parents < 0) & ~np.isin(np.arange(len(parents)), parents))
+        return torch.as_tensor((parents < 0) & ~np.isin(np.arange(len(parents)), parents), device=self.device)
 
     def close(self) -> None:
         """Release the simulations."""
@@ -234,6 +284,17 @@ class Simulation:
     def _update_constants(self) -> None:
         self.batch.set_const()
         self._constants_changed = False
+
+    def _find_device(self) -> torch.device:
+        """Where the tensors are to be; raises a ValueError where that cannot be."""
+        return torch.device("cpu")
+
+    def _start(self) -> None:
+        """Make the copies of the model and their data."""
+        if mujoco.get_mju_user_warning() is None:
+            mujoco.set_mju_user_warning(_ignore_warning)
+        threads = self.cfg.num_threads or available_processors()
+        self.batch = batch.Batch(self.model, self.num_envs, nthread=threads)
 
     def _compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
         # the drive is pace_actuators' business, and keyframes have the size of the model as it was

@@ -57,7 +57,7 @@ class ActionManager:
         """Build the terms of a dict of name to configuration."""
         self._terms = {name: term.class_type(term, env) for name, term in term_items(cfg).items()}
         self._sizes = [term.action_dim for term in self._terms.values()]
-        self.action = torch.zeros(env.num_envs, sum(self._sizes), dtype=torch.float64, device=env.device)
+        self.action = torch.zeros(env.num_envs, sum(self._sizes), dtype=env.dtype, device=env.device)
         self.prev_action = self.action.clone()
 
     @property

@@ -33,7 +33,7 @@ class CommandTerm:
         """Start with the time of the next draw at zero."""
         self.cfg = cfg
         self._env = env
-        self.time_left = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
+        self.time_left = torch.zeros(env.num_envs, dtype=env.dtype, device=env.device)
 
     @property
     def command(self) -> torch.Tensor:

@@ -29,20 +29,29 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order by the expressions instead of by the entity's own order."""
 
-    joint_ids: slice | list[int] = dataclasses.field(default_factory=lambda: slice(None))
+    joint_ids: slice | list[int] | torch.Tensor = dataclasses.field(default_factory=lambda: slice(None))
     """Filled in by :meth:`resolve`."""
 
-    body_ids: slice | list[int] = dataclasses.field(default_factory=lambda: slice(None))
+    body_ids: slice | list[int] | torch.Tensor = dataclasses.field(default_factory=lambda: slice(None))
     """Filled in by :meth:`resolve`."""
 
     def resolve(self, env: ManagerBasedEnv) -> SceneEntityCfg:
         """A copy with ``joint_ids`` and ``body_ids`` filled in."""
         resolved, entity = dataclasses.replace(self), env.scene[self.name]
         if self.joint_names is not None:
-            resolved.joint_ids = entity.find_joints(self.joint_names, preserve_order=self.preserve_order)[0]
+            resolved.joint_ids = _on_device(
+                env, entity.find_joints(self.joint_names, preserve_order=self.preserve_order)[0]
+            )
         if self.body_names is not None:
-            resolved.body_ids = entity.find_bodies(self.body_names, preserve_order=self.preserve_order)[0]
+            resolved.body_ids = _on_device(
+                env, entity.find_bodies(self.body_names, preserve_order=self.preserve_order)[0]
+            )
         return resolved
+
+
+def _on_device(env: ManagerBasedEnv, ids: list[int]) -> list[int] | torch.Tensor:
+    """Indices where the tensors are: a list would be copied to a GPU, which waits for it, at every use."""
+    return ids if env.device.type == "cpu" else torch.tensor(ids, device=env.device)
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -70,6 +79,15 @@ class ManagerTermBase:
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Forget the state of some environments."""
+
+
+Number = float | torch.Tensor
+"""A number to log; on a GPU a tensor without dimensions: nobody waits for it before it is written."""
+
+
+def as_number(value: torch.Tensor) -> Number:
+    """A tensor without dimensions as a number to log."""
+    return value.item() if value.device.type == "cpu" else value
 
 
 CfgT = TypeVar("CfgT", bound=ManagerTermBaseCfg)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Number, Term, as_number, term_items
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -27,7 +27,7 @@ class RewardManager:
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
         self._terms: list[Term[RewardTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
-        self._reward = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
+        self._reward = torch.zeros(env.num_envs, dtype=env.dtype, device=env.device)
         self._sums = {term.name: torch.zeros_like(self._reward) for term in self._terms}
         self._max_episode_length_s = getattr(env, "max_episode_length_s", 1.0)
 
@@ -58,11 +58,11 @@ class RewardManager:
                 self._sums[term.name] += value
         return self._reward.clone()
 
-    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+    def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Clear the sums of some environments; returns each term's mean per second of a full episode."""
-        log = {}
+        log: dict[str, Number] = {}
         for name, total in self._sums.items():
-            log[f"Episode_Reward/{name}"] = float(total[env_ids].mean()) / self._max_episode_length_s
+            log[f"Episode_Reward/{name}"] = as_number(total[env_ids].mean() / self._max_episode_length_s)
             total[env_ids] = 0.0
         for term in self._terms:
             term.reset(env_ids)

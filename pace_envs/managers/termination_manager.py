@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+from pace_envs.managers.manager_base import ManagerTermBaseCfg, Number, Term, as_number, term_items
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -58,9 +58,9 @@ class TerminationManager:
                 self.terminated |= value
         return self.dones
 
-    def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
+    def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Reset class terms; returns how many of these environments each term ended."""
-        log = {f"Episode_Termination/{name}": float(last[env_ids].sum()) for name, last in self._last.items()}
+        log = {f"Episode_Termination/{name}": as_number(last[env_ids].sum()) for name, last in self._last.items()}
         for term in self._terms:
             term.reset(env_ids)
         return log

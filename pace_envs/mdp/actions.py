@@ -24,13 +24,13 @@ class JointPositionAction(ActionTerm):
         super().__init__(cfg, env)
         ids, names = self._asset.find_joints(cfg.joint_names, preserve_order=cfg.preserve_order)
         self.joint_names = names
-        self._joint_ids = None if ids == list(range(self._asset.num_joints)) else torch.tensor(ids)
-        self.scale = resolve_joint_values(cfg.scale, names, field="scale", default=1.0)
-        self.offset = resolve_joint_values(cfg.offset, names, field="offset", default=0.0)
+        self._joint_ids = None if ids == list(range(self._asset.num_joints)) else torch.tensor(ids, device=env.device)
+        self.scale = env.sim.tensor(resolve_joint_values(cfg.scale, names, field="scale", default=1.0))
+        self.offset = env.sim.tensor(resolve_joint_values(cfg.offset, names, field="offset", default=0.0))
         if cfg.use_default_offset:
             self.offset = self._asset.data.default_joint_pos[0, ids].clone()
         self._plain = bool((self.scale == 1.0).all()) and not bool(self.offset.any())
-        self.processed_actions = torch.zeros(env.num_envs, len(ids), dtype=torch.float64, device=env.device)
+        self.processed_actions = torch.zeros(env.num_envs, len(ids), dtype=env.dtype, device=env.device)
 
     @property
     def action_dim(self) -> int:

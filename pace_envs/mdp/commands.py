@@ -26,10 +26,10 @@ class UniformVelocityCommand(CommandTerm):
         """Start with zero commands."""
         super().__init__(cfg, env)
         self.scale = 1.0
-        self._command = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)
-        ranges = torch.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z], dtype=torch.float64)
+        self._command = torch.zeros(env.num_envs, 3, dtype=env.dtype, device=env.device)
+        ranges = env.sim.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z])
         self._low, self._high = ranges[:, 0], ranges[:, 1]
-        self._errors = torch.zeros(env.num_envs, 3, dtype=torch.float64, device=env.device)  # planar, yaw, steps
+        self._errors = torch.zeros(env.num_envs, 3, dtype=env.dtype, device=env.device)  # planar, yaw, steps
 
     @property
     def command(self) -> torch.Tensor:

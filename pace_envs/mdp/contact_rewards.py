@@ -24,7 +24,7 @@ def feet_air_time(
 
 def undesired_contacts(env: ManagerBasedRLEnv, sensor_names: tuple[str, ...]) -> torch.Tensor:
     """Number of geoms that touch something."""
-    return sum(env.scene.sensors[name].in_contact.sum(dim=1) for name in sensor_names).double()  # type: ignore[union-attr]
+    return sum(env.scene.sensors[name].in_contact.sum(dim=1) for name in sensor_names).to(env.dtype)  # type: ignore[union-attr]
 
 
 def feet_slide(env: ManagerBasedRLEnv, sensor_name: str) -> torch.Tensor:

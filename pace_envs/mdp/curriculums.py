@@ -30,7 +30,7 @@ class command_range_by_tracking(ManagerTermBase):
         self._command = command
         self._command.scale = float(cfg.params.get("start", 0.5))
         self._window = max(env.num_envs // 4, 1)
-        self._earned = torch.zeros((), dtype=torch.float64, device=env.device)
+        self._earned = torch.zeros((), dtype=env.dtype, device=env.device)
         self._episodes = 0
 
     def __call__(  # type: ignore[override]

@@ -47,7 +47,9 @@ class electrical_power(ManagerTermBase):
         """Resolve the joints' constants."""
         super().__init__(cfg, env)
         value = cfg.params.get("copper_loss", 0.0)
-        self._copper_loss = resolve_joint_values(value, env.scene["robot"].joint_names, field="copper_loss")
+        self._copper_loss = env.sim.tensor(
+            resolve_joint_values(value, env.scene["robot"].joint_names, field="copper_loss")
+        )
 
     def __call__(  # type: ignore[override]
         self, env: ManagerBasedRLEnv, copper_loss: JointValue, regeneration: float = 1.0

@@ -46,7 +46,7 @@ def reset_root_state_uniform(
     init = asset.cfg.init_state
     pose = _draw(env, len(env_ids), pose_range)
     velocity = _draw(env, len(env_ids), velocity_range)
-    default = torch.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel], dtype=torch.float64)
+    default = env.constant((*init.pos, *init.rot, *init.lin_vel, *init.ang_vel))
     state = default.repeat(len(env_ids), 1)
     state[:, :3] += pose[:, :3]
     state[:, 3:7] = multiply(state[:, 3:7], from_euler(pose[:, 3:]))
@@ -73,5 +73,5 @@ def _draw(env: ManagerBasedEnv, count: int, ranges: Mapping[str, tuple[float, fl
     unknown = set(ranges) - set(_AXES)
     if unknown:
         raise ValueError(f"Unknown axes {', '.join(sorted(unknown))}. Available: {', '.join(_AXES)}.")
-    bounds = torch.tensor([ranges.get(axis, (0.0, 0.0)) for axis in _AXES], dtype=torch.float64)
-    return env.uniform((count, 6), bounds[:, 0], bounds[:, 1])
+    low, high = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in _AXES), strict=True)
+    return env.uniform((count, 6), env.constant(low), env.constant(high))

@@ -72,7 +72,7 @@ def _joints_of(drives: IdentifiedDrives, name: str) -> list[str]:
 def _write_to_drives(
     env: ManagerBasedEnv, robot: Articulation, name: str, values: torch.Tensor, ids: list[int], drives: IdentifiedDrives
 ) -> None:
-    whole = torch.full((env.num_envs, robot.num_joints), torch.nan, dtype=torch.float64)
+    whole = torch.full((env.num_envs, robot.num_joints), torch.nan, dtype=env.dtype, device=env.device)
     whole[:, ids] = values
     for actuator in robot.actuators.values():
         own = whole[:, actuator.joint_indices]

@@ -18,7 +18,7 @@ def randomize_friction(
     """Draw one sliding friction coefficient per environment for the geoms of a contact sensor."""
     friction = env.sim.expand("geom_friction")
     drawn = env.uniform((len(env_ids), 1), *friction_range)
-    geoms = torch.tensor(env.scene.sensors[sensor_name].geom_ids)
+    geoms = torch.tensor(env.scene.sensors[sensor_name].geom_ids, device=env.device)
     friction[env_ids[:, None], geoms[None, :], 0] = drawn
     env.sim.constants_changed()
 
@@ -31,8 +31,8 @@ def randomize_body_mass(
     Raises:
         ValueError: If a body's mass could become zero or less.
     """
-    bodies = torch.as_tensor(asset_cfg.body_ids)
-    nominal = torch.as_tensor(env.sim.model.body_mass)[bodies]
+    bodies = torch.as_tensor(asset_cfg.body_ids, device=env.device)
+    nominal = env.sim.tensor(env.sim.model.body_mass)[bodies]
     if float(nominal.min()) + mass_range[0] <= 0.0:
         raise ValueError(
             f"mass_range starts at {mass_range[0]:g} kg and the lightest of these bodies has {float(nominal.min()):g} "
@@ -41,6 +41,6 @@ def randomize_body_mass(
     mass = nominal + env.uniform((len(env_ids), len(bodies)), *mass_range)
     rows, columns = env_ids[:, None], bodies[None, :]
     env.sim.expand("body_mass")[rows, columns] = mass
-    inertia = torch.as_tensor(env.sim.model.body_inertia)[bodies]
+    inertia = env.sim.tensor(env.sim.model.body_inertia)[bodies]
     env.sim.expand("body_inertia")[rows, columns] = inertia * (mass / nominal)[..., None]
     env.sim.constants_changed()

@@ -18,7 +18,7 @@ _ROBOT = SceneEntityCfg()
 
 def is_alive(env: ManagerBasedRLEnv) -> torch.Tensor:
     """1 where the episode goes on."""
-    return (~env.termination_manager.terminated).double()
+    return (~env.termination_manager.terminated).to(env.dtype)
 
 
 def joint_torques_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:

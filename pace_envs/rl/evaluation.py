@@ -68,10 +68,10 @@ def evaluate(
     if not isinstance(base.cfg, VelocityEnvCfg):
         raise ValueError("This environment is no velocity task: its configuration is no VelocityEnvCfg.")
     robot = base.scene["robot"]
-    copper_loss = resolve_joint_values(base.cfg.copper_loss, robot.joint_names, field="copper_loss")
+    copper_loss = base.sim.tensor(resolve_joint_values(base.cfg.copper_loss, robot.joint_names, field="copper_loss"))
     steps = steps or int(base.max_episode_length)
-    sums = torch.zeros(4, dtype=torch.float64)
-    falls = 0
+    sums = torch.zeros(4, dtype=torch.float64, device=base.device)
+    falls = torch.zeros((), dtype=torch.long, device=base.device)
     obs, _ = env.reset()
     for _ in range(steps):
         # the state before the step: after it, robots that fell stand again
@@ -87,7 +87,7 @@ def evaluate(
             ]
         )
         obs, *_ = env.step(policy(obs))
-        falls += int(base.termination_manager.terminated.sum())
+        falls += base.termination_manager.terminated.sum()
         if on_step is not None:
             on_step()
     error, yaw_error, mean_power, speed = (sums / steps).tolist()
@@ -95,7 +95,7 @@ def evaluate(
     return Evaluation(
         velocity_error=error,
         yaw_rate_error=yaw_error,
-        falls_per_episode=falls / base.num_envs / (steps * base.step_dt / 20.0),
+        falls_per_episode=int(falls) / base.num_envs / (steps * base.step_dt / 20.0),
         cost_of_transport=mean_power / (weight * max(speed, 1e-9)),
         power=mean_power,
         speed=speed,

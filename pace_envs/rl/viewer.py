@@ -25,7 +25,7 @@ def watch(env: RslRlVecEnvWrapper, policy: Policy) -> None:
     from mujoco import viewer
 
     base = env.unwrapped
-    model = base.sim.batch.get_model(0)
+    model = base.sim.model_of(0)
     data = mujoco.MjData(model)
     obs, _ = env.reset()
     with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
@@ -34,7 +34,7 @@ def watch(env: RslRlVecEnvWrapper, policy: Policy) -> None:
             start = time.perf_counter()
             obs, *_ = env.step(policy(obs))
             with window.lock():
-                base.sim.batch.get_data(0, data)
+                base.sim.read_data(0, data)
                 mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(max(0.0, base.step_dt - (time.perf_counter() - start)))

@@ -157,7 +157,7 @@ def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
     viscous = physical[space["viscous_friction"]].tolist()
     shortest: dict[str, float] = {}
     for r in range(problem.dataset.num_recordings):
-        inertia = torch.as_tensor(sim.batch.get_model(r).dof_M0)[robot.dof_columns].tolist()
+        inertia = torch.as_tensor(sim.model_of(r).dof_M0)[robot.dof_columns].tolist()
         for actuator in robot.actuators.values():
             for column, name in enumerate(actuator.joint_names):
                 j = robot.joint_names.index(name)
