@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -35,12 +35,20 @@ _NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 
 
-def fit(settings: FitSettings, progress: ProgressLine | None = None) -> tuple[FitResult, Path]:
+def fit(
+    settings: FitSettings,
+    progress: ProgressLine | None = None,
+    on_start: Callable[[Path], None] = lambda _: None,
+    assess_interrupted: bool = True,
+) -> tuple[FitResult, Path]:
     """Identify a robot.
 
     Args:
         settings: What to fit, and how.
         progress: Shows how far it is.
+        on_start: Gets the run's folder before the first simulation.
+        assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
+            interruption is passed on at once, and the folder has what ``resume`` needs.
 
     Returns:
         The result and the run's folder.
@@ -51,7 +59,8 @@ def fit(settings: FitSettings, progress: ProgressLine | None = None) -> tuple[Fi
     problem = _load(settings)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
     folder.write_start(settings.to_dict(), _digests(settings, problem), problem)
-    return _Fit(settings, problem, folder, progress or ProgressLine()).run()
+    on_start(folder.path)
+    return _Fit(settings, problem, folder, progress or ProgressLine()).run(assess_interrupted)
 
 
 def resume(
@@ -159,12 +168,14 @@ class _Fit:
         """Simulated steps, with those before a resume."""
         return self._steps_before + self.evaluator.simulated_steps + self.assessor.simulated_steps
 
-    def run(self) -> tuple[FitResult, Path]:
+    def run(self, assess_interrupted: bool = True) -> tuple[FitResult, Path]:
         """Search, refine, assess, write."""
         try:
             self._write_checkpoint()  # so that a run can be resumed from its first moment
             outcome = self._optimize()
         except KeyboardInterrupt:  # keep the best so far; --resume goes on from the checkpoint
+            if not assess_interrupted:
+                raise
             outcome = Outcome(x=self._best_so_far(), stop_reasons=["interrupted"])
         self.progress.close()
         result = self._assess(outcome)

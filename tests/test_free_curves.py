@@ -101,14 +101,14 @@ def curves(fitted):
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
-    joint = error_map(curves, ["servo"])["servo"]
+    joint = error_map(curves, ["servo"], curves.base_errors)["servo"]
     assert joint["best"] == "friction_over_position" and joint["best_label"] == "position [rad]"
     others = [part for name, part in joint["explained"].items() if name != joint["best"]]
     assert joint["explained"]["friction_over_position"] > 0.9 and max(others) < 0.5
     assert joint["sentence"].startswith("a curve of friction over position explains 9") and "mrad" in joint["sentence"]
     assert len(joint["curve"]["at"]) == len(joint["curve"]["torque"]) == 17
     assert min(joint["curve"]["torque"]) >= 0.0 and joint["kind"] == "friction"  # all of it, and none pushes
-    assert error_map(None, ["servo"]) == {}
+    assert error_map(None, ["servo"], None) == {}
 
 
 @pytest.mark.parametrize(("times", "instead"), [(None, True), (2.4, True), (1.75, False)])
@@ -208,12 +208,12 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
     advice = advise(robot, outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
-    told = error_map(curves, robot.joint_names)
+    told = error_map(curves, robot.joint_names, curves.base_errors)
     assert list(told) == ["b", "c"]
     first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
     assert first == pytest.approx(CALM["friction"])
     curves.explained[0, 2] = 0.05
-    weak = error_map(curves, robot.joint_names)["c"]
+    weak = error_map(curves, robot.joint_names, curves.base_errors)["c"]
     assert weak["curve"] is None and weak["sentence"].startswith("no curve")
     assert last == pytest.approx(CALM["friction"] + 0.1 + 0.1 * CALM["viscous_friction"])
 

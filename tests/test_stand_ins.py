@@ -156,21 +156,32 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch, stopped)
         paying=["parallel_spring"],
         shares={SPRING: 1.0},
     )
-    refits, said = [], []
+    refits, said, seen, told = [], [], [], []
 
-    def fit(settings, progress):
+    refit = run.folder.parent / "refit"
+
+    def fit(settings, progress, on_start, assess_interrupted):
         refits.append(settings)
-        return SimpleNamespace(stop_reasons=[stopped]), run.folder.parent / "refit"
+        told.append(len(seen))
+        on_start(refit)
+        if stopped == "interrupted":
+            raise KeyboardInterrupt
+        return SimpleNamespace(stop_reasons=[stopped]), refit
 
     (run.folder.parent / "refit").mkdir(exist_ok=True)
     module = sys.modules[Findings.__module__]
-    for name, made in (("search_effects", found), ("advise", []), ("error_map", {})):
+    for name, made in (("search_effects", found), ("advise", []), ("error_map", {}), ("sizes", [])):
         monkeypatch.setattr(module, name, lambda *_, made=made: made)
     monkeypatch.setattr(module, "fit", fit)
     line = SimpleNamespace(say=said.append, restart=lambda: None, close=lambda: None)
-    diagnosis = diagnose(DiagnosisSettings(run=run.folder), line)
-    assert any(f"scripts/fit.py --resume {diagnosis.runs[-1]}" in text for text in said) is (stopped == "interrupted")
-    assert refits[0].effects == ["parallel_spring"] and diagnosis.runs[-1].endswith("refit")
+    assert diagnose(DiagnosisSettings(run=run.folder), line).runs == [str(run.folder)] and not refits
+    diagnosis = diagnose(DiagnosisSettings(run=run.folder, refit=True), line, seen.append)
+    assert told == [1] and seen[0].runs == [str(run.folder)]  # the verdict is told before the robot is fitted
+    broken_off = stopped == "interrupted"
+    assert any(f"scripts/fit.py --resume {refit}" in text for text in said) is broken_off
+    assert refits[0].effects == ["parallel_spring"]
+    assert diagnosis.runs == [str(run.folder), str(refit)][: 1 if broken_off else 2]
+    assert Diagnosis.load(refit).verdict == "unknown"
     assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]
     assert SAID in diagnosis.summary and "75 %" in diagnosis.summary
     assert Diagnosis.load(run.folder) == diagnosis

@@ -176,6 +176,7 @@ class ProportionalGain(Effect):
     looks = "static sag and stiffness off; parameters change from gain set to gain set"
     source = "EFFECTS of PACE on MuJoCo; users of PACE report drives whose gains are not in SI units"
     probes = ({"gain": 0.02},)
+    scales = "proportional gain"
     separates = "recordings at another gain, and a known added mass"
     gain: torch.Tensor
 
@@ -195,6 +196,7 @@ class DerivativeGain(Effect):
     looks = "damping changes from gain set to gain set"
     source = "as proportional_gain"
     probes = ({"gain": 0.05},)
+    scales = "derivative gain"
     separates = "recordings at another derivative gain"
     gain: torch.Tensor
 

@@ -25,6 +25,7 @@ class TorqueGain(Effect):
     source = "a wrong torque constant, gear ratio or efficiency"
     probes = ({"gain": 0.02},)
     twins = ("payload",)
+    scales = "torque"
     separates = "a recording with a known added mass"
     gain: torch.Tensor
 

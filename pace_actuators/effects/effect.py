@@ -109,6 +109,8 @@ class Effect:
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     absorbed_by: ClassVar[str] = ""
     """Base parameter that may take it up wholly, so that recordings of positions do not show it."""
+    scales: ClassVar[str] = ""
+    """What was stated that it multiplies, as "torque": its size is then told as a factor of that."""
     separates: ClassVar[str] = ""
     """Which further recording tells it from its likes."""
 

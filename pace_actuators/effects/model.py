@@ -36,6 +36,7 @@ class Payload(Effect):
     source = "cables, covers and tools that the model does not have"
     probes = ({"ratio": 0.02},)
     twins = ("torque_gain",)
+    scales = "mass of the link"
     separates = "a recording with a known added mass"
     ratio: torch.Tensor
 

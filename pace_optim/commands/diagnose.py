@@ -2,7 +2,8 @@
 
 import torch
 
-from pace_optim.diagnosis import DiagnosisSettings, diagnose
+from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.report import write_report
 from pace_optim.terminal.cli import make_parser
 
@@ -21,22 +22,26 @@ def main() -> None:
     parser.add_argument("--only", action="store_true", help="try nothing but --effects")
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
     parser.add_argument("--physics_dt", type=float, metavar="S", help="physics step (default: half a control step)")
-    parser.add_argument(
+    refit = parser.add_mutually_exclusive_group()
+    refit.add_argument(
+        "--refit",
+        action="store_true",
+        default=None,
+        help="fit the robot with what lowers the error although it is not what is missing (default: only with what is)",
+    )
+    refit.add_argument(
         "--no_refit", dest="refit", action="store_false", help="do not fit the robot with what was found"
     )
     args = parser.parse_args()
 
     torch.set_num_threads(1)  # many small tensors
-    diagnosis = diagnose(DiagnosisSettings(**vars(args)))
-    print(f"verdict: {diagnosis.verdict}")
-    print(diagnosis.summary)
-    for entry in diagnosis.ranking[:8]:
-        before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
-        mark = "added" if entry["added"] else ("pays" if entry["significant"] else "does not pay")
-        where = f"on {len(entry['joints'])} of {len(diagnosis.joints)} joints" if len(diagnosis.joints) > 1 else ""
-        print(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} mrad  {mark:13s}  {where}".rstrip())
-    for sentence in (*diagnosis.data, *diagnosis.advice):
-        print(f"- {sentence}")
-    for run in diagnosis.runs:
+    diagnosis = diagnose(DiagnosisSettings(**vars(args)), on_verdict=_tell)
+    for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
         print(f"report: {write_report(run)}")
     print(f"run: {diagnosis.runs[-1]}")
+
+
+def _tell(diagnosis: Diagnosis) -> None:
+    """Print what was found, and let the report of the run tell it, before the robot is fitted again."""
+    print("\n".join(lines_of(diagnosis)))
+    print(f"report: {write_report(diagnosis.run)}", flush=True)

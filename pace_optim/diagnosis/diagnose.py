@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,8 @@ from pace_optim.diagnosis.telling.result import Diagnosis
 from pace_optim.diagnosis.verdict.contributions import DOMINANT, shares
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in, stand_ins, varying
-from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, ranking, verdict
+from pace_optim.diagnosis.verdict.sizes import sizes
+from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, likes, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.run.result import FitResult
@@ -66,12 +68,18 @@ class Findings:
         return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
 
 
-def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) -> Diagnosis:
+def diagnose(
+    settings: DiagnosisSettings,
+    progress: ProgressLine | None = None,
+    on_verdict: Callable[[Diagnosis], None] = lambda _: None,
+) -> Diagnosis:
     """Find out which physical effect a run's model lacks; writes ``diagnosis.json`` into the run's folder.
 
     Args:
         settings: What to diagnose, and how.
         progress: Shows how far it is.
+        on_verdict: Gets the diagnosis as soon as it is written, before the robot is fitted with what was found. An
+            interruption ends that fit and nothing else.
 
     Raises:
         ValueError: If the run cannot be read, or anything does not fit; nothing has been written then.
@@ -98,6 +106,7 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         found.data.sentences.append(
             f"The run has {', '.join(result.effects)}: the search started from the base model, and looked for it again."
         )
+    found.data.sentences += _other_error(found, problem, result)
     diagnosis = Diagnosis(
         run=str(folder),
         verdict=found.verdict,
@@ -108,6 +117,8 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         shares={effect.name: share for effect, share in found.shares.items()},
         free_form=found.free_form,
         ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
+        sizes=sizes(found.outcome, problem.joint_names),
+        likes=likes(found.outcome),
         joints=_joints(found, problem),
         data=found.data.sentences,
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
@@ -116,21 +127,43 @@ def diagnose(settings: DiagnosisSettings, progress: ProgressLine | None = None) 
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
         ladder=_ladder(found),
-        error_map=error_map(found.curves, problem.joint_names),
+        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors),
         wall_time_s=time.monotonic() - begin,
     )
     diagnosis.save(folder)
-    if settings.refit and found.paying:
-        path = _refit(found, problem, run_settings, folder, progress)
+    progress.close()
+    on_verdict(diagnosis)
+    explains = found.verdict == "effect" or bool(found.free_form)
+    refit = explains if settings.refit is None else settings.refit
+    if refit and found.paying and (path := _refit(found, problem, run_settings, diagnosis, progress)) is not None:
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
         for run in diagnosis.runs:
             diagnosis.save(run)
-    progress.close()
     return diagnosis
 
 
-def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, progress: ProgressLine) -> Path:
-    """Fit the whole robot with what was found, from where the search ended; returns the new run's folder."""
+def _other_error(found: Findings, problem: Problem, run: FitResult) -> list[str]:
+    """Why the run tells another error of the same model, where it does."""
+    own, here = run.rmse["validation"].get("all"), float(found.outcome.base_errors.mse.mean().sqrt())
+    if own is None or run.effects or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
+        return []
+    ways = []
+    if not math.isclose(run.physics_dt, problem.physics_dt):
+        ways.append(f"the physics step is {1e3 * problem.physics_dt:g} instead of {1e3 * run.physics_dt:g} ms")
+    ways.append("each joint is simulated alone with a delay of its own, in blocks of up to one second")
+    return [
+        f"The run's own validation error of the base model is {1e3 * own:.3g} mrad, here it is {1e3 * here:.3g} mrad: "
+        f"{', and '.join(ways)}."
+    ]
+
+
+def _refit(
+    found: Findings, problem: Problem, run: FitSettings, diagnosis: Diagnosis, progress: ProgressLine
+) -> Path | None:
+    """Fit the whole robot with what was found, from where the search ended; returns the new run's folder.
+
+    ``None`` if the user breaks it off: the new folder keeps what it needs to go on, and the diagnosis.
+    """
     progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
     final = found.outcome.final
     settings = replace(
@@ -140,12 +173,23 @@ def _refit(found: Findings, problem: Problem, run: FitSettings, folder: Path, pr
         physics_dt=problem.physics_dt,
         start=whole_values(final.model, final.x, problem.joint_names),
         check_consistency=False,  # the run has done it
-        log_dir=str(folder.parent.parent),
+        log_dir=str(Path(diagnosis.run).parent.parent),
     )
     progress.restart()
-    result, path = fit(settings, progress)
-    if result.stop_reasons == ["interrupted"]:
-        progress.say(f"the fit of the whole robot was interrupted: {command('fit')} --resume {path} goes on with it")
+    begun: list[Path] = []
+
+    def keep(path: Path) -> None:
+        diagnosis.save(path)
+        begun.append(path)
+
+    try:
+        _, path = fit(settings, progress, on_start=keep, assess_interrupted=False)
+    except KeyboardInterrupt:
+        how = f": {command('fit')} --resume {begun[0]} goes on with it" if begun else ""
+        progress.close()
+        progress.say(f"the fit of the whole robot was broken off{how}; the diagnosis above stands")
+        return None
+    progress.close()
     return path
 
 

@@ -25,8 +25,9 @@ class DiagnosisSettings:
     physics_dt: float | None = None
     """Physics step of the diagnosis [s]; ``None``: half a control step, or the run's if that is finer."""
 
-    refit: bool = True
-    """Whether the model with the effects found is fitted to the whole robot, as a run of its own."""
+    refit: bool | None = None
+    """Whether the model with the effects found is fitted to the whole robot, as a run of its own; ``None``: where they
+    are what is missing, or a curve explains it in their place."""
 
     def __post_init__(self) -> None:
         """Check what can be checked without reading anything.

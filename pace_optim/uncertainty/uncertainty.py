@@ -180,6 +180,25 @@ def autocovariance(error: np.ndarray) -> np.ndarray:
     return (full[: length + 1] * taper)[: max(1, length)]
 
 
+def sandwich(columns: np.ndarray, error: np.ndarray, ridge: float = 0.0) -> np.ndarray:
+    """The covariance C = H⁻¹ (Jᵀ Σ J) H⁻¹ of the parameters of one joint, (P, P).
+
+    Args:
+        columns: J, zero where a sample does not count, (P, K, R).
+        error: (K, R).
+        ridge: Added to H, as a part of its diagonal.
+    """
+    flat = columns.reshape(len(columns), -1)
+    scale = 1 / np.maximum(np.linalg.norm(flat, axis=1), 1e-300)
+    flat, columns = flat * scale[:, None], columns * scale[:, None, None]
+    hessian = flat @ flat.T + ridge * np.eye(len(flat))
+    middle = np.zeros_like(hessian)
+    for r in range(error.shape[1]):
+        middle += columns[..., r] @ _filtered(columns[..., r], autocovariance(error[:, r])).T
+    inverse = np.linalg.inv(hessian)
+    return inverse @ middle @ inverse * scale[:, None] * scale
+
+
 def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Σ applied to each row of (entries, T), Σ the Toeplitz matrix of an autocovariance."""
     kernel = np.concatenate([covariance[:0:-1], covariance])

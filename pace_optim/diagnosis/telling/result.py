@@ -35,6 +35,11 @@ class Diagnosis:
     """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
     ranking: list[dict[str, Any]]
     """Every effect that was refitted: those added first, as in ``added``, then round by round by what they explain."""
+    sizes: list[dict[str, Any]] = field(default_factory=list)
+    """Every parameter of the effects found, on each joint: value, standard deviation, unit, the factor of what was
+    stated where it is one, and whether it is at a bound."""
+    likes: dict[str, list[str]] = field(default_factory=dict)
+    """Effects that these recordings cannot tell from one found, by its name."""
     joints: dict[str, dict[str, Any]]
     """For each joint its errors, floor and effects."""
     data: list[str]
@@ -44,7 +49,7 @@ class Diagnosis:
     advice: list[str]
     """What to do or to record next."""
     runs: list[str]
-    """Folders of the refits."""
+    """Folders of the run and of its refit, once that is done."""
     tried: list[str]
     """Names of all candidates."""
     physics_dt: float

@@ -118,12 +118,13 @@ def take_curves(outcome: Outcome, curves: Curves) -> None:
     outcome.final_errors = replace(errors, square=square)
 
 
-def error_map(curves: Curves | None, joint_names: Sequence[str]) -> dict[str, dict[str, Any]]:
+def error_map(curves: Curves | None, joint_names: Sequence[str], base_errors: BlockErrors) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
     Args:
         curves: What was fitted.
         joint_names: The joints.
+        base_errors: Of the base model, as everything else in the diagnosis tells them.
     """
     if curves is None:
         return {}
@@ -131,7 +132,7 @@ def error_map(curves: Curves | None, joint_names: Sequence[str]) -> dict[str, di
     for j in curves.joints.nonzero()[:, 0].tolist():
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
-        before, after = (float(each.mse[j].sqrt()) for each in (curves.base_errors, curves.errors[k]))
+        before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,

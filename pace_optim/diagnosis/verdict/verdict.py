@@ -102,6 +102,26 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
     return result
 
 
+def likes(outcome: Outcome) -> dict[str, list[str]]:
+    """For each effect of the final model, those that the recordings cannot tell from it; only where there are any.
+
+    Args:
+        outcome: Where the search ended.
+    """
+    model, found = outcome.final.model, {}
+    for effect, has in zip(model.effects, model.has, strict=True):
+        alike = {
+            other.name: None
+            for this in outcome.rounds
+            for j in has.nonzero()[:, 0].tolist()
+            if this.chosen[j] is effect
+            for other in this.rivals[j]
+        }
+        if alike:
+            found[effect.name] = list(alike)
+    return found
+
+
 def ranking(
     outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
 ) -> list[dict[str, Any]]:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
-from pace_optim.report.number_text import angle_unit, three_figures
-from pace_optim.terminal.cli import command
+from pace_optim.report.number_text import three_figures
+from pace_optim.report.sizes import size_text
 
 from ..markup import Section, bullets, esc, figure, table
 from ..run_data import RunData
 from ..wording import in_words
+from .verdict import callout
 
-_HEADINGS = {
-    "effect": ("good", "An effect is missing, and it is known"),
-    "nothing_missing": ("good", "Nothing is missing"),
-    "unknown": ("bad", "Something is missing, and it is none of the known effects"),
-}
-_PARTLY = 0.8
-"""Effects that explain less than this part of the error above the floor are not all that is missing."""
 _SHOWN = 10
 """Effects in the chart, at most."""
+_FACTOR, _UNIT = 1e3, "mrad"
+"""Of all errors in the section, as its sentences have them."""
 _COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py |\bpace [a-z]+(?:-[a-z]+)? --)")
 
 
@@ -31,7 +26,8 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        _verdict(content, run.result.effects),
+        callout(content, run.result.effects),
+        _sizes(content),
         _ladder(content),
         _error_map(content),
         _ranking(content),
@@ -41,28 +37,30 @@ def diagnosis(run: RunData) -> Section | None:
     return Section(id="diagnosis", title="Which effect is missing", html="".join(parts))
 
 
-def _verdict(content: dict[str, Any], had: Sequence[str]) -> str:
-    """What is missing, and how to add it to a run that had these effects."""
-    css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
-    effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
-    if content.get("free_form"):
-        part_known = "only a part of it is known" if content["added"] else "it is none of the known effects"
-        css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
-    elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
-        css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
-    add = ""
-    if effects and set(effects) == set(had):
-        add = "<p>This run is the fit with it.</p>"
-    elif effects:
-        why = "Add it" if content["added"] else "Until it is known, this lowers the error"
-        add = f"<p>{why}: <code>{command('fit')} … --effects {esc(' '.join(effects))}</code></p>"
-    return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}</div>'
-
-
 def _floor(content: dict[str, Any]) -> float:
     """Of all joints [rad]."""
     floors = [joint["floor"] for joint in content["joints"].values()]
     return (sum(floor**2 for floor in floors) / max(1, len(floors))) ** 0.5
+
+
+def _sizes(content: dict[str, Any]) -> str:
+    """How large what was found is."""
+    sizes = content.get("sizes")
+    if not sizes:
+        return ""
+    likes = content.get("likes", {})
+    rows = [
+        [
+            f"<b>{esc(size['effect'])}</b>",
+            esc(size["parameter"].replace("_", " ")),
+            esc(size["joint"]),
+            esc(size_text(size)),
+            esc(", ".join(likes.get(size["effect"], [])) or "–"),
+        ]
+        for size in sizes
+    ]
+    head = ["effect", "parameter", "joint", "size ± standard deviation", "cannot be told from"]
+    return f"<h3>How large it is</h3>{table(head, rows)}"
 
 
 def _ladder(content: dict[str, Any]) -> str:
@@ -70,7 +68,7 @@ def _ladder(content: dict[str, Any]) -> str:
     if not steps:
         return ""
     floor = _floor(content)
-    factor, unit = angle_unit([step["validation_rmse"] for step in steps])
+    factor, unit = _FACTOR, _UNIT
     rows, before = [], None
     for step in steps:
         error = step["validation_rmse"]
@@ -88,8 +86,7 @@ def _ranking(content: dict[str, Any]) -> str:
     tried = f"<p>{len(content['tried'])} effects were tried.</p>" if content.get("tried") else ""
     if not entries:
         return f"<h3>Effects</h3><p>No effect was worth a refit.</p>{tried}"
-    errors = [entry[key] for entry in entries for key in ("validation_rmse_before", "validation_rmse_after")]
-    factor, unit = angle_unit(errors)
+    factor, unit = _FACTOR, _UNIT
     return (
         "<h3>Effects<small>refitted one at a time, judged on recordings that were not fitted</small></h3>"
         f"{_chart(entries[:_SHOWN], _floor(content), factor, unit)}{_evidence(entries, factor, unit)}{tried}"
@@ -162,7 +159,7 @@ def _few(names: list[str]) -> str:
 
 def _joints(content: dict[str, Any]) -> str:
     joints = content["joints"]
-    factor, unit = angle_unit([joint["validation_rmse_before"] for joint in joints.values()])
+    factor, unit = _FACTOR, _UNIT
     rows = [
         [
             f"<b>{esc(name)}</b>",

@@ -12,6 +12,7 @@ from pace_optim.run.result import FitResult
 from ..markup import Section, bullets, esc
 from ..run_data import RunData
 from ..wording import duration, pretty_unit
+from .verdict import verdict_first
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
 
@@ -28,7 +29,9 @@ def overview(run: RunData) -> Section:
         f'<p class="lead">{esc(_verdict(run))}</p>'
     )
     return Section(
-        id="overview", title="Overview", html=head + _figures(result) + _warnings(result) + _errors_by_joint(result)
+        id="overview",
+        title="Overview",
+        html=head + verdict_first(run) + _figures(result) + _warnings(result) + _errors_by_joint(result),
     )
 
 

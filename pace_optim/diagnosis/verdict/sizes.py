@@ -1,0 +1,94 @@
+"""How large the effects found are, with error bars, and which of their sizes are at a bound."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from pace_actuators.effects import Effect, EffectParameter
+from pace_optim.diagnosis.candidates.screening import free_columns
+from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.verdict.proxy_effects import curves_in
+from pace_optim.uncertainty.uncertainty import sandwich
+
+_RIDGE = 1e-12
+
+
+def sizes(outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Every parameter of every effect found, joint by joint, for ``diagnosis.json``; curves are left out.
+
+    Args:
+        outcome: Where the search ended.
+        joint_names: The joints.
+
+    Returns:
+        ``{"effect", "parameter", "joint", "value", "std", "unit", "factor", "at_bound"}`` each. ``std`` is ``None``
+        where a value is held or at a bound; ``factor`` says what was stated is multiplied by, if it is that.
+    """
+    now = outcome.final
+    found = now.model.has & ~curves_in(now.model)
+    if not bool(found.any()):
+        return []
+    if now.jacobian is None or now.error is None:  # one iteration stays where it is, and sees the derivatives
+        now = fit_side_by_side(outcome.problem, [_start(now)], max_iteration=1, keep_jacobian=True)[0]
+    physical, std, stuck = now.model.to_physical(now.x), standard_deviations(now), now.model.at_bounds(now.x)
+    result = []
+    for effect, has, at_bound in zip(now.model.effects, found, stuck, strict=True):
+        columns = now.model.columns(effect)
+        for j in has.nonzero()[:, 0].tolist():
+            own = zip(effect.parameters, physical[j, columns].tolist(), std[j, columns].tolist(), strict=True)
+            result += [
+                {
+                    "effect": effect.name,
+                    "parameter": parameter.name,
+                    "joint": joint_names[j],
+                    "value": value,
+                    "std": error if error > 0 else None,
+                    "unit": parameter.unit,
+                    "factor": factor_of(effect, parameter, value),
+                    "at_bound": bool(at_bound[j]),
+                }
+                for parameter, value, error in own
+            ]
+    return result
+
+
+def _start(now: Fitted) -> Fitted:
+    return Fitted.start(now.model, now.model.to_physical(now.x))
+
+
+def factor_of(effect: type[Effect], parameter: EffectParameter, value: float) -> float | None:
+    """What multiplies the stated value; ``None`` for a parameter that is no such factor."""
+    if not effect.scales:
+        return None
+    return value if parameter.null == 1.0 else 1.0 + value
+
+
+def standard_deviations(now: Fitted) -> torch.Tensor:
+    """Physical standard deviations of a fitted model's parameters, (n, P); zero where one is held or at a bound.
+
+    Args:
+        now: Fitted, with its Jacobian: of every second control step of what is trained on.
+    """
+    columns, error = free_columns(now), now.error
+    if error is None:
+        raise ValueError("Error bars need a model that was fitted with keep_jacobian.")
+    result = torch.zeros_like(now.x)
+    slope = _slope(now)
+    for j in range(now.model.num_joints):
+        own = columns[..., j].double()
+        free = own.flatten(1).norm(dim=1).nonzero()[:, 0]
+        if len(free):
+            covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), _RIDGE)
+            result[j, free] = torch.as_tensor(covariance.diagonal().copy()).clamp(min=0.0).sqrt() * slope[j, free]
+    return result
+
+
+def _slope(now: Fitted) -> torch.Tensor:
+    """Physical units by normalised ones, (n, P)."""
+    model = now.model
+    half = torch.where(model.log, (model.upper / model.lower.clamp(min=1e-300)).clamp(min=1.0).log(), 0.0) / 2
+    return torch.where(model.log, half * model.to_physical(now.x), (model.upper - model.lower) / 2)

@@ -1,0 +1,72 @@
+"""A diagnosis in short: what is missing, how large it is, and the run that has it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pace_optim.report.sizes import size_text
+from pace_optim.terminal.cli import command
+
+from ..markup import bullets, esc
+from ..run_data import RunData
+from ..wording import in_words
+
+_HEADINGS = {
+    "effect": ("good", "An effect is missing, and it is known"),
+    "nothing_missing": ("good", "Nothing is missing"),
+    "unknown": ("bad", "Something is missing, and it is none of the known effects"),
+}
+_PARTLY = 0.8
+"""Effects that explain less than this part of the error above the floor are not all that is missing."""
+_SHOWN = 4
+"""Sizes in the overview, at most."""
+
+
+def verdict_first(run: RunData) -> str:
+    """For the top of the page: the verdict, sizes, likes, and a link to the run that has what was missing."""
+    content = run.read_json("diagnosis.json")
+    if not content:
+        return ""
+    sizes = content.get("sizes", [])
+    said = [f"{size['effect']} {size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes[:_SHOWN]]
+    if len(sizes) > _SHOWN:
+        said.append(f"and {len(sizes) - _SHOWN} more")
+    said += [f"{effect} cannot be told from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()]
+    more = (bullets(said, "notes") if said else "") + _refit_link(run, content)
+    return callout(
+        content, run.result.effects, more + '<p><a href="#diagnosis">What was tried, and the evidence</a></p>'
+    )
+
+
+def callout(content: dict[str, Any], had: Sequence[str], more: str = "") -> str:
+    """What is missing, and how to add it to a run that had these effects."""
+    css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
+    effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
+    if content.get("free_form"):
+        part_known = "only a part of it is known" if content["added"] else "it is none of the known effects"
+        css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
+    elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
+        css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
+    add = ""
+    if effects and set(effects) == set(had):
+        add = "<p>This run is the fit with it.</p>"
+    elif effects:
+        why = "Add it" if content["added"] else "Until it is known, this lowers the error"
+        add = f"<p>{why}: <code>{command('fit')} … --effects {esc(' '.join(effects))}</code></p>"
+    return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}{more}</div>'
+
+
+def _refit_link(run: RunData, content: dict[str, Any]) -> str:
+    """A link from a run to its refit, and back."""
+    here, places = run.folder.resolve(), [Path(each) for each in content["runs"]]
+    others = [place for place in places if place.name != here.name]
+    if len(places) < 2 or not others:
+        return ""
+    beside = here.parent / others[0].name  # runs that are moved are moved together
+    other = beside if beside.is_dir() else others[0].resolve()
+    what = "The run with it" if places[0].name == here.name else "The run without it"
+    href = f"{Path(os.path.relpath(other, here)).as_posix()}/report.html"
+    return f'<p>{what}: <a href="{esc(href)}">{esc(other.name)}</a></p>'
