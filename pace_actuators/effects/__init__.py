@@ -17,12 +17,13 @@ from pace_actuators.effects import (
 )
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, probe_points
-from pace_actuators.effects.effect_cfg import SHARED, EffectCfg, effect_cfgs
+from pace_actuators.effects.effect_cfg import SHARED, WIDE, EffectCfg, effect_cfgs
 from pace_actuators.effects.registry import available_effects, get_effect, register_effect
 from pace_actuators.effects.stack import EffectStack
 
 __all__ = [
     "SHARED",
+    "WIDE",
     "DriveState",
     "Effect",
     "EffectCfg",

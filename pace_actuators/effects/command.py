@@ -130,7 +130,14 @@ class OtherDelay(Effect):
     stage = "command"
     parameters = (
         EffectParameter(
-            name="delay", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002, meaning="delay of the other path"
+            name="delay",
+            unit="s",
+            lower=0.0,
+            upper=0.03,
+            null=0.0,
+            start=0.002,
+            meaning="delay of the other path",
+            possible=(0.0, 0.03),  # as long as its buffer
         ),
     )
     equation = "τ(t - s) where the base delays q*, q*(t - s) where the base delays τ"
@@ -171,7 +178,9 @@ class ProportionalGain(Effect):
 
     name = "proportional_gain"
     stage = "controller"
-    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02),)
+    parameters = (
+        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02, possible=(-0.9, 9.0)),
+    )
     equation = "kp (1 + g)"
     looks = "static sag and stiffness off; parameters change from gain set to gain set"
     source = "EFFECTS of PACE on MuJoCo; users of PACE report drives whose gains are not in SI units"
@@ -191,7 +200,9 @@ class DerivativeGain(Effect):
 
     name = "derivative_gain"
     stage = "controller"
-    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.05),)
+    parameters = (
+        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.05, possible=(-0.9, 9.0)),
+    )
     equation = "kd (1 + g)"
     looks = "damping changes from gain set to gain set"
     source = "as proportional_gain"

@@ -19,7 +19,9 @@ class TorqueGain(Effect):
 
     name = "torque_gain"
     stage = "drive"
-    parameters = (EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02),)
+    parameters = (
+        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02, possible=(-0.9, 9.0)),
+    )
     equation = "τ -> (1 + g) τ"
     looks = "static sag and amplitude off together"
     source = "a wrong torque constant, gear ratio or efficiency"

@@ -12,6 +12,8 @@ import torch
 if TYPE_CHECKING:
     from pace_actuators.effects.drive_state import DriveState
 
+_WIDER = 4.0
+
 Stage = Literal["command", "measurement", "controller", "drive", "friction", "transmission", "model", "recording"]
 
 
@@ -43,6 +45,20 @@ class EffectParameter:
 
     meaning: str = ""
     """What it is, in a few words."""
+
+    possible: tuple[float, float] = (-math.inf, math.inf)
+    """Between what physics allows it: a bound that a search runs into is widened within."""
+
+    @property
+    def widest(self) -> tuple[float, float]:
+        """Its bounds four times as far from the null, or on a logarithmic scale from each other; the null stays one."""
+        low, high = self.lower, self.upper
+        if self.null is not None and self.scale == "log":
+            low, high = low / _WIDER, high * _WIDER
+        elif self.null is not None and math.isfinite(self.null):
+            low, high = (self.null + _WIDER * (bound - self.null) for bound in (low, high))
+        least, most = self.possible
+        return max(low, least), min(high, most)
 
 
 class Effect:

@@ -11,6 +11,7 @@ from pace_actuators.effects.registry import get_effect
 from pace_actuators.joint_values import JointValue, match_names
 
 SHARED = "shared"
+WIDE = "wide"
 
 
 @dataclass(kw_only=True)
@@ -26,6 +27,9 @@ class EffectCfg:
     shared: bool = False
     """Whether identification looks for one value of all those joints."""
 
+    wide: bool = False
+    """Whether identification looks for it within bounds as wide as physics allows."""
+
     values: Mapping[str, JointValue] = field(default_factory=dict)
     """Values by parameter; one left out is at its null, or at its start if it has none."""
 
@@ -36,11 +40,15 @@ class EffectCfg:
     def parse(cls, text: str) -> EffectCfg:
         """Read ``name``, ``name@joints`` (a regular expression), ``name@shared`` or ``name@joints@shared`` (one value).
 
+        Each may end with ``@wide``, for bounds as wide as physics allows.
+
         Raises:
             ValueError: If there is no such effect.
         """
         name, *rest = text.split("@")
         effect = get_effect(name)
+        wide = rest[-1:] == [WIDE]
+        rest = rest[:-1] if wide else rest
         shared = rest[-1:] == [SHARED]
         joints = rest[:-1] if shared else rest
         if len(joints) > 1 or "" in joints:
@@ -48,7 +56,8 @@ class EffectCfg:
                 f"{text!r} is not understood. Write {name}, {name}@JOINTS, {name}@{SHARED} or {name}@JOINTS@{SHARED}."
             )
         whole = effect.shared or not joints
-        return cls(effect=name, joint_names_expr=".*" if whole else joints[0], shared=shared or effect.shared)
+        expr = ".*" if whole else joints[0]
+        return cls(effect=name, joint_names_expr=expr, shared=shared or effect.shared, wide=wide)
 
     @property
     def effect_class(self) -> type[Effect]:
@@ -61,7 +70,8 @@ class EffectCfg:
         expr = self.joint_names_expr
         text = expr if isinstance(expr, str) else "|".join(expr)
         joints = "" if text == ".*" else f"@{text}"
-        return self.effect + joints + (f"@{SHARED}" if self.shared and not self.effect_class.shared else "")
+        shared = f"@{SHARED}" if self.shared and not self.effect_class.shared else ""
+        return self.effect + joints + shared + (f"@{WIDE}" if self.wide else "")
 
     def joints(self, joint_names: Sequence[str]) -> list[str]:
         """The joints that have it, in order; none if the expressions match none of these."""

@@ -120,7 +120,9 @@ class FrictionDrift(Effect):
     name = "friction_drift"
     stage = "friction"
     parameters = (
-        EffectParameter(name="ratio", unit="1", lower=-0.8, upper=0.8, null=0.0, start=0.05, meaning="δ"),
+        EffectParameter(
+            name="ratio", unit="1", lower=-0.8, upper=0.8, null=0.0, start=0.05, meaning="δ", possible=(-0.95, 9.0)
+        ),
         EffectParameter(name="time_constant", unit="s", lower=1.0, upper=600.0, null=None, start=30.0, scale="log"),
     )
     equation = "d and F_c times (1 + δ (1 - exp(-t/T)))"

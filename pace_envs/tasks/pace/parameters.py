@@ -128,12 +128,13 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
         kind = effect.effect_class
         for parameter in kind.parameters:
             keys = (GLOBAL,) if effect.shared else own
+            lower, upper = parameter.widest if effect.wide else (parameter.lower, parameter.upper)
             result.append(
                 Parameter(
                     name=f"{kind.name}.{parameter.name}",
                     unit=parameter.unit,
-                    lower=(parameter.lower,) * len(keys),
-                    upper=(parameter.upper,) * len(keys),
+                    lower=(lower,) * len(keys),
+                    upper=(upper,) * len(keys),
                     apply=partial(_apply_effect, effect=kind.name, parameter=parameter.name, joint_ids=ids),
                     keys=keys,
                     scale=parameter.scale,

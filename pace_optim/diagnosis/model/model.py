@@ -131,16 +131,36 @@ class JointModel:
             joints: Which joints get it, (n,) bool.
             values: Of the effect, (n, parameters).
         """
-        model = self.with_effect(effect, joints)
+        model, columns = self.with_effect(effect, joints), self.columns(effect)
         if effect not in self.effects:
-            return model, torch.cat([physical, values], dim=1)
-        physical, lower, upper = physical.clone(), model.lower.clone(), model.upper.clone()
-        columns = self.columns(effect)
-        physical[joints, columns] = values[joints]
+            physical = torch.cat([physical, values], dim=1)
+        else:
+            physical = physical.clone()
+            physical[joints, columns] = values[joints]
+        lower, upper = model.lower.clone(), model.upper.clone()
         # what was held for a joint's old values is not held for its new ones
-        lower[joints, columns] = torch.tensor([p.lower for p in effect.parameters], dtype=torch.float64)
-        upper[joints, columns] = torch.tensor([p.upper for p in effect.parameters], dtype=torch.float64)
+        for column, p in enumerate(effect.parameters, start=columns.start):
+            own = physical[joints, column]
+            least, most = p.widest
+            lower[joints, column] = torch.full_like(own, p.lower).masked_fill(own < p.lower, least)
+            upper[joints, column] = torch.full_like(own, p.upper).masked_fill(own > p.upper, most)
         return replace(model, lower=lower, upper=upper), physical
+
+    def widened(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
+        """The same with an effect's bounds as wide as physics allows on some joints, (n,) bool."""
+        lower, upper = self.lower.clone(), self.upper.clone()
+        for column, parameter in enumerate(effect.parameters, start=self.columns(effect).start):
+            lower[joints, column], upper[joints, column] = parameter.widest
+        return replace(self, lower=lower, upper=upper)
+
+    def is_wide(self, effect: type[Effect]) -> torch.Tensor:
+        """Joints on which an effect's bounds are wider than it declares them, (n,) bool."""
+        columns, has = self.columns(effect), self.has[self.effects.index(effect)]
+        least, most = (
+            torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64)
+            for side in ("lower", "upper")
+        )
+        return has & ((self.lower[:, columns] < least) | (self.upper[:, columns] > most)).any(dim=1)
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
         """The same with an effect's structural parameter held where it is: a choice between things is no way to walk.

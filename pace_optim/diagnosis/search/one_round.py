@@ -65,7 +65,7 @@ def try_effects(
     seen = fit_side_by_side(problem.in_windows(), [start], max_iteration=1, keep_jacobian=True)[0]
     probes = screen(problem.coarse(), seen, effects, effort)
     excess = (errors.mse - floor**2).clamp(min=0.0)
-    listed = _short_list(_promising(probes, excess), excess)
+    listed = with_likes(_short_list(_promising(probes, excess), excess), effects)
     first = not now.model.effects
     far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
     wide = first or far
@@ -75,11 +75,12 @@ def try_effects(
     say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
     begun = _begun(problem, now, probes, begin, far)
     if wide:
-        listed = list(dict.fromkeys([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]]))
+        listed = with_likes([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]], effects)
     if not listed:  # no effect does better than the base parameters alone
         return None
     say(f"refitting with {_names(listed)}")
     fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough)
+    fitted = beyond_bounds(fitted, lambda starts: fit_coarse_to_fine(problem, starts, rough), say)
     blocks = validation_errors(problem, fitted)
     n = now.model.num_joints
     tried = len(effects) * n
@@ -104,6 +105,40 @@ def try_effects(
         trials, [{effect: float(evidence[effect][j]) for effect in own} for j, own in enumerate(contenders)]
     )
     return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)
+
+
+def with_likes(listed: Sequence[type[Effect]], effects: Sequence[type[Effect]]) -> list[type[Effect]]:
+    """Effects that are refitted, each followed by those among the candidates that act alike by construction."""
+    alike = {e: [other for other in effects if other.name in e.twins or e.name in other.twins] for e in effects}
+    return list(dict.fromkeys(each for effect in listed for each in (effect, *alike[effect])))
+
+
+def beyond_bounds(
+    fitted: Sequence[Fitted], refit: Callable[[list[Fitted]], list[Fitted]], say: Callable[[str], None]
+) -> list[Fitted]:
+    """The fits, those again that an effect's bound holds back, with bounds as wide as physics allows.
+
+    Args:
+        fitted: The present model with each effect.
+        refit: Fits models from where they start.
+        say: Shows how far it is.
+    """
+    result, stuck, starts = list(fitted), [], []
+    for k, each in enumerate(fitted):
+        effect = each.tried
+        if effect is None or effect not in each.model.effects:
+            continue
+        joints = each.model.at_bounds(each.x)[each.model.effects.index(effect)]
+        model = each.model.widened(effect, joints)
+        if torch.equal(model.lower, each.model.lower) and torch.equal(model.upper, each.model.upper):
+            continue
+        stuck.append(k)
+        starts.append(Fitted.start(model, each.model.to_physical(each.x), tried=effect))
+    if starts:
+        say(f"widening the bounds of {_names([start.tried for start in starts if start.tried is not None])}")
+        for k, each in zip(stuck, refit(starts), strict=True):
+            result[k] = each
+    return result
 
 
 def _promising(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], torch.Tensor]:

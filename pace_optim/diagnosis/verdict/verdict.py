@@ -97,6 +97,7 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
             effect=effect.name,
             joint_names_expr=".*" if effect.shared or everywhere else own,
             shared=effect.shared or effect in model.shared,
+            wide=bool(model.is_wide(effect).any()),
         )
         result.append(cfg.label)
     return result
