@@ -36,7 +36,7 @@ _FARTHEST = 2.0
 """Ratio of two physics steps from where on the values are called into question."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)  # slots: Isaac Lab 3.0 assigns to what has a __dict__
 class IdentifiedAt:
     """Time steps of an identification."""
 

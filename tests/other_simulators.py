@@ -16,12 +16,16 @@ from filelock import FileLock
 
 ROOT = Path(__file__).parents[1]
 CACHE = Path(os.environ.get("PACE_TEST_CACHE", ROOT / ".cache"))
-ISAACLAB = "isaaclab==2.3.0"
-MJLAB = (
+ISAACLAB = ("2.3.0", "3.0.0")
+OTHERS = (
     "mjlab==1.6.0",
     "mujoco==3.11.0",
     "mujoco-warp==3.11.0",
     "warp-lang==1.19.0",
+    "newton==1.8.0",
+    "newton-usd-schemas==0.6.0",
+    "usd-core==26.11",
+    "lazy-loader",
     # what these import and our own environment does not have; the rest (torch, rsl-rl, ...) is shared with ours
     "absl-py",
     "docstring_parser",
@@ -49,26 +53,28 @@ MJLAB = (
 )
 
 
-def one_at_a_time(fetch: Callable[[], Path]) -> Callable[[], Path]:
+def one_at_a_time(fetch: Callable[..., Path]) -> Callable[..., Path]:
     """Let only one of the processes that run tests fetch; the others wait and find it done."""
 
     @functools.wraps(fetch)
-    def alone() -> Path:
+    def alone(*args: str) -> Path:
         CACHE.mkdir(exist_ok=True)
         with FileLock(CACHE / "lock"):
-            return fetch()
+            return fetch(*args)
 
     return alone
 
 
 @one_at_a_time
-def isaaclab_wheel() -> Path:
-    """Isaac Lab's wheel (3 MB), unpacked."""
-    folder = CACHE / ISAACLAB
+def isaaclab_wheel(version: str = ISAACLAB[0]) -> Path:
+    """Isaac Lab's wheel (3 MB; 3.0: 11 MB), unpacked."""
+    folder = CACHE / f"isaaclab=={version}"
     if not (folder / "isaaclab").is_dir():
         wheels = CACHE / "wheels"
-        _pip("Isaac Lab's wheel", [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", wheels, ISAACLAB])
-        wheel = next(wheels.glob("isaaclab-2.3.0-*.whl"))
+        command = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "-d", wheels, f"isaaclab=={version}"]
+        newer = version.startswith("3.")  # it names a newer Python than our oldest; its actuators run on that too
+        _pip("Isaac Lab's wheel", [*command, *(["--python-version", "3.12", "--only-binary=:all:"] if newer else [])])
+        wheel = next(wheels.glob(f"isaaclab-{version}-*.whl"))
         part = folder.with_suffix(".part")
         with zipfile.ZipFile(wheel) as content:
             content.extractall(part)
@@ -77,16 +83,16 @@ def isaaclab_wheel() -> Path:
 
 
 @one_at_a_time
-def mjlab_python() -> Path:
-    """Python of an environment with mjlab and its MuJoCo 3.11 (0.7 GB); torch and the like are ours."""
-    folder = CACHE / "mjlab-1.6.0"
+def others_python() -> Path:
+    """Python of an environment with mjlab and its MuJoCo 3.11, Warp and Newton (0.9 GB); torch is ours."""
+    folder = CACHE / "others-1"
     python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
     done = folder / ".installed"
     if not done.is_file():
         made = subprocess.run([sys.executable, "-m", "venv", "--clear", folder], capture_output=True, text=True)
         if made.returncode:
-            pytest.skip(f"no virtual environment for mjlab: {made.stderr.strip()[-200:]}")
-        _pip("mjlab", [python, "-m", "pip", "install", "-q", "--no-deps", *MJLAB])
+            pytest.skip(f"no virtual environment for mjlab and Newton: {made.stderr.strip()[-200:]}")
+        _pip("mjlab or Newton", [python, "-m", "pip", "install", "-q", "--no-deps", *OTHERS])
         own = next(folder.rglob("site-packages"))
         (own / "zz_ours.pth").write_text("\n".join(site.getsitepackages()) + "\n")
         done.touch()

@@ -6,12 +6,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from other_simulators import ROOT, isaaclab_wheel, mjlab_python, run
+from other_simulators import ROOT, isaaclab_wheel, others_python, run
 from torque_sequence import DT, ENVS, JOINTS, STEPS, sequence, write_result
 
-from pace_actuators import IdentifiedDrives, PaceDCMotorCfg
+from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, use_identified
+from pace_optim.export import export
 from pace_optim.problem.parameter_space import ParameterSpace
 
 MODES = ("command", "effort")
@@ -88,7 +89,7 @@ def test_the_sequence_feels_every_part_of_the_drive(reference):
 
 
 def alone(cfg: PaceDCMotorCfg, data) -> np.ndarray:
-    from pace_actuators import ActuatorActions, PaceDCMotor
+    from pace_actuators import ActuatorActions
 
     motor = PaceDCMotor(cfg, JOINTS, slice(None), ENVS, dtype=torch.float64)
     return np.stack(
@@ -122,10 +123,35 @@ def test_isaac_lab_gives_the_torque_of_the_identification(reference, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+def test_isaac_lab_3_gives_the_torque_of_the_identification(reference, tmp_path):
+    """In the actuator collection of Isaac Lab 3.0's wheel, through its own control bridge and kernels; one of the two
+    as ``export --format isaaclab`` writes it."""
+    result, expected = reference
+    exported = []
+    if IdentifiedDrives.load(result).delay_mode == "effort":
+        export(result, "isaaclab").write(tmp_path / "cfg.py")
+        exported = [tmp_path / "cfg.py"]
+    run(others_python(), "isaaclab3_torques.py", isaaclab_wheel("3.0.0"), result, tmp_path / "out.npz", *exported)
+    found = np.load(tmp_path / "out.npz")
+    assert_same(found, expected)
+    for name in ("delayed", "biased"):
+        theirs = found[f"theirs_{name}"]
+        assert np.abs(found[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
+    drive = PaceDCMotorCfg.from_result(result, physics_dt=DT)
+    at_rest = PaceDCMotor(drive, JOINTS, slice(None), 1).joint_friction.numpy()
+    assert np.allclose(found["friction_at_rest"], at_rest) and (found["limit"] > 200).all()  # the asset's own is 10
+    bias = [IdentifiedDrives.load(result).parameters["encoder_bias"][joint] for joint in JOINTS]
+    assert np.allclose(found["shown"], -np.array(bias), atol=1e-5) and (found["load"] == -2.0).all()
+    assert "use_newton_actuators" in str(found["native"])  # Newton's own path refuses it in words
+    assert str(found["refused"]).count("motor") == 2 and "armature" in str(found["refused"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_mjlab_gives_the_torque_of_the_identification(reference, tmp_path):
     """In an entity and a simulation of mjlab, through its own position action."""
     result, expected = reference
-    run(mjlab_python(), "mjlab_torques.py", ROOT / "assets/anymal_d/anymal_d.xml", result, tmp_path / "out.npz")
+    run(others_python(), "mjlab_torques.py", ROOT / "assets/anymal_d/anymal_d.xml", result, tmp_path / "out.npz")
     found = np.load(tmp_path / "out.npz")
     assert_same(found, expected)
     bias = np.array([IdentifiedDrives.load(result).parameters["encoder_bias"][joint] for joint in JOINTS])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from command_lines import run_script
-from other_simulators import isaaclab_wheel, mjlab_python
+from other_simulators import isaaclab_wheel, others_python
 from torque_sequence import write_result
 
 from pace_actuators.effects.__main__ import page as page_of_effects
@@ -106,7 +106,7 @@ def test_the_code_for_mjlab_runs_there(tmp_path):
     built = (
         f"from mjlab_torques import World\nprint(World({robot!r}, *articulation.actuators).dofs('dof_armature')[0])\n"
     )
-    assert "0.055" in elsewhere(mjlab_python(), block_for("mjlab") + built, tmp_path)
+    assert "0.055" in elsewhere(others_python(), block_for("mjlab") + built, tmp_path)
 
 
 def block_for(simulator: str) -> str:

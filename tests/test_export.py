@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import run_script
-from other_simulators import isaaclab_wheel, mjlab_python
+from other_simulators import isaaclab_wheel, others_python
 from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
 
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
@@ -153,7 +153,7 @@ def test_the_mjlab_configuration_runs_there(result, tmp_path):
         "print('result', world.dofs('dof_armature')[0, 1], -world.entity.data.encoder_bias[0, 0].item())\n"
     )
     export(result, "mjlab").write(tmp_path / "cfg.py")
-    done = subprocess.run([mjlab_python(), "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run([others_python(), "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     armature, bias = map(float, done.stdout.split("result")[1].split())
     assert armature == pytest.approx(0.055) and bias == pytest.approx(0.08)
