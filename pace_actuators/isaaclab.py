@@ -13,7 +13,7 @@ What differs there, and is converted here:
   Newton's MuJoCo solver (3.0) takes it as MuJoCo's frictionloss, with a time constant of its own.
 - **Joint parameters.** 2.3 reads armature and friction from the actuator. 3.0 reads them from its configuration before
   the actuator exists: the configuration takes them over from the drive.
-- **Limits of the solver.** 3.0 leaves the asset's own effort limit in force after the actuator, 2.3 lifts it. Here it is
+- **Limits of the solver.** 3.0 leaves the asset's own effort limit in force after the actuator, 2.3 lifts it. It is
   lifted in both (``joint_effort_limit``): the drive has limited its torque.
 - **Newton's actuators.** 3.0 with ``use_newton_actuators`` runs none but those that USD can hold, and refuses this one:
   leave it off, or take what ``export --format newton`` writes.
@@ -157,7 +157,7 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
         _refuse([name for name, value in parameters.items() if getattr(self, name) not in (None, value)])
         for name, value in parameters.items():
             setattr(self, name, value)
-        if self.joint_effort_limit is None:
+        if getattr(self, "joint_effort_limit", None) is None:
             self.joint_effort_limit = _NO_LIMIT
 
     @classmethod
