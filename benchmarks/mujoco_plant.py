@@ -8,6 +8,7 @@ python benchmarks/mujoco_plant.py --friction_time_constant 0.02   # MuJoCo's def
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -85,15 +86,18 @@ def simulate(command: np.ndarray, kp: float, base: Sizes, sizes: Sizes, friction
     plant = model(base, sizes, friction_time_constant)
     data = mujoco.MjData(plant)
     data.qpos[:] = command[0]
-    steps = np.arange(len(command))
-    late = np.interp(steps - base["delay"], steps, command)
+    substeps = round(CONTROL_DT / PLANT_DT)
     seen = np.empty(len(command))
     for step in range(-round(SETTLING / CONTROL_DT), len(command)):
         encoder = data.qpos[0] - base["encoder_bias"]
         if step >= 0:
             seen[step] = encoder
-        asked = kp * (late[max(step, 0)] - encoder) - KD * data.qvel[0]
-        for _ in range(round(CONTROL_DT / PLANT_DT)):
+        speed = data.qvel[0]
+        for part in range(substeps):
+            arrived = math.floor(
+                step + (part + 0.5) / substeps - base["delay"]
+            )  # the bus holds a target until the next
+            asked = kp * (command[max(arrived, 0)] - encoder) - KD * speed
             v = data.qvel[0]
             most = max(SATURATION_EFFORT * (1 - v / VELOCITY_LIMIT), -EFFORT_LIMIT)
             least = min(SATURATION_EFFORT * (-1 - v / VELOCITY_LIMIT), EFFORT_LIMIT)

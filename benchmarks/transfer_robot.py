@@ -15,7 +15,6 @@ from pace_envs.registration import set_physics_dt
 from pace_envs.tasks.velocity import VelocityEnvCfg
 from pace_optim.plant import PlantRobot, Truth, effect_named
 from pace_optim.plant.hidden import HiddenEffect
-from pace_optim.plant.simulate import delayed
 from pace_optim.plant.truth import per_joint
 
 PHYSICS_DT = 5e-4
@@ -46,7 +45,7 @@ class RealDrive(PaceDCMotor):
         self._effects = [self._effect(name) for name in self.truth.effects]
         self._targets = np.zeros((_HISTORY, *shape))
         self._fresh = np.ones(self._num_envs, dtype=bool)
-        self._asked = np.zeros(shape)
+        self._feedback = self._asked = np.zeros(shape)
 
     @property
     def changes_passive(self) -> bool:
@@ -59,6 +58,8 @@ class RealDrive(PaceDCMotor):
         if self._calls_until_control == 0:
             self._calls_until_control = self.cfg.control_decimation
             self._control(control_action.joint_positions.numpy(), joint_pos.numpy(), speed)
+        part = self.cfg.control_decimation - self._calls_until_control
+        self._asked = self._gains[0] * self._arrived(part) + self._feedback
         self._calls_until_control -= 1
         stall, no_load, largest = self._limits
         torque = np.clip(self._asked, -largest, largest)
@@ -77,7 +78,17 @@ class RealDrive(PaceDCMotor):
         self._fresh[:] = False
         stiffness, damping = self._gains
         reading = position - self._bias
-        self._asked = stiffness * (delayed(self._targets, _HISTORY - 1, self._delay) - reading) - damping * speed
+        self._feedback = -stiffness * reading - damping * speed
+
+    def _arrived(self, part: int) -> np.ndarray:
+        """The mean over a physics step of the late target: it is held, and switches within one such step [rad]."""
+        parts = self.cfg.control_decimation
+        left = self._delay - part / parts
+        back = np.maximum(np.ceil(left), 0).astype(int)
+        older = np.take_along_axis(self._targets, (_HISTORY - 1 - back)[None], axis=0)[0]
+        newer = np.take_along_axis(self._targets, np.minimum(_HISTORY - back, _HISTORY - 1)[None], axis=0)[0]
+        weight = np.minimum(parts * (1 + left - back), 1.0)
+        return weight * older + (1 - weight) * newer
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
         """Forget the targets of all or some environments."""

@@ -17,6 +17,12 @@ class DelayBuffer:
     - ``"linear"``: ``(1 - f) * x[k - i] + f * x[k - i - 1]``, continuous in d;
     - ``"hold"``: ``x[k - ceil(d)]``, what a zero-order hold delayed by d shows at step k.
 
+    A step may have ``parts``, the physics steps in it. Then part p of step k shows the mean, over that part, of the
+    held signal delayed by d: with e = d - p / parts and w = min(1, parts (1 + e - ceil(e))),
+
+    - ``"linear"``: ``(1 - w) * x[k - ceil(e) + 1] + w * x[k - ceil(e)]``: the signal switches within one part, exactly
+      for the impulse of a torque, and stays continuous in d. With one part it is the formula above.
+
     After a reset, the first sample stands for everything before it.
     """
 
@@ -26,6 +32,7 @@ class DelayBuffer:
         num_envs: int,
         device: str | torch.device = "cpu",
         interpolation: Interpolation = "linear",
+        parts: int = 1,
     ):
         """Create the buffer with all lags at zero.
 
@@ -34,6 +41,7 @@ class DelayBuffer:
             num_envs: Number of environments.
             device: Device of the signal.
             interpolation: ``"linear"`` or ``"hold"``.
+            parts: Into how many parts a step is divided.
 
         Raises:
             ValueError: If ``max_delay`` is negative or not finite, or the interpolation is unknown.
@@ -44,6 +52,7 @@ class DelayBuffer:
             raise ValueError(f"Unknown delay interpolation {interpolation!r}. Available: 'linear', 'hold'.")
         self.max_delay = float(max_delay)
         self.interpolation = interpolation
+        self.parts = parts
         self._num_envs = num_envs
         self._device = torch.device(device)
         self._length = math.ceil(max_delay) + 2
@@ -100,7 +109,7 @@ class DelayBuffer:
             data: The sample, shape (num_envs, num_joints).
 
         Returns:
-            The delayed sample, same shape.
+            The delayed sample, same shape; of the step's first part.
         """
         if self._storage is None or self._storage.shape[1:] != data.shape[1:]:
             with torch.inference_mode(False):  # as above
@@ -115,11 +124,31 @@ class DelayBuffer:
         self._storage[start : start + self._num_envs] = data
         if self._all_zero:
             return data
+        if self.parts > 1 and self.interpolation == "linear":
+            return self.part(0)
+        return self.mean()
+
+    def changes(self, part: int) -> bool:
+        """Whether a part of a step shows something else than the part before it."""
+        return part in self._switches
+
+    def part(self, part: int) -> torch.Tensor:
+        """What a part of the present step shows, same shape as the samples."""
+        if part not in self._at:
+            return self.mean()
+        newer, older, weight = self._at[part]
+        shown = _look_up(self._storage, older[self._head])
+        return (
+            shown if weight is None else _look_up(self._storage, newer[self._head]).lerp_(shown, weight.to(shown.dtype))
+        )
+
+    def mean(self) -> torch.Tensor:
+        """The mean of what the present step shows, same shape as the samples."""
         newer = _look_up(self._storage, self._newer[self._head])
         if self._whole:
             return newer
         older = _look_up(self._storage, self._older[self._head])
-        return newer.lerp_(older, self._fraction.to(data.dtype))
+        return newer.lerp_(older, self._fraction.to(newer.dtype))
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
@@ -127,16 +156,39 @@ class DelayBuffer:
         self._fraction = torch.zeros_like(self._lag) if self.interpolation == "hold" else self._lag - whole
         self._whole = not bool(self._fraction.any())
         self._all_zero = not bool(self._lag.any())
+        self._newer, self._older = self._rows(whole), self._rows(whole + 1)
+        self._index_parts()
+
+    def _index_parts(self) -> None:
+        """The same for every part of a step: the newer and the older sample, and the older one's weight."""
+        self._at: dict[int, tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]] = {}
+        self._switches: set[int] = set()
+        if self.parts == 1 or self.interpolation == "hold":
+            return
+        before: tuple[torch.Tensor, torch.Tensor] | None = None
+        for part in range(self.parts):
+            left = self._lag - part / self.parts
+            back = left.ceil().clamp(min=0.0)
+            weight = (self.parts * (1 + left - back)).clamp(max=1.0)
+            same = bool((weight == 1).all())
+            newer = self._rows((back - 1).clamp(min=0.0))
+            self._at[part] = newer, self._rows(back), None if same else weight
+            if before is not None and not (torch.equal(before[0], back) and torch.equal(before[1], weight)):
+                self._switches.add(part)
+            before = back, weight
+
+    def _rows(self, steps: torch.Tensor) -> torch.Tensor:
+        """Rows of the storage so many steps back, for every head position."""
         heads = torch.arange(self._length, device=self._device)[:, None]
-        if whole.shape[1] == 1:
-            steps, envs = whole[:, 0].long(), torch.arange(self._num_envs, device=self._device)
+        envs = torch.arange(self._num_envs, device=self._device)
+        if steps.shape[1] == 1:
+            back = steps[:, 0].long()
         else:
-            heads, steps = heads[..., None], whole.long()
-            envs = torch.arange(self._num_envs, device=self._device)[:, None]
-        self._newer = ((heads - steps) % self._length) * self._num_envs + envs
-        self._older = ((heads - steps - 1) % self._length) * self._num_envs + envs
+            heads, back, envs = heads[..., None], steps.long(), envs[:, None]
+        return ((heads - back) % self._length) * self._num_envs + envs
 
 
-def _look_up(storage: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+def _look_up(storage: torch.Tensor | None, index: torch.Tensor) -> torch.Tensor:
     """Whole rows for one lag per environment, single entries for one per joint."""
+    assert storage is not None  # a sample was pushed before
     return storage.index_select(0, index) if index.ndim == 1 else storage.gather(0, index)

@@ -51,6 +51,16 @@ class DriveParameters:
             raise ValueError(f"Unknown delay_mode {cfg.delay_mode!r}. Available: 'command', 'effort'.")
         if not (isinstance(cfg.control_decimation, int) and cfg.control_decimation >= 1):
             raise ValueError(f"control_decimation is {cfg.control_decimation!r}, expected an integer >= 1.")
+        if cfg.implicit and cfg.drive_dt is not None:
+            raise ValueError(
+                f"The drive's controller is implicit, it runs continuously, and drive_dt is {cfg.drive_dt:g} s. "
+                "Leave out one of the two."
+            )
+        if cfg.implicit and cfg.delay_mode == "effort":
+            raise ValueError(
+                "The drive's controller is implicit, it acts at once, and delay_mode 'effort' would delay its torque. "
+                "Set implicit to False, with a drive_dt, or delay_mode to 'command'."
+            )
 
     def read(self, field: str, default: torch.Tensor | float) -> torch.Tensor:
         """A field's values; the default where the configuration says ``None``.

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 
 from pace_actuators.dc_motor import clip_effort, clip_to_line, pd_effort
-from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.drive_parameters import DriveParameters
+from pace_actuators.drive_rates import calls_per_run
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.identified import delay_in_steps, step_notes
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -23,15 +24,28 @@ _INVERSION_STEPS = 6
 """Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
 
 
+@dataclasses.dataclass
+class _Run:
+    """What the controller keeps of a run for commands that arrive before the next, (num_envs, num_joints) each."""
+
+    encoder_pos: torch.Tensor
+    encoder_vel: torch.Tensor
+    stiffness: torch.Tensor
+    damping: torch.Tensor
+    velocity: torch.Tensor | None
+    feed_forward: torch.Tensor | None
+    added: torch.Tensor | None = None
+
+
 class PaceDCMotor:
     """A PD-controlled DC motor with encoder bias and delay, batched over environments.
 
-    The way of a command through the drive, once per control step up to the hold, once per call after it:
+    The way of a command through the drive, once per run of its controller up to the hold, once per call after it:
 
         q_enc = q - bias
         τ     = kp (q* - q_enc) + kd (q̇* - q̇) + τ_ff        q*, q̇*, τ_ff delayed  (delay_mode "command")
         τ     = τ(t - delay)                                  the torque delayed     (delay_mode "effort")
-        ------- held for ``control_decimation`` calls -------
+        ------- held until the controller runs again; a command that arrives in between acts at once -------
         τ     = clip(τ, ± effort_limit)                       limit of what is asked, a current limit
         τ     = clip(τ, τ_min(v), τ_max(v))                   torque-speed line
         τ     = 0 where the drive is disabled
@@ -60,6 +74,7 @@ class PaceDCMotor:
         centred: Whether the first call of a control step gives the mean of the old and the new torque. Where a
             simulator updates speeds before positions (semi-implicit Euler), a torque acts half a physics step early;
             with this it does not.
+        is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
     """
 
     is_implicit_model = False
@@ -138,22 +153,33 @@ class PaceDCMotor:
         self.torque_enable: torch.Tensor | None = None
         self.holds_line = False
         self.centred = False
+        self.is_trapezoidal = False
         self._first_call = True
         self._speed_slope: torch.Tensor | None = None
+        self._loop_slope: torch.Tensor | None = None
+        self._run: _Run | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
         self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
         delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
-        delay, max_delay = delay_in_steps(cfg, cfg.physics_dt or physics_dt)
-        for note in step_notes(cfg, cfg.physics_dt or physics_dt):
+        dt = self._physics_dt = cfg.physics_dt or physics_dt
+        delay, max_delay = delay_in_steps(cfg, dt)
+        for note in step_notes(cfg, dt):
             warnings.warn(note, stacklevel=2)
-        self._delay_buffers = {
-            name: DelayBuffer(max_delay, num_envs, self._device, cfg.delay_interpolation) for name in delayed
-        }
-        self._silent: set[str] = set()  # commands that were not given at the last control step
+        self._calls_per_run = calls = calls_per_run(cfg, dt)
+        self._delays = DriveDelays(
+            delayed,
+            max_delay,
+            num_envs,
+            self._device,
+            cfg.delay_interpolation,
+            runs=cfg.control_decimation // calls,
+            parts=calls,
+        )
+        self._asked = self.computed_effort
         self._calls_until_control = 0
         self.update_time_lags(delay)
-        self.effects = self._make_effects(cfg.physics_dt or physics_dt)
+        self.effects = self._make_effects(dt)
         self.update_effects()
 
     @property
@@ -174,7 +200,7 @@ class PaceDCMotor:
     @property
     def time_lags(self) -> torch.Tensor:
         """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
-        return next(iter(self._delay_buffers.values())).time_lags
+        return self._delays.time_lags
 
     def compute(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> Any:
         """Turn commands into joint torques.
@@ -191,15 +217,22 @@ class PaceDCMotor:
         """
         if self.effects is not None:
             self.effects.begin_step(joint_pos, joint_vel)
-        asked = self.computed_effort
+        before, first = self._asked, self._first_call
         if self._calls_until_control == 0:
-            before, first = asked, self._first_call
-            asked = self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
-            self._calls_until_control = self.cfg.control_decimation
+            self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
+            self._calls_until_control = self._calls_per_run
             self._first_call = False
-            if self.centred and not first:
-                asked = 0.5 * (before + asked)
+        elif self._delays.changes(part := self._calls_per_run - self._calls_until_control):
+            self.computed_effort = self._effort_command_at(part)
         self._calls_until_control -= 1
+        asked = self.computed_effort
+        if self.effects is not None and self.effects.has("effort_command"):
+            asked = self.effects.asked_of_drive(asked)
+            if self._loop_slope is not None:
+                self._loop_slope = self._loop_slope * self.effects.state.speed_slope
+        self._asked = asked
+        if self.centred and not first and asked is not before:
+            asked = 0.5 * (before + asked)
         effort = self.drive_effort(asked, joint_pos, joint_vel)
         if self.effects is not None:
             effort = self.transmitted_effort(effort)
@@ -217,7 +250,7 @@ class PaceDCMotor:
     def compute_effort_command(
         self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor
     ) -> torch.Tensor:
-        """The controller's part, once per control step: encoder, delays and PD law.
+        """The controller's part, once per run of it: encoder, delays and PD law.
 
         Args:
             control_action: As in :meth:`compute`.
@@ -230,25 +263,65 @@ class PaceDCMotor:
         target = control_action.joint_positions
         if target is not None and self.effects is not None:
             target = self.effects.target_inside(target)
-        position = self._delayed("positions", target)
-        velocity = self._delayed("velocities", control_action.joint_velocities)
-        feed_forward = self._delayed("efforts", control_action.joint_efforts)
+        position = self._delays.push("positions", target)
+        velocity = self._delays.push("velocities", control_action.joint_velocities)
+        feed_forward = self._delays.push("efforts", control_action.joint_efforts)
         stiffness, damping, encoder_vel = self.stiffness, self.damping, joint_vel
         if self.effects is not None:
             encoder_vel, stiffness, damping = self.effects.seen_by_controller(joint_vel, stiffness, damping)
         encoder_pos = self.sensed_position(joint_pos) - self.encoder_bias
+        if self.cfg.implicit:
+            encoder_pos = self._within_the_step(encoder_pos, encoder_vel, stiffness, damping)
         if position is None:  # no position target: velocity and effort control
             position = encoder_pos
         velocity_error = -encoder_vel if velocity is None else velocity - encoder_vel
         position_error = position - encoder_pos
         effort = pd_effort(position_error, velocity_error, stiffness, damping)
-        if self.effects is not None:
+        if self._calls_per_run > 1:
+            self._run = _Run(encoder_pos, encoder_vel.clone(), stiffness, damping, velocity, feed_forward)
+        if self.effects is not None and self.effects.has("controller_effort"):
+            if target is not None:
+                position_error = self._delays.mean("positions", position) - encoder_pos
+            plain = effort.clone()
             effort = self.effects.given_by_controller(effort, position_error)
+            if self._run is not None:
+                self._run.added = effort - plain
         if feed_forward is not None:
             effort += feed_forward
+        return self._delays.push("torque", effort) if self.cfg.delay_mode == "effort" else effort
+
+    def _effort_command_at(self, part: int) -> torch.Tensor:
+        """The controller's torque [N m] at a call between two of its runs, when a command or a torque has arrived."""
+        delays, run = self._delays, self._run
         if self.cfg.delay_mode == "effort":
-            effort = self._delay_buffers["torque"].compute(effort)
-        return effort if self.effects is None else self.effects.asked_of_drive(effort)
+            return delays.at("torque", part, self.computed_effort)
+        if run is None:  # a subclass has a law of its own
+            return self.computed_effort
+        position = delays.at("positions", part, None)
+        velocity = delays.at("velocities", part, run.velocity)
+        feed_forward = delays.at("efforts", part, run.feed_forward)
+        position_error = torch.zeros_like(run.encoder_pos) if position is None else position - run.encoder_pos
+        velocity_error = -run.encoder_vel if velocity is None else velocity - run.encoder_vel
+        effort = pd_effort(position_error, velocity_error, run.stiffness, run.damping)
+        for more in (run.added, feed_forward):
+            if more is not None:
+                effort += more
+        return effort
+
+    def _within_the_step(
+        self, position: torch.Tensor, speed: torch.Tensor, stiffness: torch.Tensor, damping: torch.Tensor
+    ) -> torch.Tensor:
+        """What a continuous controller sees of the position in the coming step [rad]; sets its slope over the speed.
+
+        Where a simulator moves positions with the mean speed, the law is that of the middle of the step.
+        """
+        sees_all = self.effects is None or not self.effects.has("sensed_velocity")
+        self._loop_slope = damping if sees_all else damping * self.effects.state.speed_slope  # type: ignore[union-attr]
+        if not self.is_trapezoidal or self._physics_dt is None:
+            return position
+        half = 0.5 * self._physics_dt
+        self._loop_slope = self._loop_slope + half * stiffness
+        return torch.add(position, speed, alpha=half)
 
     def drive_effort(
         self, effort_command: torch.Tensor, joint_pos: torch.Tensor, joint_vel: torch.Tensor
@@ -268,13 +341,18 @@ class PaceDCMotor:
         clip = clip_effort
         if self.effects is not None and self.effects.acts_in_drive:
             asked = torch.clamp(asked, -self.effort_limit, self.effort_limit)
-            asked, slope = self.effects.given_by_drive(asked)
+            if (slope := self._loop_slope) is not None:
+                slope = slope * (asked == effort_command)
+            asked, slope = self.effects.given_by_drive(asked, slope)
             clip = clip_to_line
         effort = clip(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
+        own = self._loop_slope if slope is None else slope
         if self.holds_line:
             line = self.saturation_effort / self.velocity_limit
             free = effort.abs() != self.effort_limit
-            self._speed_slope = torch.where(effort == asked, 0.0 if slope is None else slope, line * free)
+            self._speed_slope = torch.where(effort == asked, 0.0 if own is None else own, line * free)
+        elif self._loop_slope is not None:
+            self._speed_slope = (self._loop_slope if own is None else own) * (effort == asked)
         if self.torque_enable is not None:
             effort = effort * self.torque_enable
             if self._speed_slope is not None:
@@ -331,7 +409,7 @@ class PaceDCMotor:
     @property
     def changes_passive(self) -> bool:
         """Whether ``joint_friction`` and ``joint_viscous_friction`` change from call to call."""
-        return self.holds_line or (self.effects is not None and self.effects.changes_passive)
+        return self.holds_line or self.cfg.implicit or (self.effects is not None and self.effects.changes_passive)
 
     @property
     def needs_load(self) -> bool:
@@ -414,10 +492,8 @@ class PaceDCMotor:
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments; parameters stay."""
-        for buffer in self._delay_buffers.values():
-            buffer.reset(env_ids)
+        self._delays.reset(env_ids)
         if env_ids is None:
-            self._silent.clear()
             self._calls_until_control = 0
             self._first_call = True
         if self.effects is not None:
@@ -439,8 +515,7 @@ class PaceDCMotor:
                 f"delay has shape {tuple(delay.shape)}, expected 1 or {self.num_joints} columns: "
                 "one delay per environment or per joint."
             )
-        for buffer in self._delay_buffers.values():
-            buffer.set_time_lag(delay, env_ids)
+        self._delays.set_time_lag(delay, env_ids)
 
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
@@ -460,25 +535,11 @@ class PaceDCMotor:
             self._joint_names,
             self._num_envs,
             dt=physics_dt,
-            control_dt=physics_dt * self.cfg.control_decimation,
+            control_dt=physics_dt * self._calls_per_run,
             delay_mode=self.cfg.delay_mode,
             device=self._device,
             dtype=self._dtype,
         )
-
-    def _delayed(self, name: str, data: torch.Tensor | None) -> torch.Tensor | None:
-        buffer = self._delay_buffers.get(name)
-        if buffer is None:
-            return data
-        if data is None:
-            self._silent.add(name)
-            return None
-        if name in self._silent:  # until now there was no target, or it was zero
-            self._silent.remove(name)
-            buffer.reset()
-            if name != "positions":
-                buffer.compute(torch.zeros_like(data))
-        return buffer.compute(data)
 
 
 def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:

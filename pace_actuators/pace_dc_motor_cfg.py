@@ -75,7 +75,16 @@ class PaceDCMotorCfg:
     """Between samples: ``"linear"``, or ``"hold"`` for whole steps only."""
 
     control_decimation: int = 1
-    """Calls of ``compute`` (physics steps) per control step; the commanded torque is held in between."""
+    """Calls of ``compute`` (physics steps) per control step; commands are held in between, and so is the controller's
+    torque unless ``drive_dt`` or ``implicit`` says otherwise."""
+
+    drive_dt: float | None = None
+    """Time between two runs of the drive's own controller [s], a whole fraction of the control step: commands come
+    once per control step and are held. ``None`` runs it once per control step."""
+
+    implicit: bool = False
+    """Whether the controller runs continuously, as that of a position actuator in a model file: at every physics step,
+    and its damping (and the stiffness behind it) acts on the motion within the step. Other loops hold their torque."""
 
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects beyond this base model, by name (``"stribeck_friction"``) or with their values."""

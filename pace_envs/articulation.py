@@ -443,6 +443,7 @@ class Articulation:
         for actuator in self.actuators.values():
             actuator.holds_line = actuator.cfg.control_decimation > 1 or self._sim.is_trapezoidal
             actuator.centred = actuator.holds_line and not self._sim.is_trapezoidal
+            actuator.is_trapezoidal = self._sim.is_trapezoidal
             if actuator.effects is not None:
                 actuator.effects.is_trapezoidal = self._sim.is_trapezoidal
             driven = actuator.joint_indices

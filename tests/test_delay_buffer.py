@@ -39,6 +39,31 @@ def test_a_ramp_comes_out_delayed(lag, interpolation, expected):
 
 
 @settings(deadline=None, max_examples=50)
+@given(lag=st.floats(0.0, 3.5), parts=st.integers(2, 6), seed=st.integers(0, 1000))
+def test_within_a_step_a_held_signal_switches_at_its_instant(lag, parts, seed):
+    """Each part shows the mean of the held signal over it, and all parts together the linear mix of samples."""
+    samples = np.random.default_rng(seed).normal(size=8)
+    buffer, whole = DelayBuffer(3.5, 1, parts=parts), DelayBuffer(3.5, 1)
+    buffer.set_time_lag(lag)
+    whole.set_time_lag(lag)
+    edges = np.concatenate([np.arange(len(samples) + 1) + lag, (np.arange(8 * parts + 1)) / parts])
+    for k, sample in enumerate(samples):
+        pushed = torch.full((1, 1), sample, dtype=torch.float64)
+        first, linear = float(buffer.compute(pushed)), float(whole.compute(pushed))
+        shown = [first, *(float(buffer.part(p)) for p in range(1, parts))]
+        for p, value in enumerate(shown):
+            begin, end = k + p / parts, k + (p + 1) / parts
+            cuts = np.unique([begin, *edges[(edges > begin) & (edges < end)], end])
+            middle = 0.5 * (cuts[1:] + cuts[:-1])
+            held = samples[np.clip(np.floor(middle - lag).astype(int), 0, None)]
+            assert value == pytest.approx(float(np.sum(held * np.diff(cuts)) / (end - begin)), abs=1e-9)
+            if p and not buffer.changes(p):
+                assert value == pytest.approx(shown[p - 1], abs=1e-12)
+        assert np.mean(shown) == pytest.approx(linear, abs=1e-9)
+        assert float(buffer.mean()) == pytest.approx(linear, abs=1e-12)
+
+
+@settings(deadline=None, max_examples=50)
 @given(
     lags=st.lists(st.floats(0.0, 6.5), min_size=2, max_size=4),
     per_joint=st.booleans(),

@@ -127,7 +127,7 @@ def test_a_link_swings_on_behind_a_motor_that_sticks():
 def test_a_finer_step_changes_the_motion_by_less_than_the_noise(name):
     effects = {} if name is None else {name: draw_effect(name, ROBOT, np.random.default_rng(1))}
     truth = Truth(base=BASE, effects=effects)
-    usual, fine = (positions(truth, cfg=PlantCfg(noise=0.0, step=step)) for step in (2.5e-4, 5e-5))
+    usual, fine = (positions(truth, cfg=PlantCfg(noise=0.0, step=step)) for step in (PlantCfg().step, 5e-5))
     assert motion_change(usual, fine) < (1e-4 if name == "backlash" else 3e-5)
 
 

@@ -150,11 +150,12 @@ class OtherDelay(Effect):
     delay: torch.Tensor
 
     def prepare(self) -> None:
-        """Lags in control steps."""
+        """Lags in the steps of the path: torques pass at every physics step, targets at every run of the controller."""
+        dt = self.dt if self.delay_mode == "command" else self.control_dt
         if not hasattr(self, "_buffer"):
-            upper = self.parameters[0].upper / self.control_dt
+            upper = self.parameters[0].upper / dt
             self._buffer = DelayBuffer(upper, self.shape[0], self._options["device"])
-        lags = self.delay / self.control_dt
+        lags = self.delay / dt
         self._buffer.set_time_lag(lags.clamp(0.0, self._buffer.max_delay).double())
 
     def reset_state(self, rows: torch.Tensor | slice) -> None:
@@ -170,6 +171,7 @@ class OtherDelay(Effect):
         """Delay the torque where the base delays the command."""
         if self.delay_mode == "command":
             s.effort = self._buffer.compute(s.effort)
+            s.speed_slope *= (1 - self.delay / self.dt).clamp(min=0.0)
 
 
 @register_effect

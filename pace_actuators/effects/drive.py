@@ -34,6 +34,7 @@ class TorqueGain(Effect):
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
         s.effort *= 1 + self.gain
+        s.speed_slope *= 1 + self.gain
 
 
 @register_effect
@@ -67,6 +68,7 @@ class DriveBandwidth(Effect):
         before, asked = self._torque, s.effort.clone()
         self._torque = torch.lerp(before, asked, self._weight)
         s.effort = torch.lerp(before, asked, self._mean_weight)
+        s.speed_slope *= self._mean_weight
 
 
 @register_effect
@@ -118,6 +120,7 @@ class TorqueLimit(Effect):
 
     def current_limit(self, s: DriveState) -> None:
         """Clip."""
+        s.speed_slope *= s.effort.abs() <= self.effort
         s.effort = torch.clamp(s.effort, -self.effort, self.effort)
 
 

@@ -20,7 +20,8 @@ class DriveState:
         stiffness: kp [N m/rad].
         damping: kd [N m s/rad].
         effort: The torque on its way to the joint [N m].
-        speed_slope: How fast a limit in force lets the torque fall with the speed [N m s/rad], ≥ 0.
+        speed_slope: How fast the torque falls with the speed within a physics step, by a limit in force or a controller
+            that runs continuously [N m s/rad], ≥ 0; while the speed is sensed, the part of it that the controller sees.
         friction: Level of Coulomb friction that the simulator is to apply [N m]; it holds a joint that sticks.
         viscous_friction: What the simulator is to apply [N m s/rad].
         implicit_damping: More of it, which must act on the speed at the end of the step [N m s/rad].

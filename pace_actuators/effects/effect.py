@@ -81,7 +81,7 @@ class Effect:
     Attributes:
         rows: Which environments it acts on; the others never see it.
         dt: Time between two calls of the drive (the physics step) [s].
-        control_dt: Time between two control steps [s].
+        control_dt: Time between two runs of the controller [s], the control step unless the drive has its own.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
         new_rows: Which rows have no history yet, (rows, 1) bool; ``None`` if all have.
     """
@@ -148,7 +148,7 @@ class Effect:
             num_envs: Number of environments of the drive.
             num_joints: Number of joints of the drive.
             dt: Time between two calls [s].
-            control_dt: Time between two control steps [s].
+            control_dt: Time between two runs of the controller [s].
             delay_mode: What the drive's own delay delays.
             rows: Which environments it acts on.
             device: Device of all tensors.
@@ -180,22 +180,22 @@ class Effect:
         """Once per physics step, before all else: bring the own state to the present joint state."""
 
     def command(self, s: DriveState) -> None:
-        """Once per control step, before the command's delay: change ``s.joint_pos_target``."""
+        """Once per run of the controller, before the command's delay: change ``s.joint_pos_target``."""
 
     def measurement(self, s: DriveState) -> None:
         """Whenever the encoder is read: change ``s.encoder_pos`` (before the bias)."""
 
     def sensed_velocity(self, s: DriveState) -> None:
-        """Once per control step: change ``s.encoder_vel``, the speed that the controller sees."""
+        """Once per run of the controller: change ``s.encoder_vel``, the speed that the controller sees."""
 
     def controller(self, s: DriveState) -> None:
-        """Once per control step: change ``s.stiffness`` and ``s.damping``."""
+        """Once per run of the controller: change ``s.stiffness`` and ``s.damping``."""
 
     def controller_effort(self, s: DriveState) -> None:
-        """Once per control step, after the PD law and before delays: change ``s.effort``."""
+        """Once per run of the controller, after the PD law and before delays: change ``s.effort``."""
 
     def effort_command(self, s: DriveState) -> None:
-        """Once per control step, after the controller and its delay: change ``s.effort``."""
+        """Once per physics step, after the controller and its delay: change ``s.effort``."""
 
     def current_limit(self, s: DriveState) -> None:
         """Once per physics step, where the drive limits what is asked of it: change ``s.effort``."""

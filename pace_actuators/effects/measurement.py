@@ -30,6 +30,7 @@ class EncoderScale(Effect):
     def sensed_velocity(self, s: DriveState) -> None:
         """Scale the speed."""
         s.encoder_vel += self.error * s.joint_vel
+        s.speed_slope *= 1 + self.error
 
 
 @register_effect
@@ -87,6 +88,7 @@ class VelocityFilter(Effect):
             self._seen = torch.where(new, s.encoder_vel, self._seen)
         self._seen = torch.lerp(self._seen, s.encoder_vel, self._weight)
         s.encoder_vel = self._seen
+        s.speed_slope *= self._weight
 
 
 @register_effect

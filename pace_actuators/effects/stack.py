@@ -52,7 +52,7 @@ class EffectStack:
             joint_names: The drive's joints.
             num_envs: Number of environments.
             dt: Time between two calls of the drive [s].
-            control_dt: Time between two control steps [s].
+            control_dt: Time between two runs of the controller [s].
             delay_mode: What the drive's own delay delays.
             device: Device of all tensors.
             dtype: Type of all tensors.
@@ -196,9 +196,10 @@ class EffectStack:
     def seen_by_controller(
         self, joint_vel: torch.Tensor, stiffness: torch.Tensor, damping: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Speed and gains after the effects on them."""
+        """Speed and gains after the effects on them; ``state.speed_slope`` is the part of the speed that is seen."""
         s = self.state
         if self._at["sensed_velocity"]:
+            s.speed_slope.fill_(1.0)
             s.encoder_vel = joint_vel
             self.run("sensed_velocity")
             joint_vel = s.encoder_vel
@@ -218,22 +219,29 @@ class EffectStack:
         return s.effort.clone()
 
     def asked_of_drive(self, effort: torch.Tensor) -> torch.Tensor:
-        """The controller's torque after the effects on it [N m]."""
+        """The controller's torque after the effects on it [N m]; ``state.speed_slope`` is the newest one's part."""
         if not self._at["effort_command"]:
             return effort
+        self.state.speed_slope.fill_(1.0)
         self.state.effort = effort
         self.run("effort_command")
         return self.state.effort.clone()
 
-    def given_by_drive(self, effort: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def given_by_drive(
+        self, effort: torch.Tensor, speed_slope: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """The torque before the torque-speed line [N m], and how fast it falls with the speed where effects limit it.
 
         Args:
             effort: What is asked of the motor, within its limit [N m].
+            speed_slope: How fast that falls with the speed within the physics step; ``None`` for not at all.
         """
         s = self.state
         s.effort = effort
-        s.speed_slope.zero_()
+        if speed_slope is None:
+            s.speed_slope.zero_()
+        else:
+            s.speed_slope = speed_slope
         for stage in _IN_DRIVE:
             self.run(stage)
         return s.effort, s.speed_slope

@@ -24,7 +24,8 @@ def simulate_runs(
     """Make recordings of a robot with hidden effects, all side by side.
 
     At every control instant the encoder is read, that instant's target is issued, the controller computes, and its
-    torque holds until the next. The robot starts at rest with its encoder at the first target.
+    torque holds until the next, except that a late target acts when it arrives. The robot starts at rest with its
+    encoder at the first target.
 
     Args:
         task: Identification task, or a robot.
@@ -135,8 +136,10 @@ class _Session:
         beyond = math.ceil(max(0.0, float(drives.log_skew.max())) * steps) + 2  # the log's clock may run ahead
         noise = self._noise(steps + beyond, n)
         stages = _overriders(effects)
-        targets, torques = np.empty((steps + beyond, rows, n)), np.empty((steps + beyond, rows, n))
+        targets = np.empty((steps + beyond, rows, n))
         seen, speed, applied = np.empty_like(targets), np.empty_like(targets), np.empty_like(targets)
+        arriving = LateSignal(drives.command_delay / h) if drives.command_delay.any() else None
+        leaving = LateSignal(drives.effort_delay / h) if drives.effort_delay.any() else None
 
         dynamics = Dynamics(drives, body, effects, self._start(stages["measure"], issued[0] + drives.encoder_bias))
         for k in range(steps + beyond):
@@ -154,12 +157,14 @@ class _Session:
             for effect in stages["speed_feedback"]:
                 rate = effect.speed_feedback(rate, dt)
             torque = drives.stiffness * error - drives.damping * rate
+            plain = torque
             for effect in stages["controller"]:
                 torque = effect.controller(torque, error, dt)
-            torques[k] = torque
-            torque = delayed(torques, k, drives.effort_delay / dt)
+            rest = torque - plain - drives.stiffness * reading - drives.damping * rate
             for _ in range(substeps):
-                dynamics.step(torque, h)
+                if arriving is not None:
+                    torque = drives.stiffness * arriving(target) + rest
+                dynamics.step(torque if leaving is None else leaving(torque), h)
             applied[k] = dynamics.state.torque
             if k % 100 == 0:
                 self._check_finite(dynamics.q, k)
@@ -273,6 +278,28 @@ class _Session:
                 f"The plant diverges in {run!r} at {k * self.cfg.control_dt:.2f} s. Give it less delay, more damping "
                 "or lower gains."
             )
+
+
+class LateSignal:
+    """A signal that is constant over each integration step, late: its mean over every step, of what began before it."""
+
+    def __init__(self, delay: np.ndarray):
+        """Delays in integration steps, (R, n)."""
+        self._whole = np.floor(delay + 1e-9).astype(int)
+        self._part = np.maximum(delay - self._whole, 0.0)
+        self._ring: np.ndarray | None = None
+        self._now = -1
+
+    def __call__(self, value: np.ndarray) -> np.ndarray:
+        """What arrives in the step in which the value is sent; the first value holds before the start."""
+        if self._ring is None:
+            self._ring = np.repeat(value[None], int(self._whole.max()) + 2, axis=0)
+        length = len(self._ring)
+        self._now = (self._now + 1) % length
+        self._ring[self._now] = value
+        near, far = ((self._now - self._whole - more) % length for more in (0, 1))
+        late = np.take_along_axis(self._ring, near[None], axis=0)[0]
+        return late + self._part * (np.take_along_axis(self._ring, far[None], axis=0)[0] - late)
 
 
 def delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:

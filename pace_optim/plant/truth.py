@@ -51,8 +51,8 @@ class Truth:
 class PlantCfg:
     """How the plant is stepped and measured."""
 
-    step: float = 2.5e-4
-    """Longest integration step [s]. The integration is of second order: with 0.25 ms the bench's motions
+    step: float = 2.1e-4
+    """Longest integration step [s]. The integration is of second order: with 0.21 ms the bench's motions
     differ from those with 0.02 ms by 0.002 to 0.008 mrad RMS, a tenth of the usual noise at most."""
     control_dt: float = 0.0025
     """Time between two control instants [s]."""
