@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -196,6 +197,11 @@ class PaceDCMotor:
     def joint_indices(self) -> slice | torch.Tensor | Sequence[int]:
         """Indices of the group's joints in the articulation."""
         return self._joint_indices
+
+    @property
+    def run_dt(self) -> float:
+        """Time between two runs of the controller [s]; infinite where the physics step is not known."""
+        return math.inf if self._physics_dt is None else self._calls_per_run * self._physics_dt
 
     @property
     def time_lags(self) -> torch.Tensor:

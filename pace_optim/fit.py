@@ -154,6 +154,8 @@ class _Fit:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
+        coarse = problem.for_search()
+        self.searcher = self.evaluator if coarse is problem else coarse.training_evaluator()
         self.assessor: Evaluator = problem.evaluator()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
@@ -166,7 +168,8 @@ class _Fit:
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        return self._steps_before + self.evaluator.simulated_steps + self.assessor.simulated_steps
+        every = {self.searcher, self.evaluator, self.assessor}
+        return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
     def run(self, assess_interrupted: bool = True) -> tuple[FitResult, Path]:
         """Search, refine, assess, write."""
@@ -221,7 +224,7 @@ class _Fit:
 
     def _search(self, optimizer: CMAESOptimizer) -> list[torch.Tensor]:
         """Run CMA-ES; for the hybrid, until refining pays. Returns starts for the refinement, the best first."""
-        probe = RefiningPays(self.evaluator, self.colouring) if self.settings.optimizer == "hybrid" else None
+        probe = RefiningPays(self.searcher, self.colouring) if self.settings.optimizer == "hybrid" else None
 
         def after_generation(_: CMAESOptimizer) -> None:
             if probe is not None:
@@ -230,7 +233,7 @@ class _Fit:
 
         if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
             probe(optimizer)
-        search(optimizer, self.evaluator.rollout(optimizer.population_size), after_generation)
+        search(optimizer, self.searcher.rollout(optimizer.population_size), after_generation)
         optimizer.close()
         self._write_mean(optimizer)
         best = optimizer.best if probe is None or probe.refined is None else probe.refined

@@ -350,3 +350,100 @@ def test_a_motor_of_ones_own_overrides_one_stage():
     motor = WeakMotor(drive_cfg(effort_limit=8.0), JOINTS, slice(None), 1, dtype=torch.float64)
     assert torque(motor, 1.0).tolist() == [[4.0, 4.0]]
     assert motor.computed_effort.tolist() == [[10.0, 10.0]]
+
+
+# ---- the drive's own rate
+
+
+def stepped(motor: PaceDCMotor, *, inertia: float, dt: float, steps: int, target: float) -> list[float]:
+    """Positions of one inertia on the drive, by semi-implicit Euler with damping at the end of the step."""
+    q, v, seen = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64), []
+    action = ActuatorActions(torch.full_like(q, target))
+    for _ in range(steps):
+        motor.compute(action, q, v)
+        drag = motor.joint_viscous_friction
+        v = v + dt * (motor.held_effort - drag * v) / (inertia + dt * drag)
+        q = q + dt * v
+        seen.append(q.item())
+    return seen
+
+
+def one_joint(**fields) -> PaceDCMotor:
+    return drive(joints=("j",), **fields)
+
+
+def test_a_late_command_acts_within_the_control_step_and_a_held_one_at_its_beginning():
+    motor = one_joint(control_decimation=4, delay=1.375, physics_dt=0.001)
+    given = [torque(motor, float(k // 4))[0, 0].item() for k in range(16)]
+    assert given == pytest.approx([0, 0, 0, 0, 0, 0, 0, 0, 0, 5, 10, 10, 10, 15, 20, 20])
+    held = one_joint(control_decimation=4, delay=1.375, delay_interpolation="hold", physics_dt=0.001)
+    given = [torque(held, float(k // 4))[0, 0].item() for k in range(16)]
+    assert given == [0.0] * 12 + [10.0] * 4
+
+
+def test_the_feedback_is_that_of_the_controllers_last_run_when_a_late_command_arrives():
+    motor = one_joint(control_decimation=2, delay=0.5, damping=1.0)
+    q, v = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+    given = []
+    for k in range(4):
+        q.fill_(0.1 * k)
+        v.fill_(float(k))
+        action = ActuatorActions(torch.full_like(q, float(k // 2)), None, torch.full_like(q, 5.0 * (k // 2)))
+        given.append(motor.compute(action, q, v).joint_efforts.item())
+    assert given == pytest.approx([0.0, 0.0, -10 * 0.2 - 2.0, 10 * (1 - 0.2) - 2.0 + 5.0])
+
+
+@pytest.mark.parametrize("mode", ["command", "effort"])
+def test_a_delay_counts_control_steps_whatever_the_drives_own_rate(mode):
+    fields = {"delay": 1.5, "delay_mode": mode, "control_decimation": 4, "physics_dt": 0.001}
+    fast, slow = one_joint(**fields, drive_dt=0.002), one_joint(**fields)
+    assert fast.time_lags.tolist() == slow.time_lags.tolist() == [1.5]
+    given = [[torque(m, float(k // 4))[0, 0].item() for k in range(20)] for m in (fast, slow)]
+    assert given[0] == pytest.approx(given[1])
+
+
+def test_a_controller_with_a_rate_of_its_own_reads_the_encoder_at_that_rate():
+    motor = one_joint(control_decimation=4, physics_dt=0.001, drive_dt=0.002)
+    assert motor.run_dt == pytest.approx(0.002)
+    given = [torque(motor, 0.0, pos=0.1 * k)[0, 0].item() for k in range(5)]
+    assert given == pytest.approx([0, 0, -2, -2, -4])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"drive_dt": 0.0015}, "drive_dt is 0.0015 s and the physics step 0.001 s"),
+        ({"drive_dt": 0.0005}, "Make the physics step finer"),
+        ({"drive_dt": 0.003}, "expected a whole number of runs of the controller in a control step"),
+        ({"drive_dt": 0.002, "physics_dt": None}, "set physics_dt"),
+        ({"drive_dt": 0.002, "implicit": True}, "Leave out one of the two"),
+        ({"implicit": True, "delay_mode": "effort"}, "it acts at once"),
+    ],
+)
+def test_a_rate_that_does_not_fit_is_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        one_joint(**{"control_decimation": 4, "physics_dt": 0.001, **fields})
+
+
+def test_a_continuous_loop_is_mujocos_position_actuator():
+    """Stiff beyond what a held torque can hold: kd dt / inertia = 10. With its force limit, and exactly."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>'
+        '<joint name="j" axis="0 0 1" damping="0.3"/><inertial pos="0 0 0" mass="1" diaginertia="0.02 0.02 0.02"/>'
+        '</body></worldbody><actuator><position joint="j" kp="2000" kv="100" forcerange="-60 60"/></actuator></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.2
+    motor = one_joint(
+        stiffness=2000.0, damping=100.0, effort_limit=60.0, viscous_friction=0.3, implicit=True, physics_dt=0.002
+    )
+    mine = stepped(motor, inertia=0.02, dt=0.002, steps=300, target=0.2)
+    theirs = []
+    for _ in mine:
+        mujoco.mj_step(model, data)
+        theirs.append(data.qpos[0])
+    assert mine == pytest.approx(theirs, abs=1e-9)
+    assert mine[-1] == pytest.approx(0.2, abs=5e-3)
+    held = one_joint(stiffness=2000.0, damping=100.0, effort_limit=60.0, physics_dt=0.002)
+    assert max(abs(q - 0.2) for q in stepped(held, inertia=0.02, dt=0.002, steps=300, target=0.2)[-50:]) > 0.01

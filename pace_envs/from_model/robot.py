@@ -131,6 +131,7 @@ def _drive_cfg(joints: Sequence[JointFacts]) -> PaceDCMotorCfg:
         effort_limit=limits if np.isfinite(limits).any() else None,
         velocity_limit=speeds if np.isfinite(speeds).any() else None,
         max_delay=_longest_delay(),
+        implicit=any(joint.drive is not None for joint in joints),
     )
 
 

@@ -237,7 +237,7 @@ def search_effects(
     data = check_data(problem, twins, base, run)
     base, sentences = hold_late_joints(twins, base)
     data.sentences += sentences
-    absorbed = absorbed_effects(twins.with_physics_dt(twins.control_dt), base, candidates, effort)
+    absorbed = absorbed_effects(twins.with_physics_dt(twins.coarsest_dt), base, candidates, effort)
     base.model = replace(base.model, barred=absorbed)
 
     floor = FLOOR_MARGIN * data.floor

@@ -15,6 +15,7 @@ from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.problem.drive_steps import check_loops, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -49,6 +50,16 @@ class Problem:
     def physics_dt(self) -> float:
         """Physics step [s]."""
         return self.env_cfg.sim.dt
+
+    @property
+    def coarsest_dt(self) -> float:
+        """Longest physics step that the drives allow [s]: the control step, unless a drive runs faster."""
+        return self.plain_cfg.sim.dt
+
+    def for_search(self) -> Problem:
+        """The same at a longer physics step, to lead a search, where drives run continuously: all are stable."""
+        implicit = any(drive.implicit for drive in self.plain_cfg.scene.robot.actuators.values())
+        return self.with_physics_dt(self.coarsest_dt) if implicit else self
 
     @property
     def effects(self) -> list[str]:
@@ -119,16 +130,10 @@ def load_problem(
     if delay_mode is not None and delay_mode not in DELAY_MODES:
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
     control_dt = cfg.sim.dt * cfg.decimation
+    set_control_step(cfg)
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
-        drive_dt = cfg.sim.dt * drive.control_decimation
-        if abs(drive_dt - control_dt) > 1e-9:
-            raise ValueError(
-                f"The drive's controller runs every {1e3 * drive_dt:g} ms, the environment steps every "
-                f"{1e3 * control_dt:g} ms: identification needs both alike, so that a delay has one unit. Set the "
-                "drive's control_decimation to the environment's decimation."
-            )
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.max_delay < longest:
             raise ValueError(
@@ -136,11 +141,13 @@ def load_problem(
                 f"{drive.max_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
     cfg.scene.num_envs = 1
+    physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     paths = [Path(path) for path in data] or [Path(cfg.sim2real.data_dir)]
     recordings = [_load(path, env, control_dt) for path in paths]
     held_out = [_load(Path(path), env, control_dt) for path in validation]
+    recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     problem = Problem(
         task=task,
         plain_cfg=plain,
@@ -163,6 +170,12 @@ def _configured(
     if physics_dt is not None:
         set_physics_dt(cfg, physics_dt)
     return cfg
+
+
+def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings with what is to be told of their drives' loops."""
+    notes = check_loops(env, recordings)
+    return [replace(r, notes=(*r.notes, note)) if note else r for r, note in zip(recordings, notes, strict=True)]
 
 
 def _load(path: Path, env: ManagerBasedRLEnv, control_dt: float) -> Recording:

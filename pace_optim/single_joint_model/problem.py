@@ -54,8 +54,8 @@ class TwinProblem(Problem):
         return replace(self, dataset=windows.cut(self.dataset), path=path)
 
     def coarse(self) -> TwinProblem:
-        """The same in windows, and at the control step."""
-        return self.in_windows().with_physics_dt(self.control_dt)
+        """The same in windows, and at the longest physics step."""
+        return self.in_windows().with_physics_dt(self.coarsest_dt)
 
     def _evaluator(self, dataset: Dataset, path: ReferencePath) -> Evaluator:
         def make_env(num_envs: int) -> ManagerBasedRLEnv:

@@ -62,7 +62,7 @@ def _fit_along(
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
         return along(of, whole_vector(of, fitted.model.to_physical(fitted.x)), model_effects)
 
-    at_control_step = problem.with_physics_dt(problem.control_dt)
+    at_control_step = problem.with_physics_dt(problem.coarsest_dt)
     for i in range(_ROUNDS):
         say(f"base model, round {i + 1}")
         coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()

@@ -1,0 +1,149 @@
+"""The steps at which drives are simulated, and whether their loops are stable there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from pace_envs import ManagerBasedRLEnv, set_physics_dt
+from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.recording import Recording
+
+_FINE = 0.5
+"""Largest kd dt / inertia at which a continuous loop is simulated: its steps are of second order."""
+_FINEST = 10
+"""Physics steps per time step that are taken for that at most."""
+
+
+def set_control_step(cfg: PaceSim2realEnvCfg) -> None:
+    """Let commands come, and delays count, in steps of the environment: a drive that runs faster has its ``drive_dt``.
+
+    Args:
+        cfg: The environment; its drives are changed.
+
+    Raises:
+        ValueError: If a drive runs slower than the environment.
+    """
+    control_dt = cfg.sim.dt * cfg.decimation
+    for drive in cfg.scene.robot.actuators.values():
+        if drive.control_decimation == cfg.decimation:
+            continue
+        own = cfg.sim.dt * drive.control_decimation
+        if cfg.decimation % drive.control_decimation:
+            raise ValueError(
+                f"The drive's controller runs every {1e3 * own:g} ms, the environment steps every "
+                f"{1e3 * control_dt:g} ms: the one must divide the other. Set the drive's control_decimation to the "
+                "environment's decimation, and its own rate as drive_dt."
+            )
+        if drive.drive_dt is None and not drive.implicit:
+            drive.drive_dt = own
+        drive.delay, drive.max_delay = (steps * own / control_dt for steps in (drive.delay, drive.max_delay))
+        drive.control_decimation = cfg.decimation
+
+
+def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
+    """Make the physics step as fine as the drives' own rates.
+
+    Args:
+        cfg: The environment; it is changed.
+
+    Returns:
+        The physics step at which drives that run continuously are simulated well [s]; ``None`` if the present one is
+        fine enough. A search may take the present one: it is stable.
+    """
+    own = [drive.drive_dt for drive in cfg.scene.robot.actuators.values() if drive.drive_dt is not None]
+    if own and min(own) < cfg.sim.dt * (1 - 1e-9):
+        set_physics_dt(cfg, min(own))
+    if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
+        cfg.scene.num_envs = 1
+        env = ManagerBasedRLEnv(cfg)
+        inverse = _inverse_inertia(env, upper=False)
+        damping = _of_joints(env, "damping", only_implicit=True)
+        env.close()
+        steep = float((damping * cfg.sim.dt * inverse.diagonal()).max())
+        if steep > _FINE:
+            return cfg.sim.dt / min(_FINEST, math.ceil(steep / _FINE))
+    return None
+
+
+def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[str]:
+    """Whether the drives' loops are stable at their steps with the gains of each recording.
+
+    With inertia M and armature, a loop that holds its torque over dt is unstable where an eigenvalue of
+    M⁻¹ (kd dt + kp dt² / 2) exceeds 2.
+
+    Returns:
+        A note per recording whose loop is unstable with the armature of the configuration; empty if it is not.
+
+    Raises:
+        ValueError: If a loop is unstable even with the largest armature that may be identified.
+    """
+    names = env.scene["robot"].joint_names
+    dt = _of_joints(env, "_run_dt")
+    surely, likely = (_inverse_inertia(env, upper=upper) for upper in (True, False))
+    notes = []
+    for recording in recordings:
+        kp = _stated(recording.drive.stiffness, _of_joints(env, "stiffness"))
+        kd = _stated(recording.drive.damping, _of_joints(env, "damping"))
+        pull = np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
+        note = ""
+        for inverse, certain in ((surely, True), (likely, False)):
+            root = np.sqrt(pull)
+            values, vectors = np.linalg.eigh(root[:, None] * inverse * root)
+            if values[-1] <= 2 * (1 + 1e-9):
+                continue
+            j = int(np.abs(vectors[:, -1]).argmax())
+            felt = inverse[j, j]
+            told = (
+                f"the loop of {names[j]} is unstable at its step of {1e3 * dt[j]:g} ms: kd dt / inertia is "
+                f"{kd[j] * dt[j] * felt:.3g} and kp dt² / inertia {kp[j] * dt[j] ** 2 * felt:.3g} (with an armature of "
+                f"{_armature(env, certain)[j]:.3g}), expected kd dt + kp dt² / 2 below 2 times the inertia. A real "
+                "drive runs its loop faster than that: set drive_dt in its PaceDCMotorCfg, or implicit=True; or "
+                "correct the gains"
+            )
+            if certain:
+                raise ValueError(f"{recording.name}: {told}.")
+            note = f"{told}."
+        notes.append(note)
+    return notes
+
+
+def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
+    return configured if own is None else np.broadcast_to(np.asarray(own, dtype=float), configured.shape)
+
+
+def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
+    """Of the configuration, or the largest that may be identified, (n,) [kg m²]."""
+    own = _of_joints(env, "armature")
+    bounds = env.cfg.sim2real.bounds_params[: len(own)].numpy()  # type: ignore[attr-defined]
+    return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
+
+
+def _of_joints(env: ManagerBasedRLEnv, name: str, only_implicit: bool = False) -> np.ndarray:
+    """A drive's values per joint, (n,); ``_run_dt``: time between two runs of a loop that holds its torque [s]."""
+    robot = env.scene["robot"]
+    result = np.zeros(robot.num_joints)
+    for drive in robot.actuators.values():
+        ids = drive.joint_indices
+        where = ids if isinstance(ids, slice) else np.asarray(ids)
+        if name == "_run_dt":
+            result[where] = 0.0 if drive.cfg.implicit else drive.run_dt
+        elif drive.cfg.implicit or not only_implicit:
+            result[where] = getattr(drive, name)[0].cpu().numpy()
+    return result
+
+
+def _inverse_inertia(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
+    """(M + armature)⁻¹ of the joints at the default posture, (n, n)."""
+    robot, model = env.scene["robot"], env.sim.model
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    columns = robot.dof_columns.numpy()
+    data.qpos[model.jnt_qposadr[model.dof_jntid[columns]]] = robot.data.default_joint_pos[0].numpy()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    own = mass[np.ix_(columns, columns)]
+    own[np.diag_indices(len(columns))] += _armature(env, upper) - model.dof_armature[columns]
+    return np.linalg.inv(own + 1e-12 * np.eye(len(columns)))
