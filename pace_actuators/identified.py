@@ -5,7 +5,6 @@ Delays travel in seconds, because a control step is another time in every enviro
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -13,18 +12,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pace_actuators.drive_result import ALL, BASE_FIELDS, CURE, DriveResult, result_path
 from pace_actuators.effects import EffectCfg
+from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
 
 if TYPE_CHECKING:
     from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-
-VERSION = 1
-ALL = "all"
-"""Key of a value that all joints share."""
-
-BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
-"""Parameters of the base model per joint, named as in ``PaceDCMotorCfg``."""
 
 DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 """Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
@@ -91,38 +85,22 @@ class IdentifiedDrives:
         Raises:
             ValueError: If it is missing, damaged, of another version, or holds an unknown effect.
         """
-        path = Path(path)
-        path = path / "result.json" if path.is_dir() else path
-        if not path.is_file():
-            raise ValueError(f"{path} does not exist. Name a run's folder or its result.json.")
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is no JSON ({error}). Name the result.json of a fit.") from None
-        if not isinstance(content, dict) or content.get("version") != VERSION:
-            raise ValueError(f"{path} is no fit result of version {VERSION}. Fit again with this version.")
-        try:
-            parameters = content["parameters"]
-            physics_dt, delay_s = float(content["physics_dt"]), float(content["delay_s"])
-            control_dt = float(content.get("control_dt") or _control_dt(parameters, delay_s, physics_dt))
-            result = cls(
-                path=path,
-                task=content["task"],
-                joint_names=tuple(content["joint_names"]),
-                delay_mode=content["delay_mode"],
-                delay_s=delay_s,
-                at=IdentifiedAt(control_dt=control_dt, physics_dt=physics_dt),
-                parameters=parameters,
-                std=content.get("std") or {},
-                correlation=content.get("correlation") or {},
-                effects=tuple(_parsed(path, label) for label in content["effects"]),
-                drive=content.get("drive") or {},
-            )
-            result._check()
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"{path} is no complete fit result ({type(error).__name__}: {error}). Fit again."
-            ) from None
+        path = result_path(path)
+        content = DriveResult.load(path)
+        result = cls(
+            path=path,
+            task=content.task,
+            joint_names=tuple(content.joint_names),
+            delay_mode=content.delay_mode,
+            delay_s=content.delay_s,
+            at=IdentifiedAt(control_dt=content.control_dt, physics_dt=content.physics_dt),
+            parameters=content.parameters,
+            std=content.std,
+            correlation=content.correlation,
+            effects=tuple(_parsed(path, label) for label in content.effects),
+            drive=content.drive,
+        )
+        result._check()
         return result
 
     def values(self, name: str, joints: Sequence[str]) -> dict[str, float]:
@@ -188,20 +166,13 @@ class IdentifiedDrives:
         return result
 
     def _check(self) -> None:
-        if self.delay_mode not in ("command", "effort"):
-            raise ValueError(f"{self.path}: delay_mode is {self.delay_mode!r}, expected 'command' or 'effort'.")
-        expected = {name: self.joint_names for name in BASE_FIELDS}
+        """Each parameter of an effect must have a value on each joint that has the effect."""
         for cfg in self.effects:
             for parameter in cfg.effect_class.parameters:
-                expected[f"{cfg.effect_class.name}.{parameter.name}"] = tuple(cfg.joints(self.joint_names))
-        for name, joints in expected.items():
-            known = self.values(name, joints)
-            if missing := [joint for joint in joints if joint not in known]:
-                raise ValueError(f"{self.path}: {name} has no value for {', '.join(missing)}. Fit again.")
-            if bad := [joint for joint, value in known.items() if not math.isfinite(value)]:
-                raise ValueError(f"{self.path}: {name} of {bad[0]} is {known[bad[0]]}, expected a finite number.")
-        if not (math.isfinite(self.delay_s) and self.delay_s >= 0 and self.at.control_dt > 0 < self.at.physics_dt):
-            raise ValueError(f"{self.path}: delay_s, control_dt and physics_dt must be finite and > 0. Fit again.")
+                name, joints = f"{cfg.effect_class.name}.{parameter.name}", cfg.joints(self.joint_names)
+                known = self.values(name, joints) if name in self.parameters else {}
+                if missing := [joint for joint in joints if joint not in known]:
+                    refuse(self.path, f"{name} has no value for {', '.join(missing)}", CURE)
 
 
 def delay_in_steps(cfg: PaceDCMotorCfg, physics_dt: float | None) -> tuple[float, float]:
@@ -275,9 +246,3 @@ def _by_pattern(values: Mapping[str, float]) -> dict[str, float] | float:
     """By regular expression of the joint; one number where all are alike."""
     alike = set(values.values())
     return alike.pop() if len(alike) == 1 else {re.escape(joint): value for joint, value in values.items()}
-
-
-def _control_dt(parameters: Mapping[str, Mapping[str, float]], delay_s: float, physics_dt: float) -> float:
-    """What a result without it implies."""
-    delay = parameters["delay"][ALL]
-    return delay_s / delay if delay else physics_dt

@@ -190,7 +190,7 @@ class _Fit:
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
         self._steps_before = int(checkpoint["simulated_steps"])
-        self.history = self.folder.read_history()
+        self.history = self.folder.history_of(checkpoint)
         if self.optimizer is not None and checkpoint["history"].size:
             self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process)
             self._search_stop = checkpoint["search_stop"].tolist()

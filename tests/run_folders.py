@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from pace_optim.run.history import History
@@ -32,23 +33,27 @@ AT_BOUND = "friction/ankle"
 
 
 def make_result(**changes: Any) -> FitResult:
-    """A plausible result; the ankle's friction is at its bound."""
-    keys = {name: ("all",) if name == "delay" else JOINTS for name in UNITS}
+    """A plausible result, of other joints if they are named; the last one's friction is at its bound."""
+    joints = tuple(changes.get("joint_names", JOINTS))
+    keys = {name: ("all",) if name == "delay" else joints for name in UNITS}
     values = {name: {key: VALUES[name] * (1 + 0.1 * i) for i, key in enumerate(keys[name])} for name in UNITS}
-    values["friction"]["ankle"] = 0.5
+    values["friction"][joints[-1]] = 0.5
     std: dict[str, dict[str, float | None]] = {
         name: {key: 0.02 * value for key, value in entries.items()} for name, entries in values.items()
     }
-    std["friction"]["ankle"] = None
-    unknown = LABELS.index(AT_BOUND)
+    std["friction"][joints[-1]] = None
+    labels = [f"{name}/{key}" for name, each in keys.items() for key in each]
+    at_bound = f"friction/{joints[-1]}"
+    unknown = labels.index(at_bound)
     matrix = [
-        [None if unknown in (i, j) else 1.0 if i == j else round(0.9 / (1 + abs(i - j)), 6) for j in range(len(LABELS))]
-        for i in range(len(LABELS))
+        [None if unknown in (i, j) else 1.0 if i == j else round(0.9 / (1 + abs(i - j)), 6) for j in range(len(labels))]
+        for i in range(len(labels))
     ]
+    errors = dict(zip(joints, np.linspace(0.002, 0.004, len(joints)).tolist(), strict=True))
     content: dict[str, Any] = {
         "task": "Pace-Leg-v0",
         "robot_name": "leg",
-        "joint_names": list(JOINTS),
+        "joint_names": list(joints),
         "effects": [],
         "delay_mode": "command",
         "physics_dt": 0.0025,
@@ -57,14 +62,18 @@ def make_result(**changes: Any) -> FitResult:
         "delay_s": values["delay"]["all"] * 0.0025,
         "std": std,
         "units": UNITS,
-        "at_bound": [AT_BOUND],
+        "at_bound": [at_bound],
         "no_influence": [],
-        "indistinguishable": [["friction/hip", "encoder_bias/hip"]],
-        "correlation": {"labels": list(LABELS), "matrix": matrix},
+        "indistinguishable": [[f"friction/{joints[0]}", f"encoder_bias/{joints[0]}"]],
+        "correlation": {"labels": labels, "matrix": matrix},
         "score": 3e-5,
         "rmse": {
-            "train": {"hip": 0.002, "knee": 0.003, "ankle": 0.004, "all": 0.0031},
-            "validation": {"hip": 0.0025, "knee": 0.0035, "ankle": 0.0061, "all": 0.0043},
+            "train": {**errors, "all": 0.0031},
+            "validation": {
+                **{joint: 1.25 * error for joint, error in errors.items()},
+                joints[-1]: 0.0061,
+                "all": 0.0043,
+            },
         },
         "recordings": {"train": ["chirp (first 70 %)"], "validation": ["chirp (last 30 %)", "steps"]},
         "optimizer": "hybrid",

@@ -204,15 +204,13 @@ def finished(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "content", "expected"),
     [
-        ("settings.json", "{", "settings.json cannot be read"),
-        ("settings.json", "{}", "settings.json cannot be read"),
-        ("settings.json", '{"settings": {"tusk": 1}, "digests": {}}', "settings.json cannot be read"),
+        ("settings.json", "{", "settings.json is no JSON"),
+        ("settings.json", "{}", "settings.json: settings is missing"),
+        ("settings.json", '{"settings": {"tusk": 1}, "digests": {}}', "settings.json: settings: the key 'tusk' is not"),
         ("settings.json", '{"settings": {"task": "Pace-X-v0"}, "digests": {}}', "no environment 'Pace-X-v0'"),
         ("checkpoint.npz", None, "has no checkpoint.npz: it cannot be resumed. Start a new fit."),
         ("checkpoint.npz", "nonsense", "checkpoint.npz cannot be read"),
         ("checkpoint.npz", "", "checkpoint.npz cannot be read"),
-        ("history.json", "{", "history.json cannot be read"),
-        ("history.json", None, "history.json cannot be read"),
     ],
 )
 def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, tmp_path):

@@ -121,9 +121,12 @@ def test_seconds_need_the_time_of_a_step(result):
         ({"effects": ["warp_drive"]}, r"no effect 'warp_drive'.*Import the module"),
         ({"effects": ["torque_offset"]}, "torque_offset.effort"),
         ({"parameters": {"armature": {"LF_HAA": 0.1}}}, "armature has no value for LF_HFE"),
-        ({"parameters": {"friction": dict.fromkeys(JOINTS, math.nan)}}, "friction of LF_HAA is nan"),
+        (
+            {"parameters": {"friction": dict.fromkeys(JOINTS, math.nan)}},
+            "friction/LF_HAA is nan, expected",
+        ),
         ({"delay_mode": "torque"}, "delay_mode is 'torque'"),
-        ({"joint_names": None}, "no complete fit result"),
+        ({"joint_names": None}, "joint_names is 3, expected a list"),
     ],
 )
 def test_unusable_results_are_refused(result, changes, said):

@@ -185,7 +185,8 @@ def test_values_that_are_no_numbers_do_not_break_it(tmp_path):
 
 
 def test_twenty_seconds_of_twelve_joints_stay_below_eight_megabytes(tmp_path):
-    folder = write_run(tmp_path / "run")
+    names = [f"joint_{i}" for i in range(12)]
+    folder = write_run(tmp_path / "run", make_result(joint_names=names))
     generator = torch.Generator().manual_seed(0)
 
     def recording(samples):
@@ -194,7 +195,6 @@ def test_twenty_seconds_of_twelve_joints_stay_below_eight_megabytes(tmp_path):
         part = {"time": time, "des_dof_pos": motion, "dof_pos": motion + 0.1, "sim_dof_pos": motion, "train": time < 9}
         return part | {"name": f"{samples}"}
 
-    names = [f"joint_{i}" for i in range(12)]
     write_tensors(folder / "best_trajectory.pt", {"joint_names": names, "recordings": [recording(8000)]})
     assert write_report(folder).stat().st_size < 7.5e6
     content = {"joint_names": names, "recordings": [recording(60_000) for _ in range(3)]}

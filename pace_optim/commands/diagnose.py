@@ -1,10 +1,11 @@
 """Find out which physical effect a run's model lacks."""
 
+from pathlib import Path
+
 import torch
 
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
-from pace_optim.report import write_report
 from pace_optim.terminal.cli import make_parser
 
 
@@ -37,11 +38,11 @@ def main() -> None:
     torch.set_num_threads(1)  # many small tensors
     diagnosis = diagnose(DiagnosisSettings(**vars(args)), on_verdict=_tell)
     for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
-        print(f"report: {write_report(run)}")
+        print(f"report: {Path(run) / 'report.html'}")
     print(f"run: {diagnosis.runs[-1]}")
 
 
 def _tell(diagnosis: Diagnosis) -> None:
-    """Print what was found, and let the report of the run tell it, before the robot is fitted again."""
+    """Print what was found, before the robot is fitted again."""
     print("\n".join(lines_of(diagnosis)))
-    print(f"report: {write_report(diagnosis.run)}", flush=True)
+    print(f"report: {Path(diagnosis.run) / 'report.html'}", flush=True)

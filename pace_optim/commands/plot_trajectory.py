@@ -1,16 +1,18 @@
 """Look at a run: what was commanded, measured and simulated, and how the score fell."""
 
-import json
+import io
 from pathlib import Path
 
 import matplotlib
 import torch
 from matplotlib.figure import Figure
 
+from pace_actuators.files import write_together
 from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.run.find import find_mean, find_run
 from pace_optim.run.history import History
 from pace_optim.run.replay import replay
+from pace_optim.run.tensors import read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser
 
 
@@ -43,23 +45,30 @@ def main() -> None:
     if args.plot_trajectory or both:
         if args.mean_name:
             path = find_mean(run, args.mean_name)
-            content, of = replay(run, torch.load(path, weights_only=True)), path.stem
+            content, of = replay(run, read_mean(path)), path.stem
         else:
-            content, of = torch.load(existing(run / "best_trajectory.pt"), weights_only=True), "best"
+            content, of = read_trajectory(run), "best"
         drawn = plot_trajectories(content, title=f"{title} · {of}", make_figure=plt.figure)
         figures |= {stem if of == "best" else f"{stem}_{of}": figure for stem, figure in drawn.items()}
     if args.plot_score or both:
-        history = History(**json.loads(existing(run / "history.json").read_text()))
+        history = History.load(existing(run / "history.json"))
         figures["score"] = plot_scores(history, title=title, make_figure=plt.figure)
     if on_screen:
         plt.show()
         return
     output = Path(args.output) if args.output else run
+    files = {output / f"{name}.png": png(figure) for name, figure in figures.items()}
     output.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        path = output / f"{name}.png"
-        figure.savefig(path, dpi=110)
+    write_together(files)
+    for path in files:
         print(f"plot: {path}")
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a file."""
+    made = io.BytesIO()
+    figure.savefig(made, format="png", dpi=110)
+    return made.getvalue()
 
 
 def has_display() -> bool:
@@ -80,7 +89,7 @@ def existing(path: Path) -> Path:
     Raises:
         ValueError: If there is no such file.
     """
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(
             f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
             f"scripts/fit.py --resume {path.parent}"

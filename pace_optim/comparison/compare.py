@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.report import write_report
+from pace_actuators.files import write_together
+from pace_optim.report import check_folder, report_text
 from pace_optim.report.trajectory_errors import held_out_spans
-from pace_optim.terminal.atomic import write_atomically
 
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder
@@ -43,17 +43,20 @@ def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt:
     paths = [run_folder(folder) for folder in folders]
     if repeated := [str(path) for i, path in enumerate(paths) if path in paths[:i]]:
         raise ValueError(f"{repeated[0]} is named twice. Name each run once, the base model first.")
+    for path in paths:
+        check_folder(path, anew=FILE)
     runs = [load_tracks(path, data, physics_dt) for path in paths]
     check_alike(runs)
-    content: dict[str, Any] = {}
-    for i, run in enumerate(runs):
-        content = compare_run(run)
-        if len(runs) > 1 and i == len(runs) - 1:
-            content["ladder"] = make_ladder(runs)
-        content = plain(content)
-        write_atomically(run.folder / FILE, lambda file, c=content: file.write(_dump(c).encode()))  # type: ignore[misc]
-        write_report(run.folder)
-    return content
+    contents = [compare_run(run) for run in runs]
+    if len(runs) > 1:
+        contents[-1]["ladder"] = make_ladder(runs)
+    contents = [plain(content) for content in contents]
+    files: dict[Path, bytes] = {}
+    for run, content in zip(runs, contents, strict=True):
+        files[run.folder / FILE] = _dump(content).encode()
+        files[run.folder / "report.html"] = report_text(run.folder, {FILE: content})
+    write_together(files)
+    return contents[-1]
 
 
 def run_folder(folder: str | Path) -> Path:

@@ -16,6 +16,7 @@ from pace_optim.problem.problem import Problem, file_digest, load_problem
 from pace_optim.recording import Drive, Recording
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
+from pace_optim.run.tensors import read_trajectory
 from pace_optim.uncertainty.assessment import trajectories
 
 from .load_torque import load_torques
@@ -91,7 +92,7 @@ def load_tracks(folder: Path, data: Sequence[str] = (), physics_dt: float | None
         physical = problem.space.from_dict(result.parameters)
         content = trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled))
     else:
-        content = _best_trajectory(folder)
+        content = read_trajectory(folder)
     _check_finite(folder, content)
     recordings = None if problem is None else problem.dataset.recordings
     if recordings is not None and not _are_those(recordings, content):
@@ -141,16 +142,6 @@ def _reload(folder: Path, data: Sequence[str], physics_dt: float | None, *, with
     return load_problem(**wanted)
 
 
-def _best_trajectory(folder: Path) -> dict[str, Any]:
-    path = folder / "best_trajectory.pt"
-    if not path.is_file():
-        raise ValueError(
-            f"{folder} has no best_trajectory.pt yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {folder}"
-        )
-    return torch.load(path, weights_only=True)
-
-
 def _check_finite(folder: Path, content: dict[str, Any]) -> None:
     for entry in content["recordings"]:
         if not bool(torch.as_tensor(entry["sim_dof_pos"]).isfinite().all()):
@@ -180,7 +171,7 @@ def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
     if not data or not (folder / "best_trajectory.pt").is_file():
         return []
     _, digests = FitSettings.load(folder / "settings.json")  # in the order of the recordings
-    entries = _best_trajectory(folder)["recordings"]
+    entries = read_trajectory(folder)["recordings"]
     if len(digests) != len(entries):
         return []
     known = {

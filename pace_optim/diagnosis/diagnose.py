@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from pace_actuators.effects import Effect, available_effects, get_effect
+from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import FLOOR_MARGIN, DataCheck, check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
@@ -23,7 +24,7 @@ from pace_optim.diagnosis.search.pooling import share
 from pace_optim.diagnosis.search.search import Outcome, add_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.telling.advice import advise
-from pace_optim.diagnosis.telling.result import Diagnosis
+from pace_optim.diagnosis.telling.result import FILE, Diagnosis
 from pace_optim.diagnosis.verdict.contributions import DOMINANT, shares
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in, stand_ins, varying
@@ -31,6 +32,7 @@ from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, likes, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.report import check_folder, report_text
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.cli import command
@@ -87,6 +89,7 @@ def diagnose(
     begin = time.monotonic()
     progress = progress or ProgressLine()
     folder = Path(settings.run)
+    check_folder(folder, anew=FILE)
     result = FitResult.load(folder)
     run_settings, _ = FitSettings.load(folder / "settings.json")
     candidates = candidate_effects(settings.effects, only=settings.only)
@@ -130,16 +133,24 @@ def diagnose(
         error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors),
         wall_time_s=time.monotonic() - begin,
     )
-    diagnosis.save(folder)
+    _save(diagnosis)
     progress.close()
     on_verdict(diagnosis)
     explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
     if refit and found.paying and (path := _refit(found, problem, run_settings, diagnosis, progress)) is not None:
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
-        for run in diagnosis.runs:
-            diagnosis.save(run)
+        _save(diagnosis)
     return diagnosis
+
+
+def _save(diagnosis: Diagnosis) -> None:
+    """Write the diagnosis and the report of each of its runs, all or nothing."""
+    files: dict[Path, bytes] = {}
+    for run in map(Path, diagnosis.runs):
+        files[run / FILE] = json_text(asdict(diagnosis))
+        files[run / "report.html"] = report_text(run, {FILE: asdict(diagnosis)})
+    write_together(files)
 
 
 def _other_error(found: Findings, problem: Problem, run: FitResult) -> list[str]:

@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 import torch
 
@@ -37,7 +37,7 @@ class Problem:
     dataset: Dataset
     space: ParameterSpace
     trees: list[list[str]]
-    delay_mode: str
+    delay_mode: Literal["command", "effort"]
     control_dt: float
     """Control step [s]."""
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from plotly.offline import get_plotlyjs
 
-from pace_optim.terminal.atomic import write_atomically
+from pace_actuators.files import write_atomically
 
 from .markup import Section, esc
 from .run_data import RunData
@@ -29,12 +31,57 @@ def write_report(folder: str | Path) -> Path:
     Raises:
         ValueError: If there is no result.
     """
-    folder = Path(folder)
-    run = RunData.load(folder)
-    text = render(run, [section for make in SECTIONS if (section := make(run)) is not None])
-    path = folder / "report.html"
-    write_atomically(path, lambda file: file.write(text.encode()))
+    path = Path(folder) / "report.html"
+    text = report_text(folder)
+    write_atomically(path, lambda file: file.write(text))
     return path
+
+
+def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> bytes:
+    """The page's content.
+
+    Args:
+        folder: The run's folder.
+        new: Content of JSON files that are about to be written, by name, in place of what is there.
+
+    Raises:
+        ValueError: If there is no result, or a file is damaged; the message names it.
+    """
+    run = RunData.load(Path(folder), new)
+    return render(run, make_sections(run)).encode()
+
+
+def check_folder(folder: str | Path, *, anew: str) -> None:
+    """Read all that the report of a run is made of, so that what is damaged is told before the work.
+
+    Args:
+        folder: The run's folder.
+        anew: The file that the work writes anew, which need not be sound.
+
+    Raises:
+        ValueError: If a file is damaged; the message names it.
+    """
+    make_sections(RunData.load(Path(folder), {anew: None}))
+
+
+def make_sections(run: RunData) -> list[Section]:
+    """All sections that the run's files are there for.
+
+    Raises:
+        ValueError: If a file that one is about is damaged; the message names it.
+    """
+    sections = []
+    for make, name in SECTIONS.items():
+        try:
+            section = make(run)
+        except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
+            if name is None or str(run.folder) in str(error):
+                raise
+            what = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise ValueError(f"{run.folder / name} is damaged ({what}). Remove it, or make it anew.") from error
+        if section is not None:
+            sections.append(section)
+    return sections
 
 
 def render(run: RunData, sections: list[Section]) -> str:

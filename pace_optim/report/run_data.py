@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from pace_actuators.files import read_json, refuse
 from pace_optim.run.history import History
 from pace_optim.run.result import FitResult
+from pace_optim.run.tensors import read_bounds, read_trajectory
+
+_CURE = "Remove it or make it anew: fit, compare or diagnose again."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,34 +46,42 @@ class RunData:
     bounds: dict[str, tuple[float, float]]
     """Lower and upper bound by label ``<parameter>/<joint>``, physical."""
     settings: dict[str, Any]
+    new: Mapping[str, Any]
+    """Content of JSON files that are about to be written, by name."""
 
     @classmethod
-    def load(cls, folder: Path) -> RunData:
+    def load(cls, folder: Path, new: Mapping[str, Any] | None = None) -> RunData:
         """Read a run's folder.
 
+        Args:
+            folder: The folder.
+            new: Content of JSON files that are about to be written, by name, in place of what is there.
+
         Raises:
-            ValueError: If it has no result.
+            ValueError: If it has no result, or a file is damaged.
         """
         result = FitResult.load(folder)
-        history = _read_json(folder / "history.json")
-        config = _read_tensors(folder / "config.pt") or {}
-        trajectory = _read_tensors(folder / "best_trajectory.pt") or {}
-        bounds = config["bounds_params"].tolist() if "bounds_params" in config else []
+        trajectory = {} if not (folder / "best_trajectory.pt").exists() else read_trajectory(folder)
+        names = tuple(trajectory.get("joint_names", result.joint_names))
+        if names != tuple(result.joint_names):
+            refuse(folder / "best_trajectory.pt", "joint_names are not those of result.json", _CURE)
+        settings = _read_json(folder / "settings.json") or {}
+        if not isinstance(settings, dict) or not isinstance(settings.get("settings", {}), dict):
+            refuse(folder / "settings.json", "settings is no object with keys", _CURE)
         return cls(
             folder=folder,
             result=result,
-            history=None if history is None else History(**history),
-            joint_names=tuple(trajectory.get("joint_names", result.joint_names)),
+            history=History.load(folder / "history.json") if (folder / "history.json").exists() else None,
+            joint_names=names,
             recordings=tuple(_recording(content) for content in trajectory.get("recordings", [])),
-            bounds={
-                label: (low, high) for label, (low, high) in zip(config.get("parameters", []), bounds, strict=True)
-            },
-            settings=(_read_json(folder / "settings.json") or {}).get("settings", {}),
+            bounds=read_bounds(folder),
+            settings=settings.get("settings", {}),
+            new=new or {},
         )
 
     def read_json(self, name: str) -> Any | None:
         """Another file of the folder, ``None`` if it is not there; for sections about later steps."""
-        return _read_json(self.folder / name)
+        return self.new[name] if name in self.new else _read_json(self.folder / name)
 
 
 def _recording(content: dict[str, Any]) -> RecordingData:
@@ -86,8 +97,4 @@ def _recording(content: dict[str, Any]) -> RecordingData:
 
 
 def _read_json(path: Path) -> Any | None:
-    return json.loads(path.read_text()) if path.is_file() else None
-
-
-def _read_tensors(path: Path) -> Any | None:
-    return torch.load(path, weights_only=True) if path.is_file() else None
+    return read_json(path, _CURE) if path.exists() else None

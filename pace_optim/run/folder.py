@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from pace_actuators.files import checked, json_text, refuse, write_atomically, write_json, write_tensors, writing
+from pace_actuators.files.writing import Writer
 from pace_optim.run.history import History
-from pace_optim.terminal.atomic import write_atomically, write_json, write_tensors
+from pace_optim.terminal.arrays import read_arrays
 from pace_optim.terminal.cli import command
 
 if TYPE_CHECKING:
@@ -34,6 +35,22 @@ diagnosis.json       which physical effect is missing, once {diagnose} was run
 events.out.*         TensorBoard: tensorboard --logdir {folder}
 settings.json, checkpoint.npz   what `{fit} --resume {folder}` needs
 """
+
+
+_ANEW = "Start a new fit."
+
+_CHECKPOINT = {
+    "history": ("f", 3),
+    "line_generation": ("i", 0),
+    "search_stop": ("U", 1),
+    "simulated_steps": ("i", 0),
+    "descent_x": ("f", 2),
+    "descent_state": ("f", 2),
+    "descent_stop": ("U", 1),
+    "descent_scores": ("U", 0),
+    "scores": ("U", 0),
+}
+"""Kind of number and number of axes of each array of a checkpoint."""
 
 
 class RunFolder:
@@ -90,7 +107,6 @@ class RunFolder:
         scores: History,
     ) -> None:
         """The state of the search and of the refinement, as plain numbers, and the scores so far."""
-        write_json(self.path / "history.json", scores.to_dict())
         history = np.stack(optimizer.history) if optimizer and optimizer.history else np.zeros((0, 0, 0))
         arrays = {
             "history": history,
@@ -103,8 +119,14 @@ class RunFolder:
             ).reshape(-1, 5),
             "descent_stop": np.array([d.stop_reason or "" for d in descents], dtype=str),
             "descent_scores": np.array(json.dumps([d.scores for d in descents])),
+            "scores": np.array(json.dumps(scores.to_dict())),
         }
-        write_atomically(self.path / "checkpoint.npz", lambda file: np.savez(file, **arrays))  # type: ignore[arg-type]
+        files: dict[Path, Writer] = {
+            self.path / "history.json": lambda file: file.write(json_text(scores.to_dict())),
+            self.path / "checkpoint.npz": lambda file: np.savez(file, **arrays),  # type: ignore[arg-type]
+        }
+        with writing(files):
+            pass
 
     def read_checkpoint(self) -> dict[str, np.ndarray]:
         """What :meth:`write_checkpoint` wrote.
@@ -113,25 +135,34 @@ class RunFolder:
             ValueError: If there is none, or it is damaged.
         """
         path = self.path / "checkpoint.npz"
-        if not path.is_file():
-            raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. Start a new fit.")
-        try:
-            with np.load(path, allow_pickle=False) as content:
-                return {key: content[key] for key in content.files}
-        except (OSError, ValueError, EOFError, AttributeError, BadZipFile) as error:
-            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None
+        if not path.exists():
+            raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. {_ANEW}")
+        arrays = read_arrays(path, _ANEW)
+        for name, (kind, axes) in _CHECKPOINT.items():
+            if name not in arrays:
+                refuse(path, f"{name} is missing", _ANEW)
+            if arrays[name].dtype.kind != kind or arrays[name].ndim != axes:
+                refuse(path, f"{name} is of another type or shape", _ANEW)
+            if kind == "f" and np.isnan(arrays[name]).any():
+                refuse(path, f"{name} holds values that are no numbers", _ANEW)
+        if len({len(arrays[name]) for name in ("descent_x", "descent_state", "descent_stop")}) > 1:
+            refuse(path, "its descents are not of one number", _ANEW)
+        if arrays["descent_state"].shape[1] != 5:
+            refuse(path, "descent_state is of another shape", _ANEW)
+        return arrays
 
-    def read_history(self) -> History:
-        """The scores so far, as :meth:`write_checkpoint` wrote them.
+    def history_of(self, checkpoint: dict[str, np.ndarray]) -> History:
+        """The scores up to a checkpoint: ``history.json`` may be of one moment later.
 
         Raises:
-            ValueError: If the file is missing or damaged.
+            ValueError: If they are damaged.
         """
-        path = self.path / "history.json"
+        where = f"{self.path / 'checkpoint.npz'}: scores"
         try:
-            return History(**json.loads(path.read_text()))
-        except (OSError, TypeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None
+            content = json.loads(str(checkpoint["scores"]))
+        except (ValueError, RecursionError):
+            refuse(where, "is no JSON", _ANEW)
+        return checked(History, content, where, _ANEW)
 
     def write_mean(self, generation: int, physical: torch.Tensor) -> None:
         """The mean of the search after a generation."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from pace_actuators.files import checked, read_json
 
 
 @dataclass(kw_only=True)
@@ -23,6 +26,16 @@ class History:
     """Simulated steps after each iteration of the refinement."""
     refine_time_s: list[float] = field(default_factory=list)
     """Wall time after each iteration of the refinement [s]."""
+
+    @classmethod
+    def load(cls, path: Path) -> History:
+        """Read ``history.json``.
+
+        Raises:
+            ValueError: If it is missing or damaged.
+        """
+        cure = "Fit again, or go on with the run: it is written anew."
+        return checked(cls, read_json(path, cure), path, cure)
 
     def to_dict(self) -> dict[str, list]:
         """For a JSON file."""

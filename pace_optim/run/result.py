@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,30 +10,20 @@ from typing import Any
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
+from pace_actuators.drive_result import ALL, CURE, DriveResult
+from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
-from pace_optim.terminal.atomic import write_json
 from pace_optim.uncertainty.uncertainty import Uncertainty
-
-VERSION = 1
 
 
 @dataclass(kw_only=True)
-class FitResult:
+class FitResult(DriveResult):
     """The content of ``result.json``; field names are the file's keys."""
 
-    version: int = VERSION
-    task: str
     robot_name: str
-    joint_names: list[str]
-    effects: list[str]
-    delay_mode: str
-    physics_dt: float
-    control_dt: float
-    parameters: dict[str, dict[str, float]]
-    delay_s: float
     std: dict[str, dict[str, float | None]]
     units: dict[str, str]
     at_bound: list[str]
@@ -52,31 +41,35 @@ class FitResult:
     stop_reasons: list[str]
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    drive: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def check(self, source: object) -> None:
+        """Check what the types of the fields do not say.
+
+        Raises:
+            ValueError: If something does not fit; the message names the key.
+        """
+        super().check(source)
+        for name, entries in self.parameters.items():
+            if name not in self.units:
+                refuse(source, f"units has no {name}", CURE)
+            if missing := [key for key in entries if key not in self.std.get(name, {})]:
+                refuse(source, f"std/{name} has no {missing[0]}", CURE)
+        for part in ("train", "validation"):
+            if part not in self.rmse or part not in self.recordings:
+                refuse(source, f"rmse and recordings must have {part}", CURE)
+            entries = self.rmse[part]
+            if entries and (missing := [key for key in (*self.joint_names, ALL) if key not in entries]):
+                refuse(source, f"rmse/{part} has no {missing[0]}", CURE)
+        if not self.rmse["train"]:
+            refuse(source, "rmse/train has no values", CURE)
+        labels = {f"{name}/{key}" for name, entries in self.parameters.items() for key in entries}
+        named = [*self.at_bound, *self.no_influence, *(label for group in self.indistinguishable for label in group)]
+        if foreign := [label for label in named if label not in labels]:
+            refuse(source, f"{foreign[0]!r} is none of its parameters", CURE)
 
     def save(self, path: Path) -> None:
         """Write the file atomically."""
         write_json(path, asdict(self))
-
-    @classmethod
-    def load(cls, path: str | Path) -> FitResult:
-        """Read ``result.json``, or that of a run's folder.
-
-        Raises:
-            ValueError: If it is missing or of another version.
-        """
-        path = Path(path)
-        path = path / "result.json" if path.is_dir() else path
-        if not path.is_file():
-            raise ValueError(f"{path} does not exist. Name a run's folder or its result.json.")
-        try:
-            content = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path} is no JSON ({error}). Fit again.") from None
-        if not isinstance(content, dict) or content.get("version") != VERSION:
-            raise ValueError(f"{path} is no fit result of version {VERSION}. Fit again with this version.")
-        known = cls.__dataclass_fields__
-        return cls(**{key: value for key, value in content.items() if key in known})
 
 
 def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[str, ...]) -> dict[str, float]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import checked, read_json
 from pace_optim.recording import without_fact_files
 
 OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
@@ -97,10 +97,17 @@ class FitSettings:
         Raises:
             ValueError: If the file is missing or unreadable.
         """
-        try:
-            content = json.loads(path.read_text())
-            return cls(**content["settings"]), content["digests"]
-        except FileNotFoundError:
-            raise ValueError(f"{path.parent} is no run that can be resumed: it has no {path.name}.") from None
-        except (KeyError, TypeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{path} cannot be read ({error}). Start a new fit.") from None
+        if not path.exists():
+            raise ValueError(f"{path.parent} is no run that can be resumed: it has no {path.name}.")
+        cure = "Start a new fit."
+        content = checked(_File, read_json(path, cure), path, cure)
+        settings = checked(cls, content.settings, f"{path}: settings", cure, strict=True)
+        return settings, content.digests
+
+
+@dataclass(kw_only=True)
+class _File:
+    """What ``settings.json`` holds."""
+
+    settings: dict[str, Any]
+    digests: dict[str, str]

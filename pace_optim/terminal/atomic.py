@@ -1,36 +1,5 @@
-"""Writing files so that a reader sees the old one or the new one, never a half."""
+"""Writing files whole or not at all: :mod:`pace_actuators.files` does it."""
 
-import json
-import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import IO, Any
+from pace_actuators.files import write_atomically, write_json, write_tensors
 
-import torch
-
-
-def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a file through a temporary one beside it.
-
-    Args:
-        path: The file.
-        write: Gets the open binary file.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON that can be read by eye."""
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_atomically(path, lambda file: file.write(text.encode()))
-
-
-def write_tensors(path: Path, content: Any) -> None:
-    """Write what ``torch.load(path, weights_only=True)`` reads."""
-    write_atomically(path, lambda file: torch.save(content, file))
+__all__ = ["write_atomically", "write_json", "write_tensors"]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pace_optim.terminal.atomic import write_json
+from pace_actuators.files import checked, read_json, write_json
 
 VERSION = 1
+FILE = "diagnosis.json"
 
 
 @dataclass(kw_only=True)
@@ -63,7 +63,7 @@ class Diagnosis:
 
     def save(self, folder: str | Path) -> Path:
         """Write ``diagnosis.json`` to a run's folder, atomically."""
-        path = Path(folder) / "diagnosis.json"
+        path = Path(folder) / FILE
         write_json(path, asdict(self))
         return path
 
@@ -74,10 +74,9 @@ class Diagnosis:
         Raises:
             ValueError: If it is missing or of another version.
         """
-        path = Path(folder) / "diagnosis.json"
-        if not path.is_file():
-            raise ValueError(f"{path} does not exist. Run scripts/diagnose.py {folder} first.")
-        content = json.loads(path.read_text())
-        if content.get("version") != VERSION:
-            raise ValueError(f"{path} is no diagnosis of version {VERSION}. Diagnose again.")
-        return cls(**{key: value for key, value in content.items() if key in cls.__dataclass_fields__})
+        path = Path(folder) / FILE
+        cure = f"Run scripts/diagnose.py {folder} first." if not path.exists() else "Diagnose again."
+        content = read_json(path, cure)
+        if not isinstance(content, dict) or content.get("version") != VERSION:
+            raise ValueError(f"{path} is no diagnosis of version {VERSION}. {cure}")
+        return checked(cls, content, path, cure)

@@ -20,18 +20,19 @@ from .recordings import recordings
 from .scores import scores
 from .trajectories import trajectories
 
-SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
-    overview,
-    ladder,
-    trajectories,
-    failure,
-    diagnosis,
-    parameters,
-    consistency,
-    correlation,
-    scores,
-    recordings,
-    making,
-)
+SECTIONS: dict[Callable[[RunData], Section | None], str | None] = {
+    overview: None,
+    ladder: "comparison.json",
+    trajectories: None,
+    failure: "comparison.json",
+    diagnosis: "diagnosis.json",
+    parameters: None,
+    consistency: "consistency.json",
+    correlation: None,
+    scores: "history.json",
+    recordings: None,
+    making: "settings.json",
+}
+"""Each with the file that it is about, where that is another than those of the fit."""
 
 __all__ = ["SECTIONS"]

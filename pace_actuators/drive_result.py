@@ -1,0 +1,109 @@
+"""The part of ``result.json`` that a drive needs: its schema, with one reader for all who read results."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pace_actuators.files import checked, file_at, read_json, refuse
+
+VERSION = 1
+ALL = "all"
+"""Key of a value that all joints share."""
+
+BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
+"""Parameters of the base model per joint, named as in ``PaceDCMotorCfg``."""
+
+CURE = "Fit again."
+
+
+@dataclass(kw_only=True)
+class DriveResult:
+    """What an identification says of the drives; field names are the file's keys."""
+
+    version: int = VERSION
+    task: str
+    joint_names: list[str]
+    effects: list[str]
+    delay_mode: Literal["command", "effort"]
+    physics_dt: float
+    control_dt: float
+    parameters: dict[str, dict[str, float]]
+    """Value by parameter and joint (or ``"all"``)."""
+    delay_s: float
+    std: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    """Standard deviations of the same shape; ``None`` where there is none."""
+    correlation: dict[str, Any] = field(default_factory=dict)
+    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
+    drive: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Gains and limits per joint that were in force in every recording, as far as known."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read ``result.json``, or that of a run's folder.
+
+        Raises:
+            ValueError: If it is missing, damaged, or of another version; the message names the file and the key.
+        """
+        path = result_path(path)
+        content = read_json(path, "Name the result.json of a fit, or its run's folder.")
+        if not isinstance(content, dict) or content.get("version") != VERSION:
+            raise ValueError(f"{path} is no fit result of version {VERSION}. Fit again with this version.")
+        result = checked(cls, content, path, CURE)
+        result.check(path)
+        return result
+
+    def check(self, source: object) -> None:
+        """Check what the types of the fields do not say.
+
+        Args:
+            source: The file, for messages.
+
+        Raises:
+            ValueError: If something does not fit; the message names the key.
+        """
+        if not self.joint_names or len(set(self.joint_names)) < len(self.joint_names):
+            refuse(source, "joint_names must be a list of different names", CURE)
+        for name in BASE_FIELDS:
+            self._expect(name, self.joint_names, source)
+        self._expect("delay", [ALL], source)
+        if not (self.delay_s >= 0 and self.control_dt > 0 and self.physics_dt > 0):
+            refuse(source, "delay_s, control_dt and physics_dt must be > 0", CURE)
+        self._check_correlation(source)
+
+    def _expect(self, name: str, keys: Sequence[str], source: object) -> None:
+        """A parameter must have a value for each key, or one for all."""
+        entries = self.parameters.get(name, {})
+        if missing := [key for key in keys if key not in entries and ALL not in entries]:
+            refuse(source, f"{name} has no value for {', '.join(missing)}", CURE)
+
+    def _check_correlation(self, source: object) -> None:
+        if not self.correlation:
+            return
+        labels, rows = self.correlation.get("labels"), self.correlation.get("matrix")
+        square = (
+            isinstance(labels, list)
+            and isinstance(rows, list)
+            and all(isinstance(label, str) and "/" in label for label in labels)
+            and len(rows) == len(labels)
+            and all(isinstance(row, list) and len(row) == len(labels) for row in rows)
+            and all(v is None or (isinstance(v, int | float) and math.isfinite(v)) for row in rows for v in row)
+        )
+        if not square:
+            refuse(source, "correlation must have labels (parameter/joint) and a matrix with a row for each", CURE)
+
+
+def result_path(path: str | Path) -> Path:
+    """Where the result of a run lies: the file itself, or that of the run's folder.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    path = Path(path)
+    with contextlib.suppress(OSError, ValueError):  # file_at says what is wrong
+        path = path / "result.json" if path.is_dir() else path
+    return file_at(path, "Name a run's folder or its result.json.")

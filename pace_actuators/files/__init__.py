@@ -1,0 +1,28 @@
+"""Reading files so that what is wrong with them is said by file and key, and writing them whole or not at all."""
+
+from pace_actuators.files.reading import file_at, read_json, read_tensors
+from pace_actuators.files.schema import checked, refuse
+from pace_actuators.files.writing import (
+    json_text,
+    remove_leftovers,
+    write_atomically,
+    write_json,
+    write_tensors,
+    write_together,
+    writing,
+)
+
+__all__ = [
+    "checked",
+    "file_at",
+    "json_text",
+    "read_json",
+    "read_tensors",
+    "refuse",
+    "remove_leftovers",
+    "write_atomically",
+    "write_json",
+    "write_tensors",
+    "write_together",
+    "writing",
+]

@@ -1,0 +1,96 @@
+"""Reading the tensors of a run's folder, checked: trajectories, bounds, a mean of the search."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pace_actuators.files import read_tensors, refuse
+
+_ANEW = "Fit again, or go on with the run."
+_SERIES = ("des_dof_pos", "dof_pos", "sim_dof_pos")
+
+
+def read_trajectory(folder: Path) -> dict[str, Any]:
+    """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
+
+    Raises:
+        ValueError: If it is missing or damaged; the message names the key.
+    """
+    path = folder / "best_trajectory.pt"
+    if not path.exists():
+        raise ValueError(
+            f"{folder} has no {path.name} yet: the fit has not ended. Wait, or go on with "
+            f"scripts/fit.py --resume {folder}"
+        )
+    content = _dict(read_tensors(path, _ANEW), path, ("joint_names", "recordings"))
+    names, recordings = content["joint_names"], content["recordings"]
+    if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+        refuse(path, "joint_names is no list of names", _ANEW)
+    if not (isinstance(recordings, list) and recordings):
+        refuse(path, "recordings is no list of recordings", _ANEW)
+    for r, entry in enumerate(recordings):
+        _check_recording(entry, f"{path}: recordings[{r}]", len(names))
+    return content
+
+
+def _check_recording(entry: Any, where: str, joints: int) -> None:
+    _dict(entry, where, ("name", "time", *_SERIES, "train"))
+    if not isinstance(entry["name"], str):
+        refuse(where, "name is no text", _ANEW)
+    time = entry["time"]
+    if not _is_series(time, 1) or len(time) < 2 or not bool((time.diff() > 0).all()):
+        refuse(where, "time does not increase, (K,) [s]", _ANEW)
+    for name in _SERIES:
+        shape = (len(time), joints)
+        if not _is_series(entry[name], 2, finite=name != "sim_dof_pos") or tuple(entry[name].shape) != shape:
+            refuse(where, f"{name} is no series of finite numbers of shape {shape}", _ANEW)
+    train = entry["train"]
+    if not (isinstance(train, torch.Tensor) and train.dtype == torch.bool and train.shape == time.shape):
+        refuse(where, f"train is no series of true and false of shape {tuple(time.shape)}", _ANEW)
+
+
+def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
+    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty where there is none.
+
+    Raises:
+        ValueError: If it is damaged.
+    """
+    path = folder / "config.pt"
+    if not path.exists():
+        return {}
+    content = _dict(read_tensors(path, _ANEW), path, ("parameters", "bounds_params"))
+    labels, bounds = content["parameters"], content["bounds_params"]
+    if not (isinstance(labels, list) and all(isinstance(label, str) for label in labels)):
+        refuse(path, "parameters is no list of labels", _ANEW)
+    if not _is_series(bounds, 2) or tuple(bounds.shape) != (len(labels), 2):
+        refuse(path, f"bounds_params is no tensor of finite numbers of shape {(len(labels), 2)}", _ANEW)
+    return {label: (low, high) for label, (low, high) in zip(labels, bounds.tolist(), strict=True)}
+
+
+def read_mean(path: Path) -> torch.Tensor:
+    """A mean of the search, (size,).
+
+    Raises:
+        ValueError: If the file is missing or damaged.
+    """
+    content = read_tensors(path, "Name another mean, or fit again.")
+    if not _is_series(content, 1):
+        refuse(path, "holds no vector of finite numbers", "Name another mean, or fit again.")
+    return content
+
+
+def _is_series(value: Any, axes: int, *, finite: bool = True) -> bool:
+    if not isinstance(value, torch.Tensor) or not value.is_floating_point() or value.ndim != axes:
+        return False
+    return not finite or bool(value.isfinite().all())
+
+
+def _dict(content: Any, where: object, keys: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        refuse(where, "holds no dict", _ANEW)
+    if missing := [key for key in keys if key not in content]:
+        refuse(where, f"{missing[0]} is missing", _ANEW)
+    return content
