@@ -41,6 +41,8 @@ class DriveResult:
     """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
     drive: dict[str, dict[str, float]] = field(default_factory=dict)
     """Gains and limits per joint that were in force in every recording, as far as known."""
+    undetermined: list[str] = field(default_factory=list)
+    """Labels (``parameter/joint``) of what the recordings do not determine: it keeps its prior value."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

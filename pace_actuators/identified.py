@@ -78,6 +78,9 @@ class IdentifiedDrives:
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Gains and limits per joint that were in force in every recording, as far as known."""
 
+    undetermined: frozenset[str] = frozenset()
+    """Labels ``parameter/joint`` that the recordings do not determine: their value is that of the configuration."""
+
     @classmethod
     def load(cls, path: str | Path) -> IdentifiedDrives:
         """Read ``result.json``, or that of a run's folder.
@@ -99,6 +102,7 @@ class IdentifiedDrives:
             correlation=content.correlation,
             effects=tuple(_parsed(path, label) for label in content.effects),
             drive=content.drive,
+            undetermined=frozenset(content.undetermined),
         )
         result._check()
         return result
@@ -109,6 +113,12 @@ class IdentifiedDrives:
         if ALL in entries:
             return dict.fromkeys(joints, float(entries[ALL]))
         return {joint: float(entries[joint]) for joint in joints if joint in entries}
+
+    def determined(self, name: str, joints: Sequence[str]) -> dict[str, float]:
+        """Value per joint of a parameter, for those of some joints on which the recordings determine it."""
+        if f"{name}/{ALL}" in self.undetermined:
+            return {}
+        return {j: value for j, value in self.values(name, joints).items() if f"{name}/{j}" not in self.undetermined}
 
     def find_joints(self, joint_names_expr: str | Sequence[str] | None) -> list[str]:
         """Its joints that match, in order; all for ``None``.
@@ -142,7 +152,8 @@ class IdentifiedDrives:
             "effects": tuple(self._effects_of(joints, on_the_rig)),
         }
         for name in BASE_FIELDS:
-            fields[name] = _by_pattern(self.values(name, joints))
+            if self.determined(name, joints):  # where none is, the drive keeps its own
+                fields[name] = _by_pattern(self.values(name, joints))
         for name in DRIVE_FIELDS:
             known = self.drive.get(name) or {}
             if all(joint in known for joint in joints):

@@ -12,6 +12,7 @@ import torch
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.optimizers.other_starts import other_valleys, scattered
 from pace_optim.optimizers.refine import refine
 from pace_optim.optimizers.search import RefiningPays, search
 from pace_optim.problem.evaluator import Evaluator
@@ -25,11 +26,16 @@ from pace_optim.run.tensorboard_log import TensorBoardLog
 from pace_optim.terminal.progress import ProgressLine
 from pace_optim.uncertainty.assessment import assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
+from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.uncertainty.other_solutions import with_other_solutions
+from pace_optim.uncertainty.undetermined import held_at_prior, undetermined, without
 from pace_optim.uncertainty.warnings import fit_warnings
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+
+_SCATTERED = 2
+"""Of the other starts that are tried where the only one ended far above the noise, those anywhere in the bounds."""
 
 _NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
@@ -162,6 +168,8 @@ class _Fit:
         self.descents: list[Descent] = []
         self._steps_before = 0
         self._search_stop: list[str] = []
+        self._searched = 0
+        """Other starts that were tried and ended no lower."""
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
@@ -209,12 +217,30 @@ class _Fit:
             self.descents = [Descent(x=start) for start in starts]
             self._write_checkpoint()
         self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
+        if self.settings.optimizer == "least_squares" and len(self.descents) == 1:
+            self._try_other_starts(self.descents[0])
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
 
     def _refine_from(self, x: torch.Tensor) -> Outcome:
         """Refine a known vector: it needs no coarse stage, and few steps."""
         self.descents = least_squares(self.evaluator, self.colouring, [x], _NEAR, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
+
+    def _try_other_starts(self, found: Descent) -> None:
+        """Where the only start ended far above the noise, refine a few others: it may be a wrong valley."""
+        rmse = (found.score / len(self.problem.joint_names)) ** 0.5
+        times = times_noise(self.problem, rmse)
+        if times is None or times < FAR_ABOVE_NOISE:
+            return
+        space = self.problem.space
+        vectors = [*other_valleys(space, found.x), *scattered(space, _SCATTERED, self.settings.seed)]
+        starts = [Descent(x=x) for x in vectors]
+        self.progress.say(f"{times:.3g} times the noise: trying {len(starts)} other starts")
+        others = refine(
+            self.evaluator, self.colouring, starts, lambda descents: self._after_iteration([found, *descents])
+        )
+        self.descents = sorted([found, *others], key=lambda d: d.score)
+        self._searched = len(starts) if self.descents[0] is found else 0
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
@@ -237,19 +263,7 @@ class _Fit:
         optimizer.close()
         self._write_mean(optimizer)
         best = optimizer.best if probe is None or probe.refined is None else probe.refined
-        return [best, *self._other_valleys(optimizer.best)]
-
-    def _other_valleys(self, best: torch.Tensor) -> list[torch.Tensor]:
-        """The best with another delay, and with neither bias nor friction: where least squares can get stuck."""
-        space, starts = self.problem.space, []
-        for delay in (-0.5, 0.5):
-            other = best.clone()
-            other[space["delay"]] = delay
-            starts.append(other)
-        other = best.clone()
-        other[space["encoder_bias"]] = 0.0
-        other[space["friction"]] = 0.0
-        return [*starts, other]
+        return [best, *other_valleys(self.problem.space, optimizer.best)]
 
     def _make_optimizer(self) -> CMAESOptimizer:
         cfg = self.problem.env_cfg.sim2real.cmaes
@@ -328,6 +342,16 @@ class _Fit:
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
         uncertainty, every = assess(problem, self.assessor, self.colouring, outcome.x)
         self._refuse_divergence(float(every.score[0]))
+        train = rmse_by_joint(every, data.train[every.step], problem.joint_names)["all"]
+        times = times_noise(problem, train)
+        far = times is not None and times >= FAR_ABOVE_NOISE
+        left_open = undetermined(problem, uncertainty, far)
+        if left_open:
+            refit = outcome.stop_reasons != ["interrupted"]
+            x, left_open = held_at_prior(problem, outcome.x, uncertainty, left_open, _NEAR if refit else None)
+            outcome = replace(outcome, x=x)
+            uncertainty, every = assess(problem, self.assessor, self.colouring, x)
+            uncertainty = without(uncertainty, left_open, space)
         uncertainty = with_other_solutions(uncertainty, self.descents, space)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
@@ -346,8 +370,18 @@ class _Fit:
             generations=self.optimizer.generation if self.optimizer else 0,
             simulated_steps=self.steps + consistency.simulated_steps,
             wall_time_s=self.progress.elapsed,
-            stop_reasons=outcome.stop_reasons,
-            warnings=[*fit_warnings(problem, physical, uncertainty, rmse), *consistency.sentences],
+            stop_reasons=[
+                f"stands still at {times:.3g} times the noise" if far and reason == "converged" else reason
+                for reason in outcome.stop_reasons
+            ],
+            undetermined=left_open,
+            times_noise=times,
+            std_means_nothing=far,
+            warnings=[
+                *far_end(times, train, self.settings.optimizer, self._searched, str(self.folder.path)),
+                *fit_warnings(problem, physical, uncertainty, rmse, left_open),
+                *consistency.sentences,
+            ],
         )
         result.save(self.folder.path / "result.json")
         return result

@@ -44,7 +44,7 @@ def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         "physics_dt_s": drives.at.physics_dt,
         "drive": {name: dict(values) for name, values in drives.drive.items()},
         "effects": [effect.label for effect in drives.effects],
-        "parameters": {name: drives.values(name, joints) for name in names},
+        "parameters": {name: drives.determined(name, joints) for name in names},
     }
     return json.dumps(content, indent=2) + "\n", []
 

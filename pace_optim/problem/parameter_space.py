@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -50,6 +51,18 @@ class ParameterSpace:
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
         """The space of a robot's configuration: the base parameters, the effects', and the user's own."""
         return cls((*base_parameters(cfg), *effect_parameters(cfg), *cfg.extra_parameters))
+
+    def holding(self, labels: Sequence[str], physical: torch.Tensor) -> ParameterSpace:
+        """The same with some entries held at the values of a physical vector (size,)."""
+        held, values = set(labels), physical.tolist()
+        parameters = []
+        for p in self.parameters:
+            own = values[self.slices[p.name]]
+            at = [f"{p.name}/{key}" in held for key in p.keys]
+            lower = tuple(v if yes else low for v, yes, low in zip(own, at, p.lower, strict=True))
+            upper = tuple(v if yes else high for v, yes, high in zip(own, at, p.upper, strict=True))
+            parameters.append(replace(p, lower=lower, upper=upper, start=None))
+        return ParameterSpace(parameters)
 
     @property
     def start(self) -> torch.Tensor:

@@ -39,6 +39,10 @@ class FitResult(DriveResult):
     simulated_steps: int
     wall_time_s: float
     stop_reasons: list[str]
+    times_noise: float | None = None
+    """The training error as a multiple of the measurement noise."""
+    std_means_nothing: bool = False
+    """Whether the fit ended so far above the noise that its error bars say nothing."""
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -63,7 +67,8 @@ class FitResult(DriveResult):
         if not self.rmse["train"]:
             refuse(source, "rmse/train has no values", CURE)
         labels = {f"{name}/{key}" for name, entries in self.parameters.items() for key in entries}
-        named = [*self.at_bound, *self.no_influence, *(label for group in self.indistinguishable for label in group)]
+        named = [*self.at_bound, *self.no_influence, *self.undetermined]
+        named += [*(label for group in self.indistinguishable for label in group)]
         if foreign := [label for label in named if label not in labels]:
             refuse(source, f"{foreign[0]!r} is none of its parameters", CURE)
 

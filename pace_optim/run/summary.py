@@ -35,8 +35,9 @@ def summary(result: FitResult) -> str:
 
 def _value(result: FitResult, name: str, key: str) -> str:
     std = result.std[name][key]
-    mark = " (at bound)" if f"{name}/{key}" in result.at_bound else ""
-    error = "" if std is None else f" ± {std:.1g}"
+    label = f"{name}/{key}"
+    mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
+    error = "" if std is None else " ± ?" if result.std_means_nothing else f" ± {std:.1g}"
     return f"{result.parameters[name][key]:.5g}{error}{mark}"
 
 

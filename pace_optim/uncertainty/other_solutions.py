@@ -11,7 +11,7 @@ from pace_optim.optimizers.least_squares import Descent
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
-_AS_GOOD = 1e-3
+AS_GOOD = 1e-3
 _APART = 0.02
 _APART_STD = 5.0
 
@@ -33,7 +33,7 @@ def with_other_solutions(uncertainty: Uncertainty, descents: Sequence[Descent], 
     half_range = np.maximum(space.slope(best.x).numpy(), 1e-300)
     std = np.nan_to_num(uncertainty.std / half_range)  # at a bound there is none
     for other in descents[1:]:
-        if not other.score <= (1 + _AS_GOOD) * best.score:
+        if not other.score <= (1 + AS_GOOD) * best.score:
             continue
         difference = np.abs((other.x - best.x).numpy())
         apart = np.flatnonzero((difference > 2 * _APART) & (difference > _APART_STD * std))

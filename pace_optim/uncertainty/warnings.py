@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 
@@ -12,48 +13,81 @@ from pace_optim.problem.step_error import step_error
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
+_NAMED = 3
+"""Joints that a sentence names, at most."""
 _NOTHING = 1e-6
 """Errors below this are nothing to speak of [rad]."""
 _OF_THE_STEP = (0.3, 5.0)
 """The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
 recording comes from a simulation with this very step."""
-_UNKNOWN = 0.5
-"""A standard deviation above this part of the bound range leaves a parameter open."""
 
 
 def fit_warnings(
-    problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty, rmse: dict[str, dict[str, float]]
+    problem: Problem,
+    physical: torch.Tensor,
+    uncertainty: Uncertainty,
+    rmse: dict[str, dict[str, float]],
+    left_open: Sequence[str] = (),
 ) -> list[str]:
-    """Plain sentences, none if all is well.
+    """Plain sentences, the most important first, one for each kind; none if all is well.
 
     Args:
         problem: What was fitted.
         physical: The result, (size,).
         uncertainty: At the result.
         rmse: Errors as in ``result.json``.
+        left_open: Labels of parameters that the recordings do not determine.
     """
-    warnings = _at_bounds(problem, physical, uncertainty)
-    if uncertainty.no_influence:
-        listed = ", ".join(uncertainty.no_influence)
-        warnings.append(f"No influence on these recordings, so the value means nothing: {listed}.")
-    unknown = [
-        label
-        for label, std, low, high in zip(
-            problem.space.labels,
-            uncertainty.std.tolist(),
-            problem.space.lower.tolist(),
-            problem.space.upper.tolist(),
-            strict=True,
-        )
-        if std > _UNKNOWN * (high - low)
-    ]
-    if unknown:
-        warnings.append(f"Hardly known, the error bar is as wide as the bounds: {', '.join(unknown)}.")
-    for group in uncertainty.indistinguishable:
-        warnings.append(f"The recording cannot tell apart {in_words(group)}: move more, or in other poses.")
-    warnings += _critical_delays(problem, physical)
     change = _change_at_half_the_step(problem, physical, rmse)
-    return warnings + _overfit(rmse, change) + _coarse_step(problem, rmse, change)
+    return [
+        *_overfit(rmse, change),
+        *_critical_delays(problem, physical),
+        *_at_bounds(problem, physical, uncertainty),
+        *_undetermined(left_open),
+        *_alike(uncertainty.indistinguishable),
+        *_coarse_step(problem, rmse, change),
+    ]
+
+
+def _undetermined(labels: Sequence[str]) -> list[str]:
+    """One sentence for each parameter that the recordings leave open on some joints."""
+    return [
+        f"These recordings do not determine {name.replace('_', ' ')}{_of(keys)}: no influence, or an error bar as wide "
+        "as the bounds. It keeps its prior, and exports leave it out."
+        for name, keys in _by_parameter(labels).items()
+    ]
+
+
+def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
+    """One sentence for each kind of parameters that cannot be told apart, with the joints."""
+    kinds: dict[tuple[str, ...], list[str]] = {}
+    for group in groups:
+        keys = {label.split("/")[1] for label in group} - {GLOBAL}
+        kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
+        kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
+    return [
+        f"The recording cannot tell apart "
+        f"{_listed([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
+        ": move more, or in other poses."
+        for kind, keys in kinds.items()
+    ]
+
+
+def _by_parameter(labels: Sequence[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for label in labels:
+        name, key = label.split("/", 1)
+        found.setdefault(name, []).append(key)
+    return found
+
+
+def _of(keys: Sequence[str]) -> str:
+    """On which joints: all of them where they are few, else some and how many."""
+    if list(keys) == [GLOBAL]:
+        return ""
+    if len(keys) <= _NAMED:
+        return f" of {_listed(list(keys))}"
+    return f" of {len(keys)} joints ({', '.join(keys[:_NAMED])}, …)"
 
 
 def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
@@ -102,7 +136,7 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
         places.setdefault((name, side, bound), []).append(key)
     return [
         f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.units[name]})"
-        + ("" if keys == [GLOBAL] else f" on {', '.join(keys)}")
+        + _of(keys).replace(" of ", " on ", 1)
         + ": widen the bound, or physics is missing that this parameter stands in for."
         for (name, side, bound), keys in places.items()
     ]

@@ -64,7 +64,10 @@ def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, fl
 def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None) -> list[str]:
     value, std = run.result.parameters[name][key], run.result.std.get(name, {}).get(key)
     label = f"{name}/{key}"
+    std = None if run.result.std_means_nothing else std
     text, error = value_and_error(value, std)
+    if run.result.std_means_nothing:
+        error = "?"
     plot = esc(unit) if span is None else _interval(value, std, *span)
     return [f"<b>{esc(title)}</b>", text, error, plot, _between(run, label, value), _flags(run, label, value)]
 
@@ -131,7 +134,9 @@ def _flags(run: RunData, label: str, value: float) -> str:
     if label in result.at_bound:
         low, high = run.bounds.get(label, (value, value))
         flags.append("at its lower bound" if value - low < high - value else "at its upper bound")
-    if label in result.no_influence:
+    if label in result.undetermined:
+        flags.append("not determined: its prior")
+    elif label in result.no_influence:
         flags.append("no influence")
     for group in result.indistinguishable:
         if label in group:

@@ -1,0 +1,49 @@
+"""How far above the measurement's noise a fit has ended."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pace_optim.comparison.noise import noise_floor
+from pace_optim.problem.problem import Problem
+from pace_optim.terminal.cli import command
+
+FAR_ABOVE_NOISE = 10.0
+"""An error of this many times the noise is no residual of noise: its error bars say nothing of the values' truth."""
+
+
+def times_noise(problem: Problem, rmse: float | None) -> float | None:
+    """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` where there is none.
+
+    Args:
+        problem: What was fitted.
+        rmse: Of all joints [rad].
+    """
+    squares = [
+        noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
+        for recording in problem.dataset.recordings
+        for j in range(recording.dof_pos.shape[1])
+    ]
+    noise = float(np.sqrt(np.mean(squares)))
+    return rmse / noise if rmse and noise > 0 else None
+
+
+def far_end(times: float | None, rmse: float, optimizer: str, searched: int, folder: str) -> list[str]:
+    """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
+
+    Args:
+        times: Its error as a multiple of the noise.
+        rmse: Its error [rad].
+        optimizer: What ended there.
+        searched: How many other starts ended no lower.
+        folder: The run's folder.
+    """
+    if times is None or times < FAR_ABOVE_NOISE:
+        return []
+    others = f" {searched} other starts ended no lower." if searched else ""
+    search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
+    return [
+        f"The error of {1e3 * rmse:.3g} mrad is {times:.3g} times the measurement noise: physics is missing, a fact of "
+        f"the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
+        f"{command('diagnose')} {folder} looks for what is missing."
+    ]

@@ -1,0 +1,113 @@
+"""Parameters that the recordings do not determine, and what they are held at: the configuration's value, else 0."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from pace_actuators import match_names, resolve_joint_values
+from pace_actuators.effects import effect_cfgs
+from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.other_solutions import AS_GOOD
+from pace_optim.uncertainty.uncertainty import Uncertainty
+
+HARDLY_KNOWN = 0.5
+"""A standard deviation above this part of the bound range leaves a parameter open."""
+
+
+def undetermined(problem: Problem, uncertainty: Uncertainty, far: bool = False) -> list[str]:
+    """Labels of parameters without influence, and of those whose error bar is as wide as their bounds.
+
+    Args:
+        problem: What was fitted.
+        uncertainty: At the result.
+        far: Whether the fit ended so far above the noise that error bars mean nothing: then they leave nothing open.
+    """
+    silent = set(uncertainty.no_influence)
+    if far:
+        return [label for label in problem.space.labels if label in silent]
+    width = (problem.space.upper - problem.space.lower).numpy()
+    wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * width
+    return [label for label, yes in zip(problem.space.labels, wide, strict=True) if yes or label in silent]
+
+
+def held_at_prior(
+    problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, labels: list[str], cfg: LeastSquaresCfg | None
+) -> tuple[torch.Tensor, list[str]]:
+    """A vector with what the recordings leave open at its prior, the rest fitted again beside it; and what that is.
+
+    Several parameters that are open each may not be so together: where their prior costs more than another solution
+    may, only what has no influence is held.
+
+    Args:
+        problem: What was fitted.
+        x: The result, normalised (size,).
+        uncertainty: There.
+        labels: What is open.
+        cfg: How the rest is fitted; ``None`` holds only what has no influence.
+    """
+    silent = [label for label in labels if label in uncertainty.no_influence]
+    if cfg is not None and len(silent) < len(labels):
+        physical = problem.space.to_physical(at_prior(problem, x, labels))
+        held = replace(problem, space=problem.space.holding(labels, physical))
+        evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
+        before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
+        start = held.space.to_normalised(physical)
+        best = least_squares(evaluator, colouring, [start], cfg)[0]
+        if best.score <= (1 + AS_GOOD) * before:
+            return problem.space.to_normalised(held.space.to_physical(best.x)), labels
+    return at_prior(problem, x, silent), silent
+
+
+def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tensor:
+    """A normalised vector (size,) with some entries at their prior.
+
+    Args:
+        problem: What was fitted.
+        x: Normalised, (size,).
+        labels: Which entries.
+    """
+    space = problem.space
+    at = [space.labels.index(label) for label in labels]
+    result = x.clone()
+    result[at] = space.to_normalised(prior(problem).clamp(space.lower, space.upper))[at]
+    return result
+
+
+def prior(problem: Problem) -> torch.Tensor:
+    """Every parameter as the configuration has it, physical (size,); else 0, and an effect at its null."""
+    space, joints = problem.space, list(problem.joint_names)
+    result = torch.zeros(space.size, dtype=torch.float64)
+    for drive in problem.env_cfg.scene.robot.actuators.values():
+        own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]
+        for name in PARAMETER_GROUPS:
+            if (value := getattr(drive, name)) is not None and name in space.slices:
+                values = resolve_joint_values(value, own, field=name).to(torch.float64)
+                result[space[name]][[joints.index(joint) for joint in own]] = values
+    for cfg in effect_cfgs(problem.env_cfg.sim2real.effects):
+        kind = cfg.effect_class
+        for parameter in kind.parameters:
+            here = space.slices.get(f"{kind.name}.{parameter.name}")
+            if here is not None:
+                null = parameter.start if parameter.null is None else parameter.null
+                result[here] = null if math.isfinite(null) else parameter.upper
+    return result
+
+
+def without(uncertainty: Uncertainty, labels: Sequence[str], space: ParameterSpace) -> Uncertainty:
+    """The same with neither error bars nor likes of some parameters, as they are held."""
+    held = set(labels)
+    std = np.where([label in held for label in space.labels], np.nan, uncertainty.std)
+    correlation = uncertainty.correlation.copy()
+    correlation[np.isnan(std)] = np.nan
+    correlation[:, np.isnan(std)] = np.nan
+    groups = tuple(group for group in uncertainty.indistinguishable if not held & set(group))
+    return replace(uncertainty, std=std, correlation=correlation, indistinguishable=groups)

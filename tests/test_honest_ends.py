@@ -1,0 +1,121 @@
+"""A fit that ends far above the noise says so, and what recordings do not determine keeps its prior."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from diagnoses import joint_alone
+from problems import BENCH, CALM, TRUTH, chirp, make_problem, physical, record
+from run_folders import make_result
+
+from pace_actuators import IdentifiedDrives
+from pace_optim.export import FORMATS
+from pace_optim.fit import fit
+from pace_optim.optimizers.least_squares import LeastSquaresCfg
+from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.summary import summary
+from pace_optim.uncertainty.honest_end import far_end, times_noise
+from pace_optim.uncertainty.uncertainty import Uncertainty
+from pace_optim.uncertainty.undetermined import at_prior, held_at_prior, prior, undetermined, without
+from pace_optim.uncertainty.warnings import fit_warnings
+
+
+def uncertainty(problem, **changes):
+    size = problem.space.size
+    content = {
+        "std": np.zeros(size),
+        "correlation": np.eye(size),
+        "at_bound": (),
+        "no_influence": (),
+        "indistinguishable": (),
+    }
+    return Uncertainty(**{**content, **changes})
+
+
+def test_the_end_is_told_as_a_multiple_of_the_noise_with_what_to_do():
+    (told,) = far_end(370.0, 37e-3, "least_squares", 5, "runs/a")
+    assert "370 times the measurement noise" in told and "5 other starts ended no lower" in told
+    assert "--optimizer hybrid" in told and "diagnose.py runs/a" in told and "error bars mean nothing" in told
+    assert far_end(2.0, 1e-4, "least_squares", 0, "runs/a") == far_end(None, 1e-4, "hybrid", 0, "a") == []
+
+
+def test_the_noise_is_that_of_the_recordings():
+    recording = record(chirp(3.0), CALM)
+    noisy = replace(
+        recording, dof_pos=recording.dof_pos + np.random.default_rng(0).normal(0, 1e-3, (len(recording.time), 1))
+    )
+    assert times_noise(make_problem(noisy), 5e-3) == pytest.approx(5.0, rel=0.15)
+
+
+def test_what_has_no_influence_or_an_error_bar_as_wide_as_its_bounds_is_open_unless_error_bars_mean_nothing():
+    problem = joint_alone().problem
+    std = np.zeros(problem.space.size)
+    std[problem.space["encoder_bias"]] = 10.0
+    found = uncertainty(problem, std=std, no_influence=("delay/all",))
+    assert undetermined(problem, found) == ["encoder_bias/servo", "delay/all"]
+    assert undetermined(problem, found, far=True) == ["delay/all"]
+    held = without(found, ["encoder_bias/servo"], problem.space)
+    assert np.isnan(held.std[problem.space["encoder_bias"]]).all() and held.std[0] == 0.0
+
+
+def test_the_prior_is_the_configuration_s_value_else_zero():
+    problem = joint_alone().problem
+    for drive in problem.env_cfg.scene.robot.actuators.values():
+        expected = 0.0 if drive.armature is None else float(drive.armature)
+    assert float(prior(problem)[problem.space["armature"]]) == expected
+    x = at_prior(problem, torch.full((problem.space.size,), 0.7, dtype=torch.float64), ["encoder_bias/servo"])
+    assert float(problem.space.to_physical(x)[problem.space["encoder_bias"]]) == pytest.approx(0.0, abs=1e-9)
+    assert float(x[0]) == 0.7
+
+
+def test_the_rest_is_fitted_again_and_what_costs_too_much_at_its_prior_is_not_open():
+    problem = joint_alone().problem
+    x = problem.space.to_normalised(joint_alone().truth)
+    cfg = LeastSquaresCfg(max_iteration=3)
+    kept, labels = held_at_prior(problem, x, uncertainty(problem), ["friction/servo"], cfg)
+    assert labels == [] and torch.equal(kept, x)  # no friction at all is no solution
+    kept, labels = held_at_prior(
+        problem, x, uncertainty(problem, no_influence=("friction/servo",)), ["friction/servo"], None
+    )
+    assert labels == ["friction/servo"] and float(problem.space.to_physical(kept)[problem.space["friction"]]) == 0.0
+
+
+def test_warnings_are_one_for_each_kind_and_what_does_not_carry_over_comes_first():
+    problem = make_problem(record(chirp(0.2), TRUTH))
+    rmse = {"train": {"all": 1e-3}, "validation": {"all": 59e-3}}
+    found = uncertainty(
+        problem,
+        at_bound=("friction/servo",),
+        indistinguishable=(("encoder_bias/servo", "friction/servo"), ("encoder_bias/servo", "friction/servo")),
+    )
+    told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"])
+    assert "59.0 times" in told[0] and "at its" in told[1]
+    assert told[2].startswith("These recordings do not determine delay:")
+    assert sum("cannot tell apart" in text for text in told) == 1
+
+
+def test_exports_and_training_leave_out_what_is_not_determined(tmp_path):
+    result = make_result(undetermined=["encoder_bias/hip", "armature/hip", "armature/knee", "armature/ankle"])
+    result.save(tmp_path / "result.json")
+    drives = IdentifiedDrives.load(tmp_path)
+    content = json.loads(FORMATS["json"](drives)[0])
+    assert content["parameters"]["armature"] == {} and set(content["parameters"]["encoder_bias"]) == {"knee", "ankle"}
+    fields = drives.cfg_fields()
+    assert "armature" not in fields and "friction" in fields
+
+
+@pytest.mark.slow
+def test_least_squares_in_a_wrong_valley_is_not_converged(tmp_path):
+    """The recording's drive has half the gain that it states: no base model explains it."""
+    told = record(chirp(1.0), CALM, drive={"stiffness": 170.0}, noise=1e-4)
+    wrong = replace(told, drive=replace(told.drive, stiffness=np.array([85.0])))
+    path = save_recording(tmp_path / "wrong.npz", wrong)
+    settings = FitSettings(task=BENCH, data=[str(path)], optimizer="least_squares", log_dir=str(tmp_path / "logs"))
+    result, _ = fit(settings)
+    assert result.times_noise > 10 and result.std_means_nothing
+    assert "converged" not in result.stop_reasons and "times the noise" in result.stop_reasons[-1]
+    assert "times the measurement noise" in result.warnings[0]
+    assert "± ?" in summary(result)
