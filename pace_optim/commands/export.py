@@ -9,15 +9,16 @@ from pace_optim.terminal.cli import make_parser
 def main() -> None:
     """Parse the command line, write, say what the format cannot hold."""
     parser = make_parser(
-        "Write an identified robot for other programs: an MJCF with the joints' parameters, configurations of its "
+        "Write an identified robot for other programs: an MJCF with its drives as actuators, configurations of its "
         "drives for this project (cfg), mjlab and Isaac Lab, or plain JSON.",
         example="scripts/export.py logs/pace/anymal_d/<run>/result.json --format mjcf --output anymal_d.xml",
     )
     parser.add_argument("result", metavar="FILE", help="result.json of a fit, or its run's folder")
     parser.add_argument("--format", required=True, choices=tuple(FORMATS), help="what to write")
+    parser.add_argument("--joints_only", action="store_true", help="mjcf: leave the actuators as they were")
     parser.add_argument("--output", metavar="FILE", help="where (default: standard output)")
     args = parser.parse_args()
-    exported = export(args.result, args.format)
+    exported = export(args.result, args.format, joints_only=args.joints_only)
     if args.output is None:
         print(exported.text, end="")
     else:

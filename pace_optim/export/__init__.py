@@ -59,17 +59,21 @@ FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
 """Format -> what writes it."""
 
 
-def export(path: str | Path, fmt: str) -> Export:
+def export(path: str | Path, fmt: str, *, joints_only: bool = False) -> Export:
     """A result in another format.
 
     Args:
         path: ``result.json``, or the run's folder.
         fmt: One of ``FORMATS``.
+        joints_only: Leave the drives out of a model (``mjcf``).
 
     Raises:
         ValueError: If the result is unusable, the format is unknown, or the robot's model has gone.
     """
     if fmt not in FORMATS:
         raise ValueError(f"There is no format {fmt!r}. Available: {', '.join(FORMATS)}.")
-    text, notes = FORMATS[fmt](IdentifiedDrives.load(path))
+    if joints_only and fmt != "mjcf":
+        raise ValueError(f"joints_only is for the format mjcf; {fmt!r} holds nothing but drives. Leave it out.")
+    drives = IdentifiedDrives.load(path)
+    text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
     return Export(text=text, notes=notes)

@@ -1,4 +1,4 @@
-"""A robot's MJCF with what its drives' identification says of its joints."""
+"""A robot's MJCF with what its drives' identification says: its joints, its changed bodies, and the drives themselves."""
 
 from __future__ import annotations
 
@@ -11,18 +11,26 @@ import numpy as np
 import torch
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import use_identified
+from pace_envs.model_file import read_model_file
+from pace_optim.export.mjcf_drives import write_drives
+from pace_optim.export.plain_drive import GAIN_EFFECTS, effect_notes, is_undetermined, plain_drives
 
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
 
 
-def mjcf(drives: IdentifiedDrives) -> tuple[str, list[str]]:
-    """The robot's model with identified armature, damping and frictionloss, and changed rigid bodies.
+def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, list[str]]:
+    """The robot's model with identified armature, damping and frictionloss, changed rigid bodies, and its drives.
+
+    Args:
+        drives: What was identified.
+        joints_only: Leave the actuators as they were: for a program that runs the drive itself.
 
     Raises:
-        ValueError: If the environment of the identification is not registered, or its model cannot be read.
+        ValueError: If the environment of the identification is not available, or its model cannot be read.
     """
     cfg = load_env_cfg(drives.task)
     source = Path(cfg.scene.robot.mjcf_path)
@@ -32,12 +40,13 @@ def mjcf(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     use_identified(cfg, drives.path)
     env = ManagerBasedRLEnv(cfg)
     robot, model = env.scene["robot"], env.sim.model
-    spec = mujoco.MjSpec.from_file(str(source))
+    spec = read_model_file(source).spec if source.suffix == ".urdf" else mujoco.MjSpec.from_file(str(source))
+    fields = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "damping"}
     for name, column in zip(robot.joint_names, robot.dof_columns.tolist(), strict=True):
         joint = spec.joint(name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
-        joint.armature = drives.values("armature", [name])[name]
-        joint.frictionloss = drives.values("friction", [name])[name]
-        _set_damping(joint, drives.values("viscous_friction", [name])[name])
+        for parameter, attribute in fields.items():
+            if not is_undetermined(drives, parameter, name):
+                _set(joint, attribute, drives.values(parameter, [name])[name])
         joint.solref_friction, joint.solimp_friction = model.dof_solref[column], model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
         joint = spec.joint(name)
@@ -46,10 +55,23 @@ def mjcf(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
     changed = _write_bodies(spec, plain, env)
-    notes = _notes(drives, changed)
     env.close()
     plain.close()
-    return _with_comment(spec.to_xml(), notes, drives), notes
+    held = [e.effect_class.name for e in drives.effects if _in_the_model(e.effect_class)]
+    if joints_only:
+        notes = _notes_of_joints(drives)
+    else:
+        actuators, notes = plain_drives(drives)
+        notes += write_drives(spec, actuators, drives.at.physics_dt)
+        held += GAIN_EFFECTS
+    if changed:
+        notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
+    notes += effect_notes(drives, held)
+    return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def _in_the_model(kind: type[Effect]) -> bool:
+    return kind is SoftFriction or kind.overrides("write_model")
 
 
 def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dict[str, float]:
@@ -59,12 +81,12 @@ def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dic
     return {name: value for name, value in values.items() if value > 0}
 
 
-def _set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
-    """Linear damping: since MuJoCo 3.5 a joint has a polynomial."""
-    if np.ndim(joint.damping):
-        joint.damping = [damping, *[0.0] * (len(joint.damping) - 1)]
+def _set(joint: mujoco.MjsJoint, attribute: str, value: float) -> None:
+    """Armature, frictionloss, or linear damping: since MuJoCo 3.5 damping is a polynomial."""
+    if np.ndim(before := getattr(joint, attribute)):
+        setattr(joint, attribute, [value, *[0.0] * (len(before) - 1)])
     else:
-        joint.damping = damping
+        setattr(joint, attribute, value)
 
 
 def _write_bodies(spec: mujoco.MjSpec, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
@@ -87,29 +109,29 @@ def _write_bodies(spec: mujoco.MjSpec, plain: ManagerBasedRLEnv, env: ManagerBas
     return changed
 
 
-def _notes(drives: IdentifiedDrives, changed: list[str]) -> list[str]:
+def _notes_of_joints(drives: IdentifiedDrives) -> list[str]:
     bias = [abs(value) for value in drives.parameters["encoder_bias"].values()]
     delayed = "targets" if drives.delay_mode == "command" else "the controller's torque"
-    notes = [
+    return [
         f"encoder bias (up to {max(bias):.3g} rad): the encoder shows q - bias; it is not in the model.",
         f"delay of {1e3 * drives.delay_s:.3g} ms of {delayed}: it is not in the model.",
         "gains and torque-speed limits of the drives: there are no actuators in the model but those it had.",
     ]
-    if changed:
-        notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
-    for effect in drives.effects:
-        kind = effect.effect_class
-        if kind is SoftFriction:
-            notes.append(f"{kind.name} is in the model: solreffriction and solimpfriction of its joints.")
-        elif not kind.overrides("write_model"):
-            what = kind.equation or (kind.__doc__ or "").strip().splitlines()[0]
-            notes.append(f"{kind.name} ({what}): it is not in the model.")
-    return notes
 
 
-def _with_comment(xml: str, notes: list[str], drives: IdentifiedDrives) -> str:
-    lines = [f"Joints identified with {drives.task}: armature, damping, frictionloss. What this file cannot hold:"]
-    lines += [f"- {note}" for note in notes]
+def _with_comment(spec: mujoco.MjSpec, notes: list[str], drives: IdentifiedDrives, joints_only: bool) -> str:
+    try:
+        spec.compile()
+        xml = spec.to_xml()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo does not take the robot's model with the identified values: {error}") from None
+    what = "armature, damping, frictionloss" if joints_only else "joints and drives (actuators)"
+    lines = [f"Identified with {drives.task}: {what}. Beside that:", *(f"- {note}" for note in notes)]
+    if not joints_only:
+        lines.append(
+            f"The timestep is the identification's ({1e3 * drives.at.physics_dt:g} ms). The integrator is Euler: it "
+            "holds a drive's torque over a step as the identification did; implicitfast would let kd act implicitly."
+        )
     body = "\n".join(textwrap.fill(line, 118, subsequent_indent="  ") for line in lines)
     body = body.replace("--", "- -")
     head, found, rest = xml.partition("<mujoco")

@@ -1,0 +1,144 @@
+"""Identified drives as MuJoCo's own actuators.
+
+    τ = clip(kp (ctrl - q_enc) - kd q̇, ± limit, torque-speed line),    ctrl delayed
+
+A drive with a torque-speed line is a ``dcmotor`` with its on-board controller, whose terminal voltage, back-EMF and
+current limit make the four-quadrant clip of ``PaceDCMotor`` exactly; one without is a ``position`` servo (``velocity``
+where kp is 0, ``motor`` where kd is 0 too). The encoder's bias is in the joint's ``ref``: positions, targets and
+sensors of the model are what the encoder shows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from pace_optim.export.plain_drive import PlainDrive
+
+_LINEAR = 1
+"""Interpolation of a delayed command between two samples."""
+_INPUT = mujoco.mjtCtrlInput
+"""What a ``dcmotor`` is commanded by."""
+_OF_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+def write_drives(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
+    """Give each joint its drive: an actuator that it has is changed in its place, otherwise one is added.
+
+    Args:
+        spec: The model; it is changed.
+        drives: The drives by joint.
+        dt: Physics step that they were identified at [s].
+
+    Returns:
+        What the model does not hold, or holds in an unexpected way, in words.
+    """
+    notes = _delay_notes(drives, dt)
+    spec.option.timestep = dt
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    keys = [key for key in spec.keys if len(key.ctrl)]
+    _shift_encoders(spec, drives, notes)
+    for name, drive in drives.items():
+        first, *more = [a for a in spec.actuators if a.target == name and a.trntype in _OF_JOINT] or [None]
+        for other in more:
+            _delete(spec, other, notes)
+        if first is None:
+            taken = {a.name for a in spec.actuators}
+            first = spec.add_actuator(name=name if name not in taken else f"{name}_drive")
+            first.target, first.trntype = name, mujoco.mjtTrn.mjTRN_JOINT
+        _write(first, drive, dt)
+    if keys:
+        notes.append("control values of keyframes were those of other actuators: they are left out.")
+        for key in keys:
+            key.ctrl = []
+    return notes
+
+
+def _write(actuator: mujoco.MjsActuator, drive: PlainDrive, dt: float) -> None:
+    actuator.gear = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    actuator.armature, actuator.damping = 0.0, np.zeros_like(actuator.damping)  # the joint has the identified ones
+    actuator.dyntype, actuator.dynprm = mujoco.mjtDyn.mjDYN_NONE, np.zeros_like(actuator.dynprm)
+    actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_NONE, np.zeros_like(actuator.biasprm)
+    actuator.actdim, actuator.inheritrange = -1, 0.0
+    for limited in ("ctrllimited", "forcelimited", "actlimited"):
+        setattr(actuator, limited, mujoco.mjtLimited.mjLIMITED_FALSE)
+    actuator.ctrlrange = actuator.actrange = [0.0, 0.0]
+    limit = drive.effort_limit if math.isfinite(drive.effort_limit) else 0.0
+    kp, kd = drive.stiffness, drive.damping
+    if drive.has_line:
+        actuator.set_to_dcmotor(
+            motorconst=[0.0, 0.0],
+            resistance=0.0,
+            nominal=[1.0, drive.saturation_effort, drive.velocity_limit],  # at one volt: only the ratios count
+            saturation=[limit, 0.0, 0.0],
+            controller=[kp, 0.0, kd, 0.0, 0.0, 1.0],
+            ctrlspec=_INPUT.mjINPUT_POS if kp else _INPUT.mjINPUT_VEL if kd else _INPUT.mjINPUT_FF,
+        )
+    elif kp:
+        actuator.set_to_position(kp=kp, kv=kd)
+    elif kd:
+        actuator.set_to_velocity(kv=kd)
+    else:
+        actuator.set_to_motor()
+    if limit:
+        actuator.forcerange = [-limit, limit]
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    steps = drive.delay_s / dt
+    if steps >= 0.5:
+        actuator.delay = max(steps, 1.0) * dt
+        actuator.nsample, actuator.interp = math.ceil(max(steps, 1.0) - 1e-9), _LINEAR
+    else:
+        actuator.delay, actuator.nsample = 0.0, 0
+
+
+def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str]) -> None:
+    """Let joint positions be what the encoders show: q - bias."""
+    shifted = {name: drive.encoder_bias for name, drive in drives.items() if drive.encoder_bias}
+    if not shifted:
+        return
+    addresses = {name: int(spec.compile().joint(name).qposadr[0]) for name in shifted} if spec.keys else {}
+    for name, bias in shifted.items():
+        joint = spec.joint(name)
+        is_degree = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        own = math.degrees(bias) if is_degree else bias
+        joint.ref, joint.springref = joint.ref - own, joint.springref - own
+        if np.any(joint.range):
+            joint.range = joint.range - own
+        for key in spec.keys:
+            if len(key.qpos):
+                qpos = np.array(key.qpos)
+                qpos[addresses[name]] -= bias
+                key.qpos = qpos
+    most = max(map(abs, shifted.values()))
+    notes.append(
+        f"encoder bias (up to {most:.3g} rad): joint positions, targets and keyframes of this model are what the "
+        "encoders show, q - bias (the joints' ref is shifted)."
+    )
+    if spec.tendons:
+        notes.append("tendons over joints with a bias have lengths of what the encoders show.")
+
+
+def _delete(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, notes: list[str]) -> None:
+    notes.append(f"the actuator {actuator.name or 'without a name'} moved a joint beside another: it is left out.")
+    for sensor in spec.sensors:
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname == actuator.name:
+            spec.delete(sensor)
+    spec.delete(actuator)
+
+
+def _delay_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
+    delay = max((drive.delay_s for drive in drives.values()), default=0.0)
+    if delay == 0:
+        return []
+    if delay < dt * (1 - 1e-9):
+        near = dt if delay >= 0.5 * dt else 0.0
+        return [
+            f"delay of {1e3 * delay:.3g} ms: MuJoCo's shortest is one step, so it is {1e3 * near:.3g} ms in the model."
+        ]
+    return [
+        f"delay of {1e3 * delay:.3g} ms of the targets: it is in the actuators. After a reset MuJoCo's history holds "
+        "zeros: call mj_initCtrlHistory with the first targets."
+    ]

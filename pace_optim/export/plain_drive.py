@@ -1,0 +1,127 @@
+"""What of an identified drive a simulator's own PD actuator can hold, joint by joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pace_actuators import IdentifiedDrives
+from pace_actuators.effects import Effect
+from pace_actuators.joint_values import resolve_joint_values
+from pace_optim.export.configs import drive_groups
+
+GAIN_EFFECTS = ("proportional_gain", "derivative_gain", "torque_gain", "torque_limit")
+"""Effects that are other gains and limits of the same drive."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlainDrive:
+    """PD control with a DC motor's limits: τ = clip(kp (q* - q + bias) - kd q̇, limits)."""
+
+    stiffness: float
+    """kp [N m/rad], with the effects that scale it."""
+
+    damping: float
+    """kd [N m s/rad], with the effects that scale it."""
+
+    effort_limit: float
+    """Largest torque [N m], with the effects that change it; ``inf`` without a limit."""
+
+    saturation_effort: float
+    """Stall torque of the torque-speed line [N m]; ``inf`` without a line."""
+
+    velocity_limit: float
+    """No-load speed of the torque-speed line [rad/s]; ``inf`` without a line."""
+
+    encoder_bias: float
+    """The encoder shows q - bias [rad]."""
+
+    delay_s: float
+    """Delay of the command [s]; 0 where the whole torque is delayed, which such an actuator cannot do."""
+
+    @property
+    def has_line(self) -> bool:
+        """Whether torque falls with speed."""
+        return math.isfinite(self.saturation_effort) and math.isfinite(self.velocity_limit)
+
+
+def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[str]]:
+    """The drive of each joint as far as a plain actuator holds it, and what it does not hold, in words.
+
+    Gains and limits are those that were in force in all recordings, otherwise those of the robot's configuration. A
+    bias that the recordings do not determine is left out.
+
+    Raises:
+        ValueError: If the environment of the identification is not available.
+    """
+    result: dict[str, PlainDrive] = {}
+    own = {name: _of_effect(drives, name) for name in GAIN_EFFECTS}
+    commands = drives.delay_mode == "command"
+    for cfg in drive_groups(drives).values():
+        joints = drives.find_joints(cfg.joint_names_expr)
+        found = {
+            name: [default] * len(joints)
+            if (value := getattr(cfg, name)) is None
+            else resolve_joint_values(value, joints, field=name).tolist()
+            for name, default in (
+                ("stiffness", 0.0),
+                ("damping", 0.0),
+                ("effort_limit", math.inf),
+                ("saturation_effort", math.inf),
+                ("velocity_limit", math.inf),
+                ("encoder_bias", 0.0),
+            )
+        }
+        for i, joint in enumerate(joints):
+            gain = 1 + own["torque_gain"].get(joint, 0.0)
+            line = math.isfinite(found["saturation_effort"][i]) and math.isfinite(found["velocity_limit"][i])
+            result[joint] = PlainDrive(
+                stiffness=found["stiffness"][i] * (1 + own["proportional_gain"].get(joint, 0.0)) * gain,
+                damping=found["damping"][i] * (1 + own["derivative_gain"].get(joint, 0.0)) * gain,
+                effort_limit=min(found["effort_limit"][i], own["torque_limit"].get(joint, math.inf)) * gain,
+                saturation_effort=found["saturation_effort"][i] if line else math.inf,
+                velocity_limit=found["velocity_limit"][i] if line else math.inf,
+                encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
+                delay_s=drives.delay_s if commands else 0.0,
+            )
+    notes = []
+    if not commands and drives.delay_s > 0:
+        notes.append(
+            f"delay of {1e3 * drives.delay_s:.3g} ms of the controller's torque, feedback included: not held; such an "
+            "actuator delays commands, which is another physics."
+        )
+    return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
+
+
+def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
+    """Which effects are held and which are not, in words.
+
+    Args:
+        drives: What was identified.
+        held: Names of the effects that the format holds.
+    """
+    notes = []
+    for kind in (cfg.effect_class for cfg in drives.effects):
+        if kind.name in held:
+            notes.append(f"{kind.name} is held.")
+        else:
+            notes.append(f"{kind.name} ({_what(kind)}): not held.")
+    return notes
+
+
+def is_undetermined(drives: IdentifiedDrives, parameter: str, joint: str) -> bool:
+    """Whether the recordings say nothing of a value, so that it kept its prior and is not exported."""
+    return f"{parameter}/{joint}" in getattr(drives, "undetermined", ())
+
+
+def _of_effect(drives: IdentifiedDrives, name: str) -> dict[str, float]:
+    for cfg in drives.effects:
+        if cfg.effect_class.name == name:
+            parameter = cfg.effect_class.parameters[0].name
+            return drives.values(f"{name}.{parameter}", cfg.joints(drives.joint_names))
+    return {}
+
+
+def _what(kind: type[Effect]) -> str:
+    return kind.equation or (kind.__doc__ or "").strip().splitlines()[0]

@@ -1,0 +1,197 @@
+"""A user of plain MuJoCo gets the identified drive with the exported file."""
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from command_lines import run_script
+from plain_mujoco import drive_of, fixed_in_the_air, replay
+from torque_sequence import DT, GAINS, JOINTS, sequence, write_result
+
+from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_optim.export import export
+from pace_optim.problem.parameter_space import ParameterSpace
+
+STEPS = 400
+
+
+@pytest.fixture
+def result(tmp_path):
+    return write_result(tmp_path / "result.json")
+
+
+def changed(path: Path, **changes) -> Path:
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | changes))
+    return path
+
+
+def without_effects(path: Path) -> Path:
+    parameters = json.loads(path.read_text())["parameters"]
+    return changed(path, effects=[], parameters={name: v for name, v in parameters.items() if "." not in name})
+
+
+def chirp(joints: int) -> np.ndarray:
+    """(STEPS, joints); one second, to 5 Hz, fast enough for the torque-speed line to matter."""
+    time = np.arange(STEPS)[:, None] * DT
+    return 0.5 * np.sin(2 * np.pi * (0.5 + 2.25 * time) * time + np.arange(joints)) + 0.1
+
+
+def identified_motion(path: Path, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the encoders show, (STEPS, joints), as a fit simulates it; and the largest torque [N m]."""
+    drives = IdentifiedDrives.load(path)
+    cfg = load_env_cfg(drives.task)
+    cfg.scene.num_envs, cfg.sim.num_threads = 1, 1
+    env = ManagerBasedRLEnv(cfg)
+    env.reset()
+    space = ParameterSpace.of(cfg.sim2real)
+    space.apply(env, space.from_dict(drives.parameters)[None])
+    robot, bias = env.scene["robot"], drives.values("encoder_bias", JOINTS)
+    shift = torch.tensor([list(bias.values())])
+    robot.write_joint_state_to_sim(torch.tensor(targets[:1]) + shift, torch.zeros(1, len(JOINTS)))
+    shown, most = [], 0.0
+    for target in targets:
+        shown.append((robot.data.joint_pos[0] - shift[0]).numpy().copy())
+        env.step(torch.tensor(target[None]))
+        most = max(most, float(robot.data.applied_torque.abs().max()))
+    env.close()
+    return np.array(shown), most
+
+
+def test_plain_mujoco_replays_the_motion_of_the_identification(result):
+    """To 3 µrad, as the file has six digits; with bias, fractional delay and the torque-speed line in use."""
+    targets = chirp(len(JOINTS))
+    expected, most = identified_motion(without_effects(result), targets)
+    xml = export(result, "mjcf").text
+    model = fixed_in_the_air(xml)
+    found = replay(model, JOINTS, targets, targets[0])
+    assert most > 0.4 * GAINS["effort_limit"] and np.ptp(expected, axis=0).min() > 0.05
+    assert np.abs(found - expected).max() < 3e-6
+
+    def worse(change) -> float:
+        motion = replay(fixed_in_the_air(xml, change), JOINTS, targets, targets[0])
+        return float(np.abs(motion - expected).max())
+
+    def soft(spec):
+        for joint in spec.joints:
+            joint.solref_friction, joint.solimp_friction = [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]
+
+    def undelayed(spec):
+        for actuator in spec.actuators:
+            actuator.delay = 0.0
+
+    def implicit(spec):
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+    assert min(worse(change) for change in (soft, undelayed, implicit)) > 1e-5  # each of them is needed
+
+
+def test_the_actuators_give_the_drives_torque(result):
+    """To 1e-5 of the root mean square torque, on one random sequence; gains and limits with the effects on them."""
+    path = changed(result, effects=["torque_gain"], delay_s=0.0)
+    drives = IdentifiedDrives.load(path)
+    model, data = fixed_in_the_air(export(path, "mjcf").text), sequence()
+    cfg = PaceDCMotorCfg.from_result(path, physics_dt=DT)
+    motor = PaceDCMotor(cfg, JOINTS, slice(None), data["command"].shape[1], dtype=torch.float64)
+    bias = np.array(list(drives.values("encoder_bias", JOINTS).values()))
+    places = [int(model.joint(name).qposadr[0]) for name in JOINTS]
+    speeds = [int(model.joint(name).dofadr[0]) for name in JOINTS]
+    actuators, state = [drive_of(model, name) for name in JOINTS], mujoco.MjData(model)
+    expected, found = [], []
+    for command, position, velocity in zip(data["command"], data["position"], data["velocity"], strict=True):
+        inputs = [torch.tensor(value) for value in (command, position, velocity)]
+        expected.append(motor.compute(ActuatorActions(inputs[0]), *inputs[1:]).joint_efforts.numpy()[0].copy())
+        state.qpos[places], state.qvel[speeds] = position[0] - bias, velocity[0]
+        state.ctrl[actuators] = command[0]
+        mujoco.mj_forward(model, state)
+        found.append(state.qfrc_actuator[speeds].copy())
+    scale = np.sqrt(np.square(expected).mean(axis=0))
+    assert (np.abs(np.array(found) - np.array(expected)).max(axis=0) < 1e-5 * scale).all()
+
+
+def test_a_delay_of_the_torque_is_not_made_one_of_the_command(tmp_path):
+    exported = export(write_result(tmp_path / "result.json", "effort"), "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    assert (model.actuator_delay == 0).all()
+    assert "another physics" in " ".join(exported.notes) and "another" in exported.text.split("-->")[0]
+
+
+def test_only_the_joints_are_written_on_demand(result, tmp_path):
+    done = run_script("export", result, "--format", "mjcf", "--joints_only", "--output", tmp_path / "a.xml")
+    assert done.returncode == 0, done.stderr
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "a.xml"))
+    assert model.nu == 0 and "it is not in the model" in done.stdout
+    refused = run_script("export", result, "--format", "json", "--joints_only")
+    assert refused.returncode == 2 and "joints_only" in refused.stderr
+
+
+FOREIGN = """
+<mujoco>
+  <compiler angle="degree"/>
+  <option timestep="0.002"/>
+  <default><position kp="7" forcerange="-3 3"/></default>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="arm/shoulder" axis="0 1 0" range="-90 90" damping="0.1" armature="0.01"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3" mass="1"/>
+      <body name="lower" pos="0 0 -0.3">
+        <joint name="arm/elbow" axis="0 1 0" ref="10"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.5"/>
+        <body name="finger" pos="0 0 -0.2"><joint name="finger" axis="1 0 0"/><geom size="0.02" mass="0.1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="last" joint="finger" kp="2"/>
+    <position name="servo" joint="arm/shoulder" gear="3" kv="1" ctrlrange="-30 30"/>
+    <damper name="brake" joint="arm/shoulder" kv="2" ctrlrange="0 1"/>
+  </actuator>
+  <sensor><actuatorfrc name="force" actuator="servo"/></sensor>
+  <keyframe><key name="home" qpos="0.3 0.2 0.1" ctrl="1 2 0"/></keyframe>
+</mujoco>
+"""
+
+
+def test_another_robots_actuators_are_updated_by_joint(tmp_path):
+    """Its file has actuators, degrees, a keyframe, a sensor and a joint that was not identified."""
+    from pace_optim.export.mjcf_drives import write_drives
+    from pace_optim.export.plain_drive import PlainDrive
+
+    spec = mujoco.MjSpec.from_string(FOREIGN)
+    inf, common = np.inf, {"delay_s": 0.005}
+    drives = {
+        "arm/shoulder": PlainDrive(
+            stiffness=30.0, damping=1.5, effort_limit=20.0, saturation_effort=inf, velocity_limit=inf,
+            encoder_bias=0.05, **common,
+        ),
+        "arm/elbow": PlainDrive(
+            stiffness=0.0, damping=2.0, effort_limit=inf, saturation_effort=9.0, velocity_limit=5.0,
+            encoder_bias=-0.02, **common,
+        ),
+    }  # fmt: skip
+    before = spec.compile()
+    notes = " ".join(write_drives(spec, drives, 0.002))
+    spec.compile()
+    model = mujoco.MjModel.from_xml_string(spec.to_xml())
+    names = [model.actuator(i).name for i in range(model.nu)]
+    assert names == ["last", "servo", "arm/elbow"]  # in its place, by its name; the second on a joint goes
+    assert "brake" in notes and model.sensor("force").objid[0] == 1
+    servo = model.actuator("servo")
+    assert servo.gear[0] == 1 and servo.biasprm[1] == -30 and servo.biasprm[2] == -1.5 and servo.forcerange[1] == 20
+    assert not model.actuator_ctrllimited[1] and model.actuator("last").gainprm[0] == 2  # the finger's is untouched
+    assert np.allclose(model.actuator_delay, [0, 0.005, 0.005]) and model.actuator_history[1, 0] == 3
+    data = mujoco.MjData(model)
+    data.qvel[1] = 1.0
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[1] == pytest.approx(-2.0)
+    assert np.allclose(model.jnt_range[0], np.radians([-90, 90]) - 0.05)
+    assert np.allclose(model.key_qpos[0], [0.25, 0.22, 0.1])
+    place = mujoco.MjData(before), mujoco.MjData(model)
+    place[0].qpos[:], place[1].qpos[:] = before.key_qpos[0], model.key_qpos[0]
+    for made, state in zip((before, model), place, strict=True):
+        mujoco.mj_kinematics(made, state)
+    assert np.allclose(place[0].xpos, place[1].xpos, atol=1e-6)  # the same posture, by what the encoders show
