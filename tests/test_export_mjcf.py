@@ -12,8 +12,11 @@ from plain_mujoco import drive_of, fixed_in_the_air, replay
 from torque_sequence import DT, GAINS, JOINTS, sequence, write_result
 
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
-from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.from_model import cfg_from_model
 from pace_optim.export import export
+from pace_optim.export.mjcf_drives import write_drives
+from pace_optim.export.plain_drive import PlainDrive
 from pace_optim.problem.parameter_space import ParameterSpace
 
 STEPS = 400
@@ -129,6 +132,53 @@ def test_only_the_joints_are_written_on_demand(result, tmp_path):
     assert refused.returncode == 2 and "joints_only" in refused.stderr
 
 
+def test_drives_of_a_model_file_run_as_they_did_there(tmp_path):
+    """Loops that only a continuous law keeps stable (kd dt / inertia > 2): the same motion as the environment's."""
+    path = tmp_path / "arm.xml"
+    path.write_text(STIFF)
+    cfg = cfg_from_model(path)
+    cfg.scene.num_envs, cfg.sim.num_threads = 1, 1
+    set_physics_dt(cfg, DT)
+    env = ManagerBasedRLEnv(cfg)
+    env.reset()
+    robot = env.scene["robot"]
+    names, targets = robot.joint_names, 0.4 * chirp(2)
+    robot.write_joint_state_to_sim(torch.tensor(targets[:1]), torch.zeros(1, 2))
+    expected = []
+    for target in targets:
+        expected.append(robot.data.joint_pos[0].numpy().copy())
+        env.step(torch.tensor(target[None]))
+    fields = {name: env.sim.expand(name)[0].numpy().copy() for name in ("dof_armature", "dof_frictionloss")}
+    env.close()
+    spec = mujoco.MjSpec.from_string(STIFF)
+    common = {"saturation_effort": np.inf, "velocity_limit": np.inf, "encoder_bias": 0.0, "delay_s": 0.0, "run_dt": 0.0}
+    drives = {
+        "shoulder": PlainDrive(stiffness=2000.0, damping=200.0, effort_limit=150.0, **common),
+        "wrist": PlainDrive(stiffness=500.0, damping=50.0, effort_limit=28.0, **common),
+    }
+    notes = write_drives(spec, drives, DT)
+    spec.compile()
+    model = fixed_in_the_air(spec.to_xml())
+    model.dof_armature[:], model.dof_frictionloss[:] = fields["dof_armature"], fields["dof_frictionloss"]
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and "implicitfast" in " ".join(notes)
+    assert np.abs(replay(model, names, targets, targets[0]) - np.array(expected)).max() < 3e-6
+
+
+STIFF = """
+<mujoco>
+  <worldbody>
+    <body name="upper"><joint name="shoulder" axis="0 1 0" armature="0.1"/>
+      <inertial pos="0.2 0 0" mass="4" diaginertia="0.02 0.06 0.06"/>
+      <body name="hand" pos="0.4 0 0"><joint name="wrist" axis="1 0 0" armature="0.02"/>
+        <inertial pos="0.03 0 0.01" mass="0.4" diaginertia="0.0003 0.0003 0.0003"/></body></body>
+  </worldbody>
+  <actuator>
+    <position name="a" joint="shoulder" kp="2000" kv="200" forcerange="-150 150"/>
+    <position name="b" joint="wrist" kp="500" kv="50" forcerange="-28 28"/>
+  </actuator>
+</mujoco>
+"""
+
 FOREIGN = """
 <mujoco>
   <compiler angle="degree"/>
@@ -158,9 +208,6 @@ FOREIGN = """
 
 def test_another_robots_actuators_are_updated_by_joint(tmp_path):
     """Its file has actuators, degrees, a keyframe, a sensor and a joint that was not identified."""
-    from pace_optim.export.mjcf_drives import write_drives
-    from pace_optim.export.plain_drive import PlainDrive
-
     spec = mujoco.MjSpec.from_string(FOREIGN)
     inf, common = np.inf, {"delay_s": 0.005}
     drives = {

@@ -32,7 +32,8 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
         patterns = [drive.joint_names_expr] if isinstance(drive.joint_names_expr, str) else drive.joint_names_expr
         own = [joint for joint in drives.joint_names if any(re.fullmatch(p, joint) for p in patterns)]
         if own:
-            configured = {name: getattr(drive, name) for name in DRIVE_FIELDS if name not in drives.drive}
+            kept = (*(name for name in DRIVE_FIELDS if name not in drives.drive), "drive_dt", "implicit")
+            configured = {name: getattr(drive, name) for name in kept}
             found = drives.cfg_fields([re.escape(joint) for joint in own])
             result[group] = PaceDCMotorCfg(**configured | {"joint_names_expr": drive.joint_names_expr} | found)
             result[group] = replace(result[group], joint_names_expr=drive.joint_names_expr)
@@ -53,8 +54,7 @@ def cfg_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
 
 def mjlab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """An articulation of mjlab."""
-    events = any(effect.effect_class.overrides("friction") for effect in drives.effects)
-    events = events or any(effect.effect_class.overrides("transmission") for effect in drives.effects)
+    events = _changes_friction(drives)
     body = [
         "from mjlab.entity import EntityArticulationInfoCfg",
         "",
@@ -93,8 +93,21 @@ def isaaclab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
 
 def _page(drives: IdentifiedDrives, world: World, body: list[str]) -> tuple[str, list[str]]:
     notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
+    if world.friction_hook and _is_implicit(drives):
+        notes.append(
+            f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
+        )
     head = [f'"""Drives identified with {drives.task}: {drives.path.parent.name}.', "", *notes, '"""', ""]
     return "\n".join([*head, *body]) + "\n", notes
+
+
+def _is_implicit(drives: IdentifiedDrives) -> bool:
+    return any(cfg.implicit for cfg in drive_groups(drives).values())
+
+
+def _changes_friction(drives: IdentifiedDrives) -> bool:
+    kinds = [effect.effect_class for effect in drives.effects]
+    return _is_implicit(drives) or any(k.overrides("friction") or k.overrides("transmission") for k in kinds)
 
 
 def _groups(drives: IdentifiedDrives, **extra: str) -> str:

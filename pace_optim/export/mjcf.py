@@ -1,4 +1,4 @@
-"""A robot's MJCF with what its drives' identification says: its joints, its changed bodies, and the drives themselves."""
+"""A robot's MJCF with what was identified: its joints, its changed bodies, and its drives."""
 
 from __future__ import annotations
 
@@ -128,10 +128,7 @@ def _with_comment(spec: mujoco.MjSpec, notes: list[str], drives: IdentifiedDrive
     what = "armature, damping, frictionloss" if joints_only else "joints and drives (actuators)"
     lines = [f"Identified with {drives.task}: {what}. Beside that:", *(f"- {note}" for note in notes)]
     if not joints_only:
-        lines.append(
-            f"The timestep is the identification's ({1e3 * drives.at.physics_dt:g} ms). The integrator is Euler: it "
-            "holds a drive's torque over a step as the identification did; implicitfast would let kd act implicitly."
-        )
+        lines.append(f"The timestep is the identification's ({1e3 * drives.at.physics_dt:g} ms).")
     body = "\n".join(textwrap.fill(line, 118, subsequent_indent="  ") for line in lines)
     body = body.replace("--", "- -")
     head, found, rest = xml.partition("<mujoco")

@@ -38,7 +38,8 @@ def write_drives(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], dt: floa
     """
     notes = _delay_notes(drives, dt)
     spec.option.timestep = dt
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.integrator = _integrator(drives)
+    notes += _rate_notes(drives, dt)
     keys = [key for key in spec.keys if len(key.ctrl)]
     _shift_encoders(spec, drives, notes)
     for name, drive in drives.items():
@@ -119,6 +120,23 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
     )
     if spec.tendons:
         notes.append("tendons over joints with a bias have lengths of what the encoders show.")
+
+
+def _integrator(drives: Mapping[str, PlainDrive]) -> mujoco.mjtIntegrator:
+    """The one with which the actuators' damping acts as it did: within the step, or as a torque held over it."""
+    continuous = any(drive.run_dt == 0 for drive in drives.values())
+    return mujoco.mjtIntegrator.mjINT_IMPLICITFAST if continuous else mujoco.mjtIntegrator.mjINT_EULER
+
+
+def _rate_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
+    rates = sorted({drive.run_dt for drive in drives.values()})
+    how = "implicitfast: kd acts within the step" if rates[0] == 0 else "Euler: a drive's torque is held over the step"
+    notes = [f"the integrator is {how}, as in the identification."]
+    if rates[0] == 0 < rates[-1]:
+        notes.append("some drives held their torque over a step: here all act within it.")
+    if rates[-1] > dt * (1 + 1e-9):
+        notes.append(f"controllers ran every {1e3 * rates[-1]:.3g} ms: here at each step of {1e3 * dt:.3g} ms.")
+    return notes
 
 
 def _delete(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, notes: list[str]) -> None:

@@ -40,6 +40,9 @@ class PlainDrive:
     delay_s: float
     """Delay of the command [s]; 0 where the whole torque is delayed, which such an actuator cannot do."""
 
+    run_dt: float = 0.0
+    """Time over which the drive's controller holds its torque [s]; 0 for one that runs continuously."""
+
     @property
     def has_line(self) -> bool:
         """Whether torque falls with speed."""
@@ -84,6 +87,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 velocity_limit=found["velocity_limit"][i] if line else math.inf,
                 encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
                 delay_s=drives.delay_s if commands else 0.0,
+                run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
             )
     notes = []
     if not commands and drives.delay_s > 0:
