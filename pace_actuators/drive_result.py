@@ -44,6 +44,9 @@ class DriveResult:
     undetermined: list[str] = field(default_factory=list)
     """Labels (``parameter/joint``) of what the recordings do not determine: it keeps its prior value."""
 
+    environment: dict[str, Any] = field(default_factory=dict)
+    """Where the environment of the identification comes from: its code and files, by digest."""
+
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read ``result.json``, or that of a run's folder.

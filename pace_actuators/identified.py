@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pace_actuators.drive_result import ALL, BASE_FIELDS, CURE, DriveResult, result_path
-from pace_actuators.effects import EffectCfg
+from pace_actuators.effects import EffectCfg, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
+from pace_actuators.own_code import checked_record
 
 if TYPE_CHECKING:
     from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -81,6 +82,9 @@ class IdentifiedDrives:
     undetermined: frozenset[str] = frozenset()
     """Labels ``parameter/joint`` that the recordings do not determine: their value is that of the configuration."""
 
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    """Where the environment of the identification comes from: its code and files, by digest."""
+
     @classmethod
     def load(cls, path: str | Path) -> IdentifiedDrives:
         """Read ``result.json``, or that of a run's folder.
@@ -90,6 +94,11 @@ class IdentifiedDrives:
         """
         path = result_path(path)
         content = DriveResult.load(path)
+        try:
+            code = checked_record(content.environment)
+        except TypeError as error:
+            refuse(path, str(error), CURE)
+        use_recorded_effects(content.effects, code, str(path))
         result = cls(
             path=path,
             task=content.task,
@@ -103,6 +112,7 @@ class IdentifiedDrives:
             effects=tuple(_parsed(path, label) for label in content.effects),
             drive=content.drive,
             undetermined=frozenset(content.undetermined),
+            environment=content.environment,
         )
         result._check()
         return result

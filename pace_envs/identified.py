@@ -18,6 +18,7 @@ from pace_envs.articulation import load_robot_spec
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.managers import EventTermCfg
+from pace_envs.task_source import EnvironmentRecord
 
 _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -62,6 +63,19 @@ def use_identified(
             ),
         }
     return notes
+
+
+def load_identified_cfg(drives: IdentifiedDrives) -> Any:
+    """The configuration of the environment in which drives were identified, from the record in their result.
+
+    Raises:
+        ValueError: If it is not known, and its code has changed or gone.
+    """
+    try:
+        record = EnvironmentRecord.read(drives.environment, drives.task)
+    except TypeError as error:
+        raise ValueError(f"{drives.path} is no complete fit result ({error}). Fit again.") from None
+    return record.load_cfg(str(drives.path))
 
 
 def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -23,6 +24,12 @@ _TASKS = {
     "Pace-Go2-Velocity-v0": "pace_envs.tasks.velocity.go2:go2_velocity_env_cfg",
 }
 
+MODEL_FILES = (".xml", ".mjcf", ".urdf")
+"""What a model file's name ends with."""
+
+_REGISTERED_BY: dict[str, dict[str, Any]] = {}
+"""Globals of the module that registered a task, by the task's name."""
+
 
 def register_envs() -> None:
     """Register the project's environments with Gymnasium, once; ``import pace_envs`` does it."""
@@ -41,8 +48,12 @@ def register_task(task: str, env_cfg_entry_point: str | Callable[[], ManagerBase
     Raises:
         ValueError: If the name is taken.
     """
+    caller, before = sys._getframe(1).f_globals, _REGISTERED_BY.get(task)
+    if before is not None and before is not caller and before["__name__"] == caller["__name__"] != __name__:
+        del gym.registry[task]  # a module of that name, since replaced by one of another folder, had registered it
     if task in gym.registry:
         raise ValueError(f"An environment named {task!r} is already registered. Choose another name.")
+    _REGISTERED_BY[task] = caller
     gym.register(
         id=task,
         entry_point="pace_envs.registration:make_env",
@@ -58,13 +69,36 @@ def registered_tasks() -> list[str]:
     return sorted(name for name, spec in gym.registry.items() if "env_cfg_entry_point" in spec.kwargs)
 
 
+def registered_by(task: str) -> str | None:
+    """The module that registered a task, by the task's name; ``None`` if this package did, or nobody."""
+    module = _REGISTERED_BY.get(task, {}).get("__name__", __name__)
+    return None if module.partition(".")[0] == "pace_envs" else module
+
+
+def is_model_file(task: str) -> bool:
+    """Whether a task is named by a robot's model file."""
+    return task.lower().endswith(MODEL_FILES)
+
+
 def load_env_cfg(task: str) -> Any:
-    """A fresh configuration of a registered environment.
+    """A fresh configuration of an environment; nothing is imported to find it.
+
+    Args:
+        task: Its registered name, also after ``module:`` or ``path/to/file.py:``; or a model file.
 
     Raises:
         ValueError: If there is no such environment.
     """
+    if is_model_file(task):
+        return _of_model_file(task)
+    module, _, task = task.rpartition(":")
     if task not in registered_tasks():
+        if module:
+            known = ", ".join(name for name in _REGISTERED_BY if registered_by(name)) or "none"
+            raise ValueError(
+                f"There is no environment {task!r} after {module} was imported; registered were {known}. Register it "
+                "there with pace_envs.register_task."
+            )
         close = difflib.get_close_matches(task, registered_tasks(), n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ValueError(
@@ -137,6 +171,16 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     cfg.sim.integrator = "rk4"
     for drive in cfg.scene.robot.actuators.values():
         drive.control_decimation *= ratio
+
+
+def _of_model_file(path: str) -> Any:
+    try:
+        from pace_envs.from_model import cfg_from_model  # type: ignore[import-not-found]  # as other tasks need none
+    except ModuleNotFoundError:
+        raise ValueError(
+            f"--task {path}: this version reads no model files. Write a configuration and name it as module:Name."
+        ) from None
+    return cfg_from_model(path)
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

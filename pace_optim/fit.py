@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from pace_actuators.effects import effect_modules
+from pace_envs import load_env_cfg
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
@@ -16,10 +20,18 @@ from pace_optim.optimizers.other_starts import other_valleys, scattered
 from pace_optim.optimizers.refine import refine
 from pace_optim.optimizers.search import RefiningPays, search
 from pace_optim.problem.evaluator import Evaluator
-from pace_optim.problem.problem import Problem, as_vector, file_digest, load_problem
+from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.report import write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
+from pace_optim.run.inputs import (
+    check_same_configuration,
+    check_unchanged,
+    input_digests,
+    recording_digests,
+    with_absolute_paths,
+)
+from pace_optim.run.open import Run, problem_of
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
@@ -44,14 +56,16 @@ _NEAR = LeastSquaresCfg(score_tolerance=0.02)
 def fit(
     settings: FitSettings,
     progress: ProgressLine | None = None,
+    before: Run | None = None,
     on_start: Callable[[Path], None] = lambda _: None,
     assess_interrupted: bool = True,
 ) -> tuple[FitResult, Path]:
     """Identify a robot.
 
     Args:
-        settings: What to fit, and how.
+        settings: What to fit, and how; its task and effects are known (:func:`pace_envs.task_source.use_task`).
         progress: Shows how far it is.
+        before: The run whose robot is fitted anew, if there is one.
         on_start: Gets the run's folder before the first simulation.
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
             interruption is passed on at once, and the folder has what ``resume`` needs.
@@ -62,15 +76,30 @@ def fit(
     Raises:
         ValueError: If anything does not fit; nothing has been written then.
     """
-    problem = _load(settings)
+    if before is None:
+        env_cfg, place = load_env_cfg(settings.task), None
+    else:
+        env_cfg, place = before.load_cfg(), before.record.folder
+    settings = with_absolute_paths(settings, env_cfg)
+    problem = _load(settings, env_cfg)
+    record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
-    folder.write_start(settings.to_dict(), _digests(settings, problem), problem)
+    folder.write_start(
+        settings.to_dict(),
+        recording_digests(settings),
+        problem,
+        inputs=input_digests(settings, record),
+        environment=record.to_dict(),
+    )
     on_start(folder.path)
-    return _Fit(settings, problem, folder, progress or ProgressLine()).run(assess_interrupted)
+    return _Fit(settings, problem, folder, progress or ProgressLine(), record).run(assess_interrupted)
 
 
 def resume(
-    path: str | Path, max_iteration: int | None = None, progress: ProgressLine | None = None
+    path: str | Path,
+    max_iteration: int | None = None,
+    progress: ProgressLine | None = None,
+    task: str | None = None,
 ) -> tuple[FitResult, Path]:
     """Go on with an interrupted fit; the result is that of one that was never interrupted.
 
@@ -78,36 +107,29 @@ def resume(
         path: The run's folder.
         max_iteration: Another largest number of generations.
         progress: Shows how far it is.
+        task: Where the run's environment is found now, if it has been moved.
 
     Raises:
-        ValueError: If the run cannot be resumed, or its recordings have changed.
+        ValueError: If the run cannot be resumed, or anything that it was started with has changed.
     """
+    settings, _ = FitSettings.load(Path(path) / "settings.json")
     folder = RunFolder(Path(path))
-    settings, digests = FitSettings.load(folder.path / "settings.json")
-    if max_iteration is not None:
-        settings = replace(settings, max_iteration=max_iteration)
     checkpoint = folder.read_checkpoint()
-    for name, digest in digests.items():
-        if not Path(name).is_file() or file_digest(name) != digest:
-            raise ValueError(f"{name} has changed or gone since the run was started. Put it back, or start a new fit.")
-    problem = _load(settings)
-    run = _Fit(settings, problem, folder, progress or ProgressLine())
+    before = Run.open(folder.path, task)
+    check_unchanged(before)
+    settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
+    problem = _load(settings, before.load_cfg())
+    check_same_configuration(before, problem)
+    run = _Fit(settings, problem, folder, progress or ProgressLine(), before.record)
     run.restore(checkpoint)
     return run.run()
 
 
-def _load(settings: FitSettings) -> Problem:
+def _load(settings: FitSettings, env_cfg: Any) -> Problem:
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
-    problem = load_problem(
-        settings.task,
-        data=settings.data,
-        validation=settings.validation,
-        delay_mode=settings.delay_mode,
-        physics_dt=settings.physics_dt,
-        effects=settings.effects,
-    )
+    problem = problem_of(settings, env_cfg)
     cmaes = problem.env_cfg.sim2real.cmaes
     chosen = {
         name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None
@@ -136,11 +158,6 @@ def _try_out(problem: Problem) -> None:
     rollout.env.close()
 
 
-def _digests(settings: FitSettings, problem: Problem) -> dict[str, str]:
-    names = [*(settings.data or [str(problem.env_cfg.sim2real.data_dir)]), *settings.validation]
-    return {str(name): file_digest(name) for name in names}
-
-
 @dataclass(kw_only=True, eq=False)
 class Outcome:
     """Where the optimizers ended."""
@@ -153,8 +170,16 @@ class Outcome:
 class _Fit:
     """One run: the optimizers' state and what is written along the way."""
 
-    def __init__(self, settings: FitSettings, problem: Problem, folder: RunFolder, progress: ProgressLine):
+    def __init__(
+        self,
+        settings: FitSettings,
+        problem: Problem,
+        folder: RunFolder,
+        progress: ProgressLine,
+        record: EnvironmentRecord,
+    ):
         self.settings = settings
+        self.record = record
         self.problem = problem
         self.folder = folder
         self.progress = progress
@@ -365,6 +390,7 @@ class _Fit:
             every,
             uncertainty,
             effects=problem.effects,
+            environment=self.record.to_dict(),
             optimizer=self.settings.optimizer,
             seed=self.settings.seed,
             generations=self.optimizer.generation if self.optimizer else 0,

@@ -18,7 +18,14 @@ from pace_actuators.effects import (
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, probe_points
 from pace_actuators.effects.effect_cfg import SHARED, WIDE, EffectCfg, effect_cfgs
-from pace_actuators.effects.registry import available_effects, get_effect, register_effect
+from pace_actuators.effects.registry import (
+    available_effects,
+    effect_modules,
+    get_effect,
+    import_effect,
+    register_effect,
+    use_recorded_effects,
+)
 from pace_actuators.effects.stack import EffectStack
 
 __all__ = [
@@ -33,10 +40,12 @@ __all__ = [
     "command",
     "drive",
     "effect_cfgs",
+    "effect_modules",
     "fading_friction",
     "free_form",
     "friction",
     "get_effect",
+    "import_effect",
     "measurement",
     "model",
     "mount",
@@ -44,4 +53,5 @@ __all__ = [
     "register_effect",
     "transmission",
     "two_mass",
+    "use_recorded_effects",
 ]

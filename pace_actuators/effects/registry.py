@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from importlib import import_module
 
 from pace_actuators.effects.effect import Effect
+from pace_actuators.own_code import (
+    CodeRecord,
+    absolute_reference,
+    import_named,
+    import_recorded,
+    is_path,
+    loaded_module,
+    split_reference,
+)
 
 _EFFECTS: dict[str, type[Effect]] = {}
 
@@ -46,10 +56,57 @@ def get_effect(name: str) -> type[Effect]:
     return _EFFECTS[name]
 
 
-def _imported(name: str) -> type[Effect]:
-    module, _, attribute = name.partition(":")
+def import_effect(text: str) -> str:
+    """Import the module of an effect that the user names, and return the effect's text, good from any folder.
+
+    Args:
+        text: What :meth:`EffectCfg.parse` reads, with ``module:Class`` or ``path/to/file.py:Class`` for the name; a
+            registered name is returned as it is.
+
+    Raises:
+        ValueError: If there is no such module or class.
+    """
+    name, at, joints = text.partition("@")
+    module, _ = split_reference(name)
+    if not module:
+        return text
     try:
-        effect = getattr(import_module(module), attribute)
+        import_named(module)
+    except ValueError as error:
+        raise ValueError(f"The effect {name!r}: {error}") from None
+    name = absolute_reference(name)
+    get_effect(name)
+    return f"{name}{at}{joints}"
+
+
+def use_recorded_effects(effects: Sequence[str], code: CodeRecord, where: str) -> None:
+    """Make the effects known that a file names: those of one's own by its record of their code, and not otherwise.
+
+    Args:
+        effects: What :meth:`EffectCfg.parse` reads.
+        code: The record.
+        where: The file, for messages.
+
+    Raises:
+        ValueError: If code is named that the record does not hold, or that has changed since.
+    """
+    for text in effects:
+        if module := split_reference(text.partition("@")[0])[0]:
+            import_recorded(module, code, where, f"--import {module}, or import it before the file is read")
+
+
+def effect_modules(effects: Sequence[str]) -> list[str]:
+    """The modules that effects of one's own name."""
+    return [module for text in effects if (module := split_reference(text.partition("@")[0])[0])]
+
+
+def _imported(name: str) -> type[Effect]:
+    module, attribute = split_reference(name)
+    try:
+        found = loaded_module(module)
+        if found is None and is_path(module):
+            raise ImportError(f"{module} has not been imported")
+        effect = getattr(found or import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"The effect {name!r} cannot be imported ({error}). Correct module:Class, or put the module's folder on "

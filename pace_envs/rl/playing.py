@@ -109,7 +109,7 @@ class _Film:
 
 def _run_settings(checkpoint: Path, settings: PlaySettings) -> RunSettings:
     if (checkpoint.parent / SETTINGS_FILE).is_file():
-        run = RunSettings.read(checkpoint.parent)
+        run = RunSettings.read(checkpoint.parent, settings.task)
     elif settings.task is not None:
         run = RunSettings(task=settings.task)
     else:

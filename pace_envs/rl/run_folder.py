@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
+from typing import Any
+
+from pace_envs.task_source import EnvironmentRecord
 
 SETTINGS_FILE = "settings.json"
 IDENTIFIED_FILE = "identified.json"
@@ -52,18 +56,28 @@ class RunSettings:
     log_dir: str = "logs/rsl_rl"
     """Where runs are kept."""
 
-    def write(self, folder: Path) -> None:
-        """Write ``settings.json``, whole or not at all."""
+    def write(self, folder: Path, environment: Mapping[str, Any]) -> None:
+        """Write ``settings.json``, whole or not at all.
+
+        Args:
+            folder: The training's.
+            environment: Where the task comes from (:class:`pace_envs.task_source.EnvironmentRecord`).
+        """
         part = folder / f".{SETTINGS_FILE}.part"
-        part.write_text(json.dumps({"version": 1, **asdict(self)}, indent=2) + "\n", encoding="utf-8")
+        content = {"version": 1, **asdict(self), "environment": dict(environment)}
+        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         os.replace(part, folder / SETTINGS_FILE)
 
     @classmethod
-    def read(cls, folder: Path) -> RunSettings:
-        """Read ``settings.json``.
+    def read(cls, folder: Path, task: str | None = None) -> RunSettings:
+        """Read ``settings.json`` and make its task known.
+
+        Args:
+            folder: The training's.
+            task: Another task in place of its own.
 
         Raises:
-            ValueError: If the folder has none, or it cannot be read.
+            ValueError: If the folder has none, it cannot be read, or the code of its task has changed or gone.
         """
         path = folder / SETTINGS_FILE
         if not path.is_file():
@@ -73,8 +87,10 @@ class RunSettings:
             # not in older runs
             added = dict.fromkeys(("identified", "randomize_identified", "physics_dt", "start_from"))
             settings = cls(**{field.name: (added | data)[field.name] for field in fields(cls)})
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            record = EnvironmentRecord.read(data.get("environment"), settings.task)
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}).") from None
+        settings.task = record.use(str(path), task)
         if settings.identified is not None and (folder / IDENTIFIED_FILE).is_file():
             settings.identified = str(folder / IDENTIFIED_FILE)
         return settings

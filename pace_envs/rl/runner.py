@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
@@ -53,10 +55,13 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         """
         if not Path(path).is_file():
             raise ValueError(f"The checkpoint {path} does not exist.")
+        content = read_checkpoint(path, map_location)
         try:
-            infos = super().load(path, load_cfg, strict, map_location)
-        except (RuntimeError, KeyError, AttributeError) as error:
-            first = str(error).splitlines()[0]
+            if self.alg.load(content, load_cfg, strict):
+                self.current_learning_iteration = int(content["iter"])
+            infos = content["infos"]
+        except (RuntimeError, KeyError, AttributeError, TypeError, ValueError) as error:
+            first = (str(error) or type(error).__name__).splitlines()[0]
             raise ValueError(f"{path} is no checkpoint of this task's networks ({first}). Check --task.") from None
         self.current_learning_iteration += 1
         if self.env.unwrapped.curriculum_manager.active_terms:
@@ -71,6 +76,28 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         manager = self.env.unwrapped.command_manager
         terms = {name: manager.get_term(name) for name in manager.active_terms}
         return {name: term for name, term in terms.items() if isinstance(term, UniformVelocityCommand)}
+
+
+def read_checkpoint(path: str | Path, map_location: str | None = None) -> dict[str, Any]:
+    """The content of a checkpoint: numbers and tensors, and nothing that would run code to be read.
+
+    Raises:
+        ValueError: If the file is damaged or holds anything else.
+    """
+    try:
+        content = torch.load(path, weights_only=True, map_location=map_location)
+    except (pickle.UnpicklingError, BadZipFile, RuntimeError, EOFError, KeyError, ValueError, TypeError) as error:
+        foreign = isinstance(error, pickle.UnpicklingError) and "weights_only" in str(error).lower()
+        what = "holds objects of Python beside numbers, which are not loaded" if foreign else "is damaged, or none"
+        raise ValueError(
+            f"The checkpoint {path} {what}. Name a model_<iteration>.pt that scripts/train.py wrote."
+        ) from None
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"The checkpoint {path} holds a {type(content).__name__}, expected that of a training. Name a "
+            "model_<iteration>.pt that scripts/train.py wrote."
+        )
+    return content
 
 
 def _with_threads(update: Callable[[], dict], threads: int) -> Callable[[], dict]:

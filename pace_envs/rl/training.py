@@ -17,6 +17,7 @@ from pace_envs.rl.export import export_policy
 from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, find_checkpoint, latest_checkpoint, new_run_folder
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+from pace_envs.task_source import EnvironmentRecord
 from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
 
 EditCfg = Callable[[VelocityEnvCfg], None]
@@ -90,25 +91,28 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
     cfg = load_cfg(settings, edit)
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)
     folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
-    settings.write(folder)
+    settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
     if settings.identified is not None:
         shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
     return _learn(cfg, folder, start)
 
 
-def resume(run: str | Path, max_iterations: int | None = None, edit: EditCfg | None = None) -> Path:
+def resume(
+    run: str | Path, max_iterations: int | None = None, edit: EditCfg | None = None, task: str | None = None
+) -> Path:
     """Go on with a training in its folder, up to ``max_iterations`` in all.
 
     Raises:
         ValueError: If there is nothing left to do.
     """
     folder = Path(run)
-    settings = RunSettings.read(folder)
+    settings = RunSettings.read(folder, task)
     if max_iterations is not None:
         settings = replace(settings, max_iterations=max_iterations)
     checkpoint = latest_checkpoint(folder)
-    settings.write(folder)
-    return _learn(load_cfg(settings, edit), folder, checkpoint)
+    cfg = load_cfg(settings, edit)
+    settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
+    return _learn(cfg, folder, checkpoint)
 
 
 def _learn(cfg: VelocityEnvCfg, folder: Path, checkpoint: Path | None) -> Path:

@@ -7,6 +7,7 @@ import torch
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 
 def main() -> None:
@@ -33,10 +34,11 @@ def main() -> None:
     refit.add_argument(
         "--no_refit", dest="refit", action="store_false", help="do not fit the robot with what was found"
     )
-    args = parser.parse_args()
+    add_common_options(parser, run=True)
+    options = take_common_options(vars(parser.parse_args()))
 
     torch.set_num_threads(1)  # many small tensors
-    diagnosis = diagnose(DiagnosisSettings(**vars(args)), on_verdict=_tell)
+    diagnosis = diagnose(DiagnosisSettings(**options), on_verdict=_tell)
     for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
         print(f"report: {Path(run) / 'report.html'}")
     print(f"run: {diagnosis.runs[-1]}")

@@ -4,6 +4,7 @@ import sys
 
 from pace_optim.export import FORMATS, export
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 
 def main() -> None:
@@ -17,13 +18,15 @@ def main() -> None:
     parser.add_argument("--format", required=True, choices=tuple(FORMATS), help="what to write")
     parser.add_argument("--joints_only", action="store_true", help="mjcf: leave the actuators as they were")
     parser.add_argument("--output", metavar="FILE", help="where (default: standard output)")
-    args = parser.parse_args()
-    exported = export(args.result, args.format, joints_only=args.joints_only)
-    if args.output is None:
+    add_common_options(parser, run=True)
+    options = take_common_options(vars(parser.parse_args()))
+    output = options["output"]
+    exported = export(options["result"], options["format"], joints_only=options["joints_only"], task=options["task"])
+    if output is None:
         print(exported.text, end="")
     else:
-        exported.write(args.output)
+        exported.write(output)
     for note in exported.notes:  # after the text on standard output, they go where they do not mix with it
-        print(f"note: {note}", file=sys.stdout if args.output else sys.stderr)
-    if args.output is not None:
-        print(f"written: {args.output}")
+        print(f"note: {note}", file=sys.stdout if output else sys.stderr)
+    if output is not None:
+        print(f"written: {output}")

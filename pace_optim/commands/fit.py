@@ -1,13 +1,18 @@
 """Identify a robot's drives from recordings."""
 
+import sys
+
 import torch
 
 from pace_optim.fit import fit, resume
 from pace_optim.problem.problem import DELAY_MODES
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary
-from pace_optim.terminal.cli import import_task, make_parser
-from pace_optim.terminal.options import add_common_options
+from pace_optim.terminal.cli import given_options, make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
+
+_WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless")
+"""Options that a resumed run takes; it has the others from its start."""
 
 
 def main() -> None:
@@ -47,16 +52,18 @@ def main() -> None:
     parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
     parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
-    args = vars(parser.parse_args())
+    args = take_common_options(vars(parser.parse_args()))
     del args["headless"]
 
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     if run := args.pop("resume"):
-        result, folder = resume(run, args["max_iteration"])
+        if ignored := [option for option in given_options(parser) if option not in _WITH_RESUME]:
+            print(f"note: --resume goes on with the run's own settings; ignored: {', '.join(ignored)}", file=sys.stderr)
+        result, folder = resume(run, args["max_iteration"], task=args["task"])
     else:
         if args["task"] is None:
             raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
-        result, folder = fit(FitSettings(**args | {"task": import_task(args["task"])}))
+        result, folder = fit(FitSettings(**args))
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
     print(f"run: {folder}")

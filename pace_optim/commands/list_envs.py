@@ -4,14 +4,15 @@ from pathlib import Path
 
 from pace_envs import load_env_cfg, registered_tasks
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 HEADER = ("task", "robot", "joints", "physics/control", "sample recording")
 
 
-def rows() -> list[tuple[str, ...]]:
+def rows(tasks: list[str]) -> list[tuple[str, ...]]:
     """One per environment."""
     result: list[tuple[str, ...]] = []
-    for task in registered_tasks():
+    for task in dict.fromkeys(tasks):
         cfg = load_env_cfg(task)
         sim2real = getattr(cfg, "sim2real", None)
         robot = sim2real.robot_name if sim2real else Path(cfg.scene.robot.mjcf_path).stem
@@ -32,11 +33,13 @@ def sample_recording(path: Path) -> str:
 
 def main() -> None:
     """Print the table."""
-    make_parser(
+    parser = make_parser(
         "List the registered environments: robot, number of joints, rates of physics and control, sample recording.",
         example="scripts/list_envs.py",
-    ).parse_args()
-    table = [HEADER, *rows()]
+    )
+    add_common_options(parser)
+    task = take_common_options(vars(parser.parse_args()))["task"]
+    table = [HEADER, *rows([*registered_tasks(), *([task] if task and ":" not in task else [])])]
     widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
     for row in table:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

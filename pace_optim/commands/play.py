@@ -10,8 +10,8 @@ if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
 
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
 from pace_optim.run.training_replay import replay_in_training  # noqa: E402
-from pace_optim.terminal.cli import import_task, make_parser  # noqa: E402
-from pace_optim.terminal.options import add_common_options  # noqa: E402
+from pace_optim.terminal.cli import make_parser  # noqa: E402
+from pace_optim.terminal.options import add_common_options, take_common_options  # noqa: E402
 
 
 def main() -> None:
@@ -32,16 +32,16 @@ def main() -> None:
     parser.add_argument("--export", metavar="DIR", help="write the policy as TorchScript and ONNX")
     parser.add_argument("--identified", metavar="FILE", help="walk on the drives of this fit: its result.json")
     parser.add_argument(
-        "--replay", metavar="RUN", help="instead, replay the recordings of this fit in --task, the base held"
+        "--replay",
+        metavar="RUN",
+        help="instead, replay the recordings of this fit in --task (default: its own environment), the base held",
     )
     parser.add_argument("--physics_dt", type=float, metavar="S", help="with --replay: step of physics and drives")
-    args = vars(parser.parse_args())
-    args["task"] = import_task(args["task"]) if args["task"] else None
+    args = take_common_options(vars(parser.parse_args()))
     run, physics_dt = args.pop("replay"), args.pop("physics_dt")
     if run is not None:
-        if args["task"] is None:
-            raise ValueError("--replay needs --task, the environment that is to be trained in.")
-        print(replay_in_training(run, load_cfg(RunSettings(task=args["task"], identified=run, physics_dt=physics_dt))))
+        training = RunSettings(task=args["task"] or "", identified=run, physics_dt=physics_dt)
+        print(replay_in_training(run, load_cfg(training) if args["task"] else None))
         return
     if args["checkpoint"] is None:
         raise ValueError("--checkpoint is missing: name a model_<n>.pt or a training's folder, or a fit with --replay.")

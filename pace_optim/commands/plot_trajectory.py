@@ -1,5 +1,6 @@
 """Look at a run: what was commanded, measured and simulated, and how the score fell."""
 
+import argparse
 import io
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pace_optim.run.history import History
 from pace_optim.run.replay import replay
 from pace_optim.run.tensors import read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 
 def main() -> None:
@@ -30,7 +32,8 @@ def main() -> None:
     parser.add_argument("--output", metavar="DIR", help="write PNG files there instead of showing windows")
     parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
     parser.add_argument("--headless", action="store_true", help="show nothing; without --output, write to the run")
-    args = parser.parse_args()
+    add_common_options(parser, run=True)
+    args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
     both = not (args.plot_trajectory or args.plot_score)
 
     torch.set_num_threads(1)
@@ -45,7 +48,7 @@ def main() -> None:
     if args.plot_trajectory or both:
         if args.mean_name:
             path = find_mean(run, args.mean_name)
-            content, of = replay(run, read_mean(path)), path.stem
+            content, of = replay(run, read_mean(path), args.task), path.stem
         else:
             content, of = read_trajectory(run), "best"
         drawn = plot_trajectories(content, title=f"{title} · {of}", make_figure=plt.figure)

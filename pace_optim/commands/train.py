@@ -6,8 +6,8 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from pace_envs.rl import RunSettings, resume, train
-from pace_optim.terminal.cli import import_task, make_parser
-from pace_optim.terminal.options import add_common_options
+from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 
 def main() -> None:
@@ -32,11 +32,11 @@ def main() -> None:
     )
     parser.add_argument("--log_dir", default="logs/rsl_rl", metavar="DIR", help="where runs are kept")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted or finished run")
-    args = vars(parser.parse_args())
+    args = take_common_options(vars(parser.parse_args()))
     if run := args.pop("resume"):
-        folder = resume(run, args["max_iterations"])
+        folder = resume(run, args["max_iterations"], task=args["task"])
     else:
         if args["task"] is None:
             raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
-        folder = train(RunSettings(**args | {"task": import_task(args["task"])}))
+        folder = train(RunSettings(**args))
     print(f"run: {folder}")

@@ -13,6 +13,7 @@ import numpy as np
 from pace_actuators.files import write_together
 from pace_optim.report import check_folder, report_text
 from pace_optim.report.trajectory_errors import held_out_spans
+from pace_optim.run.open import run_folder
 
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder
@@ -24,7 +25,12 @@ FILE = "comparison.json"
 _DIGITS = 5
 
 
-def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt: float | None = None) -> dict[str, Any]:
+def compare(
+    folders: Sequence[str | Path],
+    data: Sequence[str] = (),
+    physics_dt: float | None = None,
+    task: str | None = None,
+) -> dict[str, Any]:
     """Say where each run's model fails, and put several side by side.
 
     Every run's folder gets a comparison.json and its report anew; the last one's also hold the ladder of the error.
@@ -33,6 +39,7 @@ def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt:
         folders: Runs' folders; several must share task and recordings.
         data: Recordings to simulate in place of the runs' own.
         physics_dt: Simulate at this physics step in place of the runs' [s].
+        task: Another environment in place of the runs' own.
 
     Returns:
         The content of the last run's comparison.json.
@@ -45,7 +52,7 @@ def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt:
         raise ValueError(f"{repeated[0]} is named twice. Name each run once, the base model first.")
     for path in paths:
         check_folder(path, anew=FILE)
-    runs = [load_tracks(path, data, physics_dt) for path in paths]
+    runs = [load_tracks(path, data, physics_dt, task) for path in paths]
     check_alike(runs)
     contents = [compare_run(run) for run in runs]
     if len(runs) > 1:
@@ -57,20 +64,6 @@ def compare(folders: Sequence[str | Path], data: Sequence[str] = (), physics_dt:
         files[run.folder / "report.html"] = report_text(run.folder, {FILE: content})
     write_together(files)
     return contents[-1]
-
-
-def run_folder(folder: str | Path) -> Path:
-    """The folder of a run, named by itself or by a file in it.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    path = Path(folder)
-    if path.name == "result.json" and path.is_file():
-        path = path.parent
-    if not path.is_dir():
-        raise ValueError(f"There is no run {folder}. Name the folder that scripts/fit.py printed as its last line.")
-    return path
 
 
 def compare_run(run: RunTracks) -> dict[str, Any]:

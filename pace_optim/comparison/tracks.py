@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,9 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from pace_envs.task_source import file_digest
 from pace_optim.problem.evaluator import Evaluator
-from pace_optim.problem.problem import Problem, file_digest, load_problem
+from pace_optim.problem.problem import Problem
 from pace_optim.recording import Drive, Recording
+from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_trajectory
@@ -65,23 +66,27 @@ class RunTracks:
     """What could not be done."""
 
 
-def load_tracks(folder: Path, data: Sequence[str] = (), physics_dt: float | None = None) -> RunTracks:
+def load_tracks(
+    folder: Path, data: Sequence[str] = (), physics_dt: float | None = None, task: str | None = None
+) -> RunTracks:
     """A run's best parameters on its own recordings, or on others.
 
     Args:
         folder: The run's folder.
         data: Recordings to simulate in place of the run's own.
         physics_dt: Simulate at this physics step in place of the run's [s].
+        task: Another environment in place of the run's.
 
     Raises:
         ValueError: If the run or a recording cannot be used.
     """
     result = FitResult.load(folder)
-    simulate = bool(data) or physics_dt is not None
+    simulate = bool(data) or physics_dt is not None or task is not None
     notes: list[str] = []
     problem: Problem | None = None
     try:
-        problem = _reload(folder, data, physics_dt, with_effects=simulate)
+        # the torque of the load does not depend on effects
+        problem = open_problem(folder, task=task, data=data, physics_dt=physics_dt, effects=None if simulate else ())
     except (ValueError, KeyError, OSError) as error:
         if simulate:
             raise
@@ -127,21 +132,6 @@ def load_tracks(folder: Path, data: Sequence[str] = (), physics_dt: float | None
     )
 
 
-def _reload(folder: Path, data: Sequence[str], physics_dt: float | None, *, with_effects: bool) -> Problem:
-    """The run's problem; without its effects, which the torque of the load does not depend on, when not simulated."""
-    settings, _ = FitSettings.load(folder / "settings.json")
-    wanted: dict[str, Any] = {
-        name: getattr(settings, name) for name in inspect.signature(load_problem).parameters if hasattr(settings, name)
-    }
-    if data:
-        wanted |= {"data": list(data), "validation": []}
-    if physics_dt is not None:
-        wanted["physics_dt"] = physics_dt
-    if not with_effects:
-        wanted.pop("effects", None)
-    return load_problem(**wanted)
-
-
 def _check_finite(folder: Path, content: dict[str, Any]) -> None:
     for entry in content["recordings"]:
         if not bool(torch.as_tensor(entry["sim_dof_pos"]).isfinite().all()):
@@ -170,7 +160,7 @@ def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
     """For files named anew, which samples the run was trained on: those of its own recordings, by their digests."""
     if not data or not (folder / "best_trajectory.pt").is_file():
         return []
-    _, digests = FitSettings.load(folder / "settings.json")  # in the order of the recordings
+    digests = FitSettings.load(folder / "settings.json")[1].digests  # in the order of the recordings
     entries = read_trajectory(folder)["recordings"]
     if len(digests) != len(entries):
         return []

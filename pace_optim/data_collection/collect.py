@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 
 from pace_envs import load_env_cfg, registered_tasks
+from pace_envs.registration import make_env
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.excitation import Trajectory, make_excitation, write_command_csv
 from pace_optim.experiment_design import Design
@@ -89,9 +89,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
     truth = None if cfg.command_only else true_parameters(sim2real, space, cfg.parameters)
 
     count = len(trajectories)
-    env: Any = gym.make(
-        cfg.task, cfg=env_cfg, num_envs=count, physics_dt=cfg.physics_dt, delay_mode=cfg.delay_mode
-    ).unwrapped
+    env: Any = make_env(cfg.task, cfg=env_cfg, num_envs=count, physics_dt=cfg.physics_dt, delay_mode=cfg.delay_mode)
     try:
         limits = _limits_of(env)
         design = design_motion(cfg, env, trajectories[0], limits, report) if cfg.optimize else None

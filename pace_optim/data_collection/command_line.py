@@ -11,8 +11,8 @@ from pace_optim.excitation import excitations
 from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
-from pace_optim.terminal.cli import Parser, import_task, make_parser
-from pace_optim.terminal.options import add_common_options
+from pace_optim.terminal.cli import Parser, make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
 
 from .cfg import CollectionCfg
 
@@ -106,15 +106,14 @@ def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
     Raises:
         ValueError: If one is malformed.
     """
-    options = vars(args).copy()
+    options = take_common_options(vars(args))
     load = Load(
         added_mass=_pairs("--added_mass", options.pop("added_mass"), "BODY=KG"),
         **{key: options.pop(key) for key in ("load_mass", "load_length", "arm_mass")},
     )
     parameters = _pairs("--parameter", options.pop("parameter"), "NAME=VALUE or NAME/JOINT=VALUE")
-    task = import_task(options.pop("task"))
     effects = tuple(options.pop("effect"))
-    return CollectionCfg(task=task, load=load, parameters=parameters, effects=effects, **options)
+    return CollectionCfg(load=load, parameters=parameters, effects=effects, **options)
 
 
 def _pairs(option: str, words: Sequence[str], form: str) -> dict[str, float]:

@@ -31,10 +31,10 @@ from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in,
 from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, likes, ranking, verdict
 from pace_optim.fit import fit
-from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.problem.problem import Problem
 from pace_optim.report import check_folder, report_text
+from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
-from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
 
@@ -88,19 +88,13 @@ def diagnose(
     """
     begin = time.monotonic()
     progress = progress or ProgressLine()
-    folder = Path(settings.run)
+    run = Run.open(settings.run, settings.task)
+    folder = run.folder
     check_folder(folder, anew=FILE)
     result = FitResult.load(folder)
-    run_settings, _ = FitSettings.load(folder / "settings.json")
     candidates = candidate_effects(settings.effects, only=settings.only)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
-    problem = load_problem(
-        run_settings.task,
-        data=run_settings.data,
-        validation=run_settings.validation,
-        delay_mode=run_settings.delay_mode,
-        physics_dt=physics_dt,
-    ).with_effects(())
+    problem = run.problem(physics_dt=physics_dt, effects=())
     base = {name: result.parameters[name] for name in problem.space.slices}
     found = search_effects(
         problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say, result
@@ -138,7 +132,7 @@ def diagnose(
     on_verdict(diagnosis)
     explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
-    if refit and found.paying and (path := _refit(found, problem, run_settings, diagnosis, progress)) is not None:
+    if refit and found.paying and (path := _refit(found, problem, run, diagnosis, progress)) is not None:
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
         _save(diagnosis)
     return diagnosis
@@ -168,9 +162,7 @@ def _other_error(found: Findings, problem: Problem, run: FitResult) -> list[str]
     ]
 
 
-def _refit(
-    found: Findings, problem: Problem, run: FitSettings, diagnosis: Diagnosis, progress: ProgressLine
-) -> Path | None:
+def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, progress: ProgressLine) -> Path | None:
     """Fit the whole robot with what was found, from where the search ended; returns the new run's folder.
 
     ``None`` if the user breaks it off: the new folder keeps what it needs to go on, and the diagnosis.
@@ -178,13 +170,13 @@ def _refit(
     progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
     final = found.outcome.final
     settings = replace(
-        run,
+        run.settings,
         effects=found.paying,
         optimizer="least_squares",
         physics_dt=problem.physics_dt,
         start=whole_values(final.model, final.x, problem.joint_names),
         check_consistency=False,  # the run has done it
-        log_dir=str(Path(diagnosis.run).parent.parent),
+        log_dir=str(run.folder.absolute().parent.parent),
     )
     progress.restart()
     begun: list[Path] = []
@@ -194,7 +186,7 @@ def _refit(
         begun.append(path)
 
     try:
-        _, path = fit(settings, progress, on_start=keep, assess_interrupted=False)
+        _, path = fit(settings, progress, before=run, on_start=keep, assess_interrupted=False)
     except KeyboardInterrupt:
         how = f": {command('fit')} --resume {begun[0]} goes on with it" if begun else ""
         progress.close()

@@ -13,6 +13,9 @@ class DiagnosisSettings:
     run: str | Path
     """The run's folder."""
 
+    task: str | None = None
+    """Another environment than the run's own."""
+
     effects: list[str] = field(default_factory=list)
     """More candidates (``module:Class``), beside all registered ones; or, with ``only``, the only ones."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
@@ -59,13 +59,14 @@ FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
 """Format -> what writes it."""
 
 
-def export(path: str | Path, fmt: str, *, joints_only: bool = False) -> Export:
+def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str | None = None) -> Export:
     """A result in another format.
 
     Args:
         path: ``result.json``, or the run's folder.
         fmt: One of ``FORMATS``.
         joints_only: Leave the drives out of a model (``mjcf``).
+        task: Another environment than that of the fit.
 
     Raises:
         ValueError: If the result is unusable, the format is unknown, or the robot's model has gone.
@@ -75,5 +76,7 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False) -> Export:
     if joints_only and fmt != "mjcf":
         raise ValueError(f"joints_only is for the format mjcf; {fmt!r} holds nothing but drives. Leave it out.")
     drives = IdentifiedDrives.load(path)
+    if task is not None:
+        drives = replace(drives, task=task, environment={})
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
     return Export(text=text, notes=notes)

@@ -12,7 +12,7 @@ from pace_actuators import IdentifiedAt, IdentifiedDrives, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable
-from pace_envs import load_env_cfg
+from pace_envs.identified import load_identified_cfg
 
 _DELAY = (
     "The delay is in seconds: the drive converts it to its own control steps. At another physics step than "
@@ -26,7 +26,7 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
     Raises:
         ValueError: If the environment of the identification is not registered.
     """
-    cfg = load_env_cfg(drives.task)
+    cfg = load_identified_cfg(drives)
     result = {}
     for group, drive in cfg.scene.robot.actuators.items():
         patterns = [drive.joint_names_expr] if isinstance(drive.joint_names_expr, str) else drive.joint_names_expr

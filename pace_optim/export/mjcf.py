@@ -13,8 +13,8 @@ import torch
 from pace_actuators import IdentifiedDrives
 from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction
-from pace_envs import ManagerBasedRLEnv, load_env_cfg
-from pace_envs.identified import use_identified
+from pace_envs import ManagerBasedRLEnv
+from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.model_file import read_model_file
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import GAIN_EFFECTS, effect_notes, is_undetermined, plain_drives
@@ -32,7 +32,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     Raises:
         ValueError: If the environment of the identification is not available, or its model cannot be read.
     """
-    cfg = load_env_cfg(drives.task)
+    cfg = load_identified_cfg(drives)
     source = Path(cfg.scene.robot.mjcf_path)
     cfg.scene.num_envs = 1
     cfg.sim.dt, cfg.decimation = drives.at.control_dt, 1

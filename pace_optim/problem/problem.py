@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 
@@ -109,6 +108,7 @@ def load_problem(
     delay_mode: str | None = None,
     physics_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
+    env_cfg: Any = None,
 ) -> Problem:
     """Read and check everything that a fit needs.
 
@@ -120,11 +120,12 @@ def load_problem(
         physics_dt: A finer physics step under the same control rate [s].
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
+        env_cfg: The task's configuration, if it has been loaded; it is not changed.
 
     Raises:
         ValueError: If anything does not fit.
     """
-    cfg = load_env_cfg(task)
+    cfg = load_env_cfg(task) if env_cfg is None else copy.deepcopy(env_cfg)
     if not isinstance(cfg, PaceSim2realEnvCfg):
         raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
     if delay_mode is not None and delay_mode not in DELAY_MODES:
@@ -189,11 +190,6 @@ def _load(path: Path, env: ManagerBasedRLEnv, control_dt: float) -> Recording:
         load_bodies=robot.body_names,
         accepts_load=cfg.sim2real.apply_load is not None,
     )
-
-
-def file_digest(path: str | Path) -> str:
-    """SHA-256 of a file, to tell whether it has changed."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def as_vector(problem: Problem, values: dict) -> torch.Tensor:

@@ -14,6 +14,7 @@ import torch
 from pace_actuators.files import checked, json_text, refuse, write_atomically, write_json, write_tensors, writing
 from pace_actuators.files.writing import Writer
 from pace_optim.run.history import History
+from pace_optim.run.resolved import resolved, write_model
 from pace_optim.terminal.arrays import read_arrays
 from pace_optim.terminal.cli import command
 
@@ -33,6 +34,7 @@ history.json         scores over iterations
 comparison.json      where the model fails, once {compare} was run
 diagnosis.json       which physical effect is missing, once {diagnose} was run
 events.out.*         TensorBoard: tensorboard --logdir {folder}
+model.mjb            the compiled model (mujoco.MjModel.from_binary_path)
 settings.json, checkpoint.npz   what `{fit} --resume {folder}` needs
 """
 
@@ -73,9 +75,27 @@ class RunFolder:
                 name = f"{stamp}_{attempt}"
         raise OSError(f"No free folder under {parent}.")
 
-    def write_start(self, settings: dict[str, Any], digests: dict[str, str], problem: Problem) -> None:
-        """Everything that is known before the first simulation."""
-        write_json(self.path / "settings.json", {"settings": settings, "digests": digests})
+    def write_start(
+        self,
+        settings: dict[str, Any],
+        digests: dict[str, str],
+        problem: Problem,
+        *,
+        inputs: dict[str, str | None],
+        environment: dict[str, Any],
+    ) -> None:
+        """Everything that is known before the first simulation.
+
+        Args:
+            settings: What the fit was told.
+            digests: SHA-256 of each recording.
+            problem: What is fitted.
+            inputs: SHA-256 of each other file that was read; ``None`` where there was none.
+            environment: Where the environment comes from.
+        """
+        content = {"settings": settings, "environment": environment, "digests": digests, "inputs": inputs}
+        write_json(self.path / "settings.json", {**content, "resolved": resolved(problem)})
+        write_model(problem, self.path / "model.mjb")
         write_tensors(
             self.path / "config.pt",
             {

@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import checked, read_json
+from pace_actuators.files import checked, read_json, refuse
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim.recording import without_fact_files
 
 OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
@@ -17,7 +18,8 @@ class FitSettings:
     """One fit, as on the command line of ``scripts/fit.py``."""
 
     task: str
-    """Registered name of the environment."""
+    """The environment: a registered name, ``module:Name``, ``/path/to/file.py:Name`` or a model file, which
+    :func:`pace_envs.task_source.use_task` has made known."""
 
     data: list[str] = field(default_factory=list)
     """Recordings to train on; none means the robot's own sample."""
@@ -91,8 +93,8 @@ class FitSettings:
         return asdict(self)
 
     @classmethod
-    def load(cls, path: Path) -> tuple[FitSettings, dict[str, str]]:
-        """Settings of a run and the digests of its recordings, from its ``settings.json``.
+    def load(cls, path: Path) -> tuple[FitSettings, SettingsFile]:
+        """Settings of a run and the whole content of its ``settings.json``; nothing that it names is imported.
 
         Raises:
             ValueError: If the file is missing or unreadable.
@@ -100,14 +102,30 @@ class FitSettings:
         if not path.exists():
             raise ValueError(f"{path.parent} is no run that can be resumed: it has no {path.name}.")
         cure = "Start a new fit."
-        content = checked(_File, read_json(path, cure), path, cure)
+        content = checked(SettingsFile, read_json(path, cure), path, cure)
         settings = checked(cls, content.settings, f"{path}: settings", cure, strict=True)
-        return settings, content.digests
+        try:
+            EnvironmentRecord.read(content.environment, settings.task)
+        except TypeError as error:
+            refuse(path, str(error), cure)
+        return settings, content
 
 
 @dataclass(kw_only=True)
-class _File:
+class SettingsFile:
     """What ``settings.json`` holds."""
 
     settings: dict[str, Any]
+    """What the fit was told."""
+
     digests: dict[str, str]
+    """SHA-256 of each recording, by its path, in the order of training and validation."""
+
+    environment: dict[str, Any] = field(default_factory=dict)
+    """Where the environment comes from; runs of earlier versions have none."""
+
+    inputs: dict[str, str | None] = field(default_factory=dict)
+    """SHA-256 of each other file that was read; ``None`` where there was none."""
+
+    resolved: dict[str, Any] = field(default_factory=dict)
+    """The whole configuration as data."""

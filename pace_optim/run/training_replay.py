@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from pace_actuators import IdentifiedDrives
-from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
@@ -19,8 +19,8 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Recording, conform_recording, load_recording
 from pace_optim.recording.dataset import make_dataset
+from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, rmse_by_joint
-from pace_optim.run.settings import FitSettings
 
 _HEIGHT = 2.0
 """How far the base is lifted, so that no leg reaches the ground [m]."""
@@ -69,7 +69,7 @@ class TrainingReplay:
         return "\n".join(lines)
 
 
-def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg) -> TrainingReplay:
+def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -> TrainingReplay:
     """Let the robot of a training environment follow the recordings of a fit, its base held in the air.
 
     The drives are those that :func:`pace_envs.identified.use_identified` makes of the result, with the gains that were
@@ -77,17 +77,18 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg) -> TrainingRepl
 
     Args:
         run: The fit's folder, or its ``result.json``.
-        cfg: The training environment; it is not changed.
+        cfg: The training environment; it is not changed. ``None`` means that of the identification, with the drives
+            as a training would have them.
 
     Raises:
         ValueError: If a recording has gone, or the environment's robot is another.
     """
-    folder = Path(run) if Path(run).is_dir() else Path(run).parent
+    opened = Run.open(run)
+    folder, settings, fitted_cfg = opened.folder, opened.settings, opened.load_cfg()
     result = FitResult.load(folder)
-    settings, _ = FitSettings.load(folder / "settings.json")
-    fitted_cfg = load_env_cfg(settings.task)
     if not isinstance(fitted_cfg, PaceSim2realEnvCfg):
         raise ValueError(f"{settings.task} is no identification task: {folder} cannot be replayed.")
+    cfg = cfg or fitted_cfg
     env_cfg = _held_robot(fitted_cfg, cfg, folder)
     control_dt = _control_dt(env_cfg)
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))

@@ -16,7 +16,6 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from typing import NoReturn
 
 USER_ERROR = 2
@@ -30,10 +29,7 @@ def run_cli(main: Callable[[], int | None]) -> int:
 
     What a user can mend (ValueError, KeyError, OSError) is printed to stderr as one line, ``error: ...``, and exits
     with 2; an interruption exits with 130. With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
-    Modules named on the command line, or in a run's settings, may lie in the present folder.
     """
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # as `python -m` would find them
     try:
         return main() or 0
     except KeyboardInterrupt:
@@ -61,27 +57,6 @@ def as_called(text: str) -> str:
     return re.sub(r"scripts/(\w+)\.py", lambda found: _CONSOLE + found[1].replace("_", "-"), text)
 
 
-def import_task(task: str) -> str:
-    """Import the module of ``module:Task``, which registers the task, and return the task's name.
-
-    The module may lie in the present folder.
-
-    Raises:
-        ValueError: If there is no such module.
-    """
-    module, colon, name = task.rpartition(":")
-    if colon:
-        sys.path.append(os.getcwd())  # as `python -m` would find it
-        try:
-            import_module(module)
-        except ImportError as error:
-            raise ValueError(
-                f"--task {task}: the module {module!r} cannot be imported ({_one_line(error)}). Correct its name, or "
-                "put its folder on PYTHONPATH."
-            ) from None
-    return name
-
-
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line and say what was probably meant."""
 
@@ -98,6 +73,13 @@ class Parser(argparse.ArgumentParser):
                     message += f"; did you mean {match} instead of {option}?"
         print(f"error: {message.rstrip('.')}. See {self.prog} --help.", file=sys.stderr)
         raise SystemExit(USER_ERROR)
+
+
+def given_options(parser: argparse.ArgumentParser) -> list[str]:
+    """The options that stand on the command line, by their names."""
+    words = [word.partition("=")[0] for word in sys.argv[1:]]
+    known = [option for action in parser._actions for option in action.option_strings]
+    return [word for word in dict.fromkeys(words) if word in known]
 
 
 def make_parser(description: str, *, example: str) -> Parser:

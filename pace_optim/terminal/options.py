@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
-_TASK = "registered environment, module:Name, or FILE.py:Name"
+_TASK = "registered environment, module:Name, FILE.py:Name, or a model file"
 
 
 def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, required: bool = False) -> None:
@@ -17,3 +18,36 @@ def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, re
     """
     default = "default: the run's own" if run else "pace list-envs lists them"
     parser.add_argument("--task", required=required, help=f"{_TASK} ({default})")
+    parser.add_argument(
+        "--import",
+        dest="imports",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="import these modules or files of yours first: code that a run names and has no record of",
+    )
+
+
+def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Import what the user named by these options; returns them without those that have had their effect.
+
+    ``effects``, if the command has it, may name code of the user's own too.
+
+    Raises:
+        ValueError: If something that was named cannot be imported.
+    """
+    from pace_actuators.effects import import_effect
+    from pace_actuators.own_code import import_named
+    from pace_envs.task_source import use_task
+
+    options = dict(options)
+    for module in options.pop("imports"):
+        try:
+            import_named(module)
+        except ValueError as error:
+            raise ValueError(f"--import {module}: {error}") from None
+    if options.get("task") is not None:
+        options["task"] = use_task(options["task"])
+    if options.get("effects"):
+        options["effects"] = [import_effect(text) for text in options["effects"]]
+    return options

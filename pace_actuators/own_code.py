@@ -1,0 +1,303 @@
+"""Code of a user's own, found by name: a module is imported because the user names it, or because a record fits it.
+
+What a file names is never imported by itself. A record, as it stands in a run's ``settings.json`` and ``result.json``,
+holds where each file of the code lies and its SHA-256; the code is run from the very bytes that were compared, so that
+neither another file of that name in the present folder nor a stale byte code can take its place.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any
+
+CodeRecord = Mapping[str, Mapping[str, str]]
+"""``{module: {"file": path, "sha256": digest}}``, each file of a user's code."""
+
+_OURS = ("pace_actuators", "pace_envs", "pace_optim", "pace_assets")
+_INSTALLED = ("site-packages", "dist-packages")
+
+
+def split_reference(text: str) -> tuple[str, str]:
+    """``module:Name`` or ``path/to/file.py:Name`` in its two parts; the first is empty where there is only a name."""
+    module, _, name = text.rpartition(":")
+    return module, name
+
+
+def absolute_reference(text: str) -> str:
+    """The same reference, which means the same from any folder: a path is made absolute."""
+    module, name = split_reference(text)
+    return f"{Path(module).resolve()}:{name}" if is_path(module) else text
+
+
+def is_path(module: str) -> bool:
+    """Whether a module is named by its file."""
+    return module.endswith(".py")
+
+
+def loaded_module(module: str) -> ModuleType | None:
+    """A module that has been imported before, by its name or its file."""
+    if not is_path(module):
+        return sys.modules.get(module)
+    file = Path(module).resolve()
+    return next((m for m in list(sys.modules.values()) if m.__name__ != "__main__" and source_file(m) == file), None)
+
+
+def import_named(module: str) -> ModuleType:
+    """Import a module that the user names, as ``package.module`` or as a file; it may lie in the present folder.
+
+    Raises:
+        ValueError: If it cannot be imported.
+    """
+    try:
+        return _import_file(Path(module).resolve()) if is_path(module) else _import_name(module)
+    except (ImportError, SyntaxError, OSError) as error:
+        raise ValueError(
+            f"the module {module!r} cannot be imported ({_one_line(error)}). Correct its name, put its folder on "
+            "PYTHONPATH, or name its file."
+        ) from None
+
+
+def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> ModuleType:
+    """Import a module that a file names, if its code is what the file's record says.
+
+    Args:
+        module: Its name or its file.
+        code: The record.
+        where: The file that names it, for messages.
+        hint: What the user types to name it himself.
+
+    Raises:
+        ValueError: If the record does not hold it, or the code has changed or gone.
+    """
+    name = next((n for n, entry in code.items() if entry["file"] == module), module)
+    known = loaded_module(module)
+    if known is not None and (name not in code or source_file(known) == Path(code[name]["file"])):
+        return known
+    if name not in code:
+        raise ValueError(
+            f"{where} names code, {module}, and has no record of it: it is not imported by itself. If you trust it, "
+            f"name it: {hint}."
+        )
+    sources = {each: (Path(entry["file"]), _verified(entry, where, hint)) for each, entry in code.items()}
+    for each, (file, _) in sources.items():
+        if (other := sys.modules.get(each)) is not None and source_file(other) != file:
+            _forget(each)
+    sys.meta_path.insert(0, _RecordedCode(sources))
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ValueError(
+            f"{where}: the code {module} cannot be imported again ({_one_line(error)}). Name it: {hint}."
+        ) from None
+
+
+def code_of(modules: Sequence[str]) -> dict[str, dict[str, str]]:
+    """The record of modules and of all that they import from beside them; packages that were installed are left out."""
+    record: dict[str, dict[str, str]] = {}
+    waiting = [name for module in modules for name in _with_parents(module)]
+    roots = {root for module in modules if (root := _root(module)) is not None}
+    while waiting:
+        name = waiting.pop()
+        file = _file_of(name, roots)
+        if name in record or file is None or name.partition(".")[0] in _OURS or not _is_own(file, name, modules, roots):
+            continue
+        source = file.read_bytes()
+        record[name] = {"file": str(file), "sha256": digest_of(source)}
+        waiting += [each for found in _imports(source, name, file) for each in _with_parents(found)]
+    return dict(sorted(record.items()))
+
+
+def checked_record(content: Mapping[str, Any]) -> CodeRecord:
+    """The record of the code in a file's ``environment``.
+
+    Raises:
+        TypeError: If it is none.
+    """
+    code = content.get("code", {})
+    if not isinstance(code, Mapping) or not all(
+        isinstance(entry, Mapping) and all(isinstance(entry.get(key), str) for key in ("file", "sha256"))
+        for entry in code.values()
+    ):
+        raise TypeError("environment.code is no record of files and digests")
+    return code
+
+
+def source_file(module: ModuleType) -> Path | None:
+    """Where a module's source lies; ``None`` if it has none."""
+    file = getattr(module, "__file__", None)
+    return Path(file).resolve() if isinstance(file, str) and file.endswith(".py") else None
+
+
+def digest_of(content: bytes) -> str:
+    """SHA-256."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def _import_file(file: Path) -> ModuleType:
+    if not file.is_file():
+        raise ImportError(f"there is no file {file}")
+    if (known := loaded_module(str(file))) is not None:
+        return known
+    name = file.stem
+    if (other := sys.modules.get(name)) is not None:
+        if _is_installed(name, other):
+            name = f"{name}_{digest_of(str(file).encode())[:8]}"
+        else:
+            _forget(name)
+    spec = spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{file} is no Python file")
+    module = module_from_spec(spec)
+    sys.modules[name] = module
+    sys.path.insert(0, str(file.parent))  # as `python file.py` does
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    finally:
+        sys.path.remove(str(file.parent))
+        _search(file.parent)
+    return module
+
+
+def _import_name(name: str) -> ModuleType:
+    top = name.partition(".")[0]
+    spec, here = PathFinder.find_spec(top), str(Path.cwd())
+    if spec is None and (spec := PathFinder.find_spec(top, [here])) is not None:
+        _search(Path(here))
+    known = sys.modules.get(top)
+    if (
+        known is not None
+        and spec is not None
+        and spec.origin is not None
+        and source_file(known)
+        not in (
+            None,
+            Path(spec.origin).resolve(),
+        )
+    ):
+        _forget(top)
+    return import_module(name)
+
+
+def _search(folder: Path) -> None:
+    """Let modules be found in a folder, after all others."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+def _is_installed(name: str, module: ModuleType) -> bool:
+    file = source_file(module)
+    return file is None or name in (*sys.stdlib_module_names, *_OURS) or any(part in _INSTALLED for part in file.parts)
+
+
+def _forget(name: str) -> None:
+    """Let a name stand for another module of that name, in another folder."""
+    for each in [each for each in sys.modules if each == name or each.startswith(f"{name}.")]:
+        del sys.modules[each]
+
+
+def _verified(entry: Mapping[str, str], where: str, hint: str) -> bytes:
+    file = Path(entry["file"])
+    try:
+        content = file.read_bytes()
+    except OSError:
+        raise ValueError(f"{where} was made with {file}, which has gone. Put it back, or name it: {hint}.") from None
+    if digest_of(content) != entry["sha256"]:
+        raise ValueError(
+            f"{file} has changed since {where} was made with it, so it is not imported by itself. Put it back, or name "
+            f"it: {hint}."
+        )
+    return content
+
+
+class _RecordedCode(MetaPathFinder):
+    """Finds the modules of a record, and no other."""
+
+    def __init__(self, sources: Mapping[str, tuple[Path, bytes]]):
+        self._sources = sources
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name in self._sources:
+            file, source = self._sources[name]
+            package = file.name == "__init__.py"
+            code = compile(source, str(file), "exec", dont_inherit=True)
+            spec = ModuleSpec(name, _Compiled(code), origin=str(file), is_package=package)
+            spec.has_location = True
+            return spec
+        if any(each.startswith(f"{name}.") for each in self._sources):  # a package without a file of its own
+            return ModuleSpec(name, None, is_package=True)
+        return None
+
+
+class _Compiled(Loader):
+    def __init__(self, code: CodeType):
+        self._code = code
+
+    def exec_module(self, module: ModuleType) -> None:
+        exec(self._code, module.__dict__)
+
+
+def _root(module: str) -> Path | None:
+    """The folder from which a module is named."""
+    known = loaded_module(module)
+    file = None if known is None else source_file(known)
+    if known is None or file is None:
+        return None
+    depth = known.__name__.count(".") + (file.name == "__init__.py")
+    return file.parents[depth]
+
+
+def _with_parents(module: str) -> list[str]:
+    known = loaded_module(module) if is_path(module) else None
+    words = (known.__name__ if known is not None else module).split(".")
+    return [".".join(words[: i + 1]) for i in range(len(words))]
+
+
+def _file_of(name: str, roots: set[Path]) -> Path | None:
+    known = sys.modules.get(name)
+    if known is not None:
+        return source_file(known)
+    for root in roots:  # imported only when it is needed
+        for file in (
+            root.joinpath(*name.split(".")).with_suffix(".py"),
+            root.joinpath(*name.split("."), "__init__.py"),
+        ):
+            if file.is_file():
+                return file.resolve()
+    return None
+
+
+def _is_own(file: Path, name: str, modules: Sequence[str], roots: set[Path]) -> bool:
+    if any(part in _INSTALLED for part in file.parts):
+        return name.partition(".")[0] in {module.partition(".")[0] for module in modules}
+    return any(file.is_relative_to(root) for root in roots)
+
+
+def _imports(source: bytes, name: str, file: Path) -> Iterator[str]:
+    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            words = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*(word for word in words if word), *([node.module] if node.module else [])])
+            if base:
+                yield base
+            yield from (f"{base}.{alias.name}" if base else alias.name for alias in node.names if alias.name != "*")
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,171 @@
+"""Where a task comes from: a name, a module of one's own, a model file; and how it is found again in a run's record."""
+
+from __future__ import annotations
+
+import hashlib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from pace_actuators.own_code import (
+    absolute_reference,
+    checked_record,
+    code_of,
+    import_named,
+    import_recorded,
+    loaded_module,
+    split_reference,
+)
+from pace_envs.registration import is_model_file, load_env_cfg, registered_by
+
+_ENVIRONMENT = ("task", "module", "folder", "code", "files")
+
+
+def use_task(text: str) -> str:
+    """Make a task known that the user names, and return its text, good from any folder.
+
+    Args:
+        text: A registered name, ``module:Name``, ``path/to/file.py:Name`` (either registers the name when it is
+            imported), or a model file (``.xml``, ``.mjcf``, ``.urdf``).
+
+    Raises:
+        ValueError: If there is no such module or file.
+    """
+    if is_model_file(text):
+        if not Path(text).is_file():
+            raise ValueError(f"--task {text}: there is no such model file. Correct its path.")
+        return str(Path(text).resolve())
+    module, _ = split_reference(text)
+    if not module:
+        return text
+    try:
+        import_named(module)
+    except ValueError as error:
+        raise ValueError(f"--task {text}: {error}") from None
+    return absolute_reference(text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentRecord:
+    """What a run keeps to find its environment again."""
+
+    task: str
+    """As :func:`use_task` returns it."""
+
+    module: str | None = None
+    """What is imported so that the task is known, a module or a file; ``None``: this package knows it."""
+
+    folder: str = ""
+    """Where relative paths of the configuration begin."""
+
+    code: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """File and SHA-256 of each module of the user's own."""
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of each file that the model consists of."""
+
+    @classmethod
+    def of(cls, task: str, cfg: Any, effects: Iterable[str] = (), folder: str | None = None) -> EnvironmentRecord:
+        """The record of a task that is known.
+
+        Args:
+            task: As :func:`use_task` returns it.
+            cfg: Its configuration.
+            effects: Modules of effects of the user's own.
+            folder: Where relative paths begin; ``None`` means the present folder.
+        """
+        module = None if is_model_file(task) else split_reference(task)[0] or registered_by(task)
+        files = model_files(Path(cfg.scene.robot.mjcf_path).resolve())
+        return cls(
+            task=task,
+            module=module,
+            folder=folder or str(Path.cwd()),
+            code=code_of([*([module] if module else []), *effects]),
+            files={str(file): file_digest(file) for file in files},
+        )
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any] | None, task: str) -> EnvironmentRecord:
+        """The ``environment`` of a file; that of a registered task where there is none.
+
+        Raises:
+            TypeError: If it is damaged.
+        """
+        if not content:
+            return cls(task=task)
+        values = {key: content[key] for key in _ENVIRONMENT if key in content}
+        for key, kind in (("task", str), ("module", str | None), ("folder", str), ("files", Mapping)):
+            if key in values and not isinstance(values[key], kind):
+                raise TypeError(f"environment.{key} is {values[key]!r}")
+        checked_record(content)
+        return cls(**{"task": task} | values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return asdict(self)
+
+    def use(self, where: str, task: str | None = None) -> str:
+        """Make the task known again and return its text, or another that the user names instead.
+
+        Args:
+            where: The file of this record, for messages.
+            task: Another one, as :func:`use_task` returns it.
+
+        Raises:
+            ValueError: If its code has changed or gone.
+        """
+        if task is not None:
+            return task
+        name = split_reference(self.task)[1]
+        if self.module == "__main__":
+            if loaded_module("__main__") is not None and registered_by(name) == "__main__":
+                return self.task
+            raise ValueError(f"{where} was made by a script that registers {name}. Name it: --task FILE.py:{name}.")
+        if is_model_file(self.task) or self.module is None:
+            return self.task
+        import_recorded(self.module, self.code, where, f"--task {self.module}:{name}")
+        return self.task
+
+    def load_cfg(self, where: str, task: str | None = None) -> Any:
+        """A fresh configuration of the environment; relative paths begin where the run was started."""
+        cfg = load_env_cfg(self.use(where, task))
+        path = Path(cfg.scene.robot.mjcf_path)
+        if self.folder and not path.is_absolute() and not path.is_file():
+            cfg.scene.robot.mjcf_path = Path(self.folder) / path
+        return cfg
+
+
+def model_files(path: Path) -> list[Path]:
+    """A model file and what it includes and needs, as far as it is there."""
+    found = [path]
+    for file in found:
+        for name in _included(file):
+            if (each := (path.parent / name).resolve()).is_file() and each not in found:
+                found.append(each)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except (ValueError, OSError):
+        return found
+    meshes = [path.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file]
+    return found + sorted({mesh.resolve() for mesh in meshes if mesh.is_file()})
+
+
+def file_digest(path: str | Path) -> str:
+    """SHA-256 of a file, or of all files of a folder, to tell whether they have changed."""
+    path, digest = Path(path), hashlib.sha256()
+    if not path.is_dir():
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    for file in sorted(each for each in path.rglob("*") if each.is_file()):
+        digest.update(f"{file.relative_to(path)}\0{file_digest(file)}\0".encode())
+    return digest.hexdigest()
+
+
+def _included(file: Path) -> list[str]:
+    try:
+        return [name for element in ET.parse(file).iter("include") if (name := element.get("file"))]
+    except (ET.ParseError, OSError):
+        return []

@@ -1,0 +1,141 @@
+"""Opening a run: its settings, its environment, and the problem that it solves, in one line.
+
+problem = open_problem("logs/pace/my_arm/26_01_01_12-00-00")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pace_actuators.effects import use_recorded_effects
+from pace_envs.task_source import EnvironmentRecord
+from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.run.settings import FitSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run's folder with what it was told, its environment made known again."""
+
+    folder: Path
+    """Where it lies."""
+
+    settings: FitSettings
+    """What the fit was told, paths absolute; the task is one that is known."""
+
+    record: EnvironmentRecord
+    """Where its environment comes from."""
+
+    recordings: dict[str, str]
+    """SHA-256 of each recording, by its path, in the order of training and validation."""
+
+    inputs: dict[str, str | None]
+    """SHA-256 of each other file that the fit read; ``None`` where there was none."""
+
+    resolved: dict[str, Any]
+    """The whole configuration as it was resolved then."""
+
+    overridden: bool = False
+    """Whether the task is not the run's own."""
+
+    @classmethod
+    def open(cls, run: str | Path, task: str | None = None) -> Run:
+        """Read a run's ``settings.json`` and make its environment and effects known.
+
+        Args:
+            run: The run's folder, or its ``result.json``.
+            task: Another environment instead of its own, as :func:`pace_envs.task_source.use_task` returns it.
+
+        Raises:
+            ValueError: If it is no run, or the code of its environment has changed or gone.
+        """
+        folder = run_folder(run)
+        path = folder / "settings.json"
+        settings, content = FitSettings.load(path)
+        record = EnvironmentRecord.read(content.environment, settings.task)
+        known = record.use(str(path), task)
+        use_recorded_effects(settings.effects, record.code, str(path))
+        return cls(
+            folder=folder,
+            settings=replace(settings, task=known),
+            record=record,
+            recordings=content.digests,
+            inputs=content.inputs,
+            resolved=content.resolved,
+            overridden=task is not None,
+        )
+
+    def problem(
+        self,
+        *,
+        data: Sequence[str | Path] = (),
+        physics_dt: float | None = None,
+        effects: Sequence[Any] | None = None,
+    ) -> Problem:
+        """The problem that the run solves, on its own recordings or on others.
+
+        Args:
+            data: Recordings in place of its own.
+            physics_dt: Another physics step [s].
+            effects: Other effects; ``None`` keeps its own.
+
+        Raises:
+            ValueError: If a recording has gone, or anything does not fit.
+        """
+        settings = self.settings
+        if data:
+            settings = replace(settings, data=[str(path) for path in data], validation=[])
+        problem = problem_of(replace(settings, physics_dt=physics_dt or settings.physics_dt), self.load_cfg())
+        return problem if effects is None else problem.with_effects(effects)
+
+    def load_cfg(self) -> Any:
+        """A fresh configuration of its environment."""
+        task = self.settings.task if self.overridden else None
+        return self.record.load_cfg(str(self.folder / "settings.json"), task)
+
+
+def open_problem(
+    run: str | Path,
+    *,
+    task: str | None = None,
+    data: Sequence[str | Path] = (),
+    physics_dt: float | None = None,
+    effects: Sequence[Any] | None = None,
+) -> Problem:
+    """The problem of a run of any robot; :meth:`Run.open` and :meth:`Run.problem` tell the arguments."""
+    return Run.open(run, task).problem(data=data, physics_dt=physics_dt, effects=effects)
+
+
+def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
+    """The problem that settings pose: the one place where they become one.
+
+    Args:
+        settings: Of a fit; its task and effects are known.
+        env_cfg: The task's configuration, if it has been loaded.
+    """
+    return load_problem(
+        settings.task,
+        data=settings.data,
+        validation=settings.validation,
+        delay_mode=settings.delay_mode,
+        physics_dt=settings.physics_dt,
+        effects=settings.effects,
+        env_cfg=env_cfg,
+    )
+
+
+def run_folder(run: str | Path) -> Path:
+    """The folder of a run, named by itself or by its ``result.json``.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    path = Path(run)
+    if path.name == "result.json" and path.is_file():
+        path = path.parent
+    if not path.is_dir():
+        raise ValueError(f"There is no run {run}. Name the folder that scripts/fit.py printed as its last line.")
+    return path
