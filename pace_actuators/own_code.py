@@ -87,11 +87,10 @@ def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> Mod
             f"{where} names code, {module}, and has no record of it: it is not imported by itself. If you trust it, "
             f"name it: {hint}."
         )
-    sources = {each: (Path(entry["file"]), _verified(entry, where, hint)) for each, entry in code.items()}
-    for each, (file, _) in sources.items():
-        if (other := sys.modules.get(each)) is not None and source_file(other) != file:
+    for each, entry in code.items():
+        if (other := sys.modules.get(each)) is not None and source_file(other) != Path(entry["file"]):
             _forget(each)
-    sys.meta_path.insert(0, _RecordedCode(sources))
+    sys.meta_path.insert(0, _RecordedCode(code, where, hint))
     try:
         return import_module(name)
     except ImportError as error:
@@ -222,22 +221,23 @@ def _verified(entry: Mapping[str, str], where: str, hint: str) -> bytes:
 
 
 class _RecordedCode(MetaPathFinder):
-    """Finds the modules of a record, and no other."""
+    """Finds the modules of a record, each compared when it is imported, and no other."""
 
-    def __init__(self, sources: Mapping[str, tuple[Path, bytes]]):
-        self._sources = sources
+    def __init__(self, code: CodeRecord, where: str, hint: str):
+        self._code, self._where, self._hint = code, where, hint
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if name in self._sources:
-            file, source = self._sources[name]
+        if name in self._code:
+            file = Path(self._code[name]["file"])
             package = file.name == "__init__.py"
+            source = _verified(self._code[name], self._where, self._hint)
             code = compile(source, str(file), "exec", dont_inherit=True)
             spec = ModuleSpec(name, _Compiled(code), origin=str(file), is_package=package)
             spec.has_location = True
             return spec
-        if any(each.startswith(f"{name}.") for each in self._sources):  # a package without a file of its own
+        if any(each.startswith(f"{name}.") for each in self._code):  # a package without a file of its own
             return ModuleSpec(name, None, is_package=True)
         return None
 

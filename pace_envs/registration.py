@@ -14,6 +14,7 @@ import gymnasium as gym
 from pace_envs.gym_vector import PaceVectorEnv
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
+from pace_envs.model_file import is_model_file
 
 _TASKS = {
     "Pace-AnymalD-v0": "pace_envs.tasks.pace.anymal_d:anymal_d_pace_env_cfg",
@@ -23,9 +24,6 @@ _TASKS = {
     "Pace-AnymalD-Velocity-v0": "pace_envs.tasks.velocity.anymal_d:anymal_d_velocity_env_cfg",
     "Pace-Go2-Velocity-v0": "pace_envs.tasks.velocity.go2:go2_velocity_env_cfg",
 }
-
-MODEL_FILES = (".xml", ".mjcf", ".urdf")
-"""What a model file's name ends with."""
 
 _REGISTERED_BY: dict[str, dict[str, Any]] = {}
 """Globals of the module that registered a task, by the task's name."""
@@ -75,11 +73,6 @@ def registered_by(task: str) -> str | None:
     return None if module.partition(".")[0] == "pace_envs" else module
 
 
-def is_model_file(task: str) -> bool:
-    """Whether a task is named by a robot's model file."""
-    return task.lower().endswith(MODEL_FILES)
-
-
 def load_env_cfg(task: str) -> Any:
     """A fresh configuration of an environment; nothing is imported to find it.
 
@@ -90,7 +83,9 @@ def load_env_cfg(task: str) -> Any:
         ValueError: If there is no such environment.
     """
     if is_model_file(task):
-        return _of_model_file(task)
+        from pace_envs.from_model import cfg_from_model  # its configuration is one of this package
+
+        return cfg_from_model(task)
     module, _, task = task.rpartition(":")
     if task not in registered_tasks():
         if module:
@@ -171,16 +166,6 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     cfg.sim.integrator = "rk4"
     for drive in cfg.scene.robot.actuators.values():
         drive.control_decimation *= ratio
-
-
-def _of_model_file(path: str) -> Any:
-    try:
-        from pace_envs.from_model import cfg_from_model  # type: ignore[import-not-found]  # as other tasks need none
-    except ModuleNotFoundError:
-        raise ValueError(
-            f"--task {path}: this version reads no model files. Write a configuration and name it as module:Name."
-        ) from None
-    return cfg_from_model(path)
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:

@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
-
 from pace_actuators.own_code import (
     absolute_reference,
     checked_record,
@@ -20,7 +18,8 @@ from pace_actuators.own_code import (
     loaded_module,
     split_reference,
 )
-from pace_envs.registration import is_model_file, load_env_cfg, registered_by
+from pace_envs.model_file import is_model_file, read_model_file
+from pace_envs.registration import load_env_cfg, registered_by
 
 _ENVIRONMENT = ("task", "module", "folder", "code", "files")
 
@@ -147,7 +146,7 @@ def model_files(path: Path) -> list[Path]:
             if (each := (path.parent / name).resolve()).is_file() and each not in found:
                 found.append(each)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = read_model_file(path).spec  # less the meshes that the dynamics do not need
     except (ValueError, OSError):
         return found
     meshes = [path.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file]

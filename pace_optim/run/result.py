@@ -161,7 +161,8 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
-        notes=[f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
+        notes=list(problem.env_cfg.sim2real.notes)
+        + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
         drive=drive_in_force(problem),
         **facts,
     )
