@@ -57,6 +57,9 @@ def import_named(module: str) -> ModuleType:
     Raises:
         ValueError: If it cannot be imported.
     """
+    recorded = [finder for finder in sys.meta_path if isinstance(finder, _RecordedCode)]
+    for finder in recorded:  # what the user names comes before what records name
+        sys.meta_path.remove(finder)
     try:
         return _import_file(Path(module).resolve()) if is_path(module) else _import_name(module)
     except (ImportError, SyntaxError, OSError) as error:
@@ -64,6 +67,8 @@ def import_named(module: str) -> ModuleType:
             f"the module {module!r} cannot be imported ({_one_line(error)}). Correct its name, put its folder on "
             "PYTHONPATH, or name its file."
         ) from None
+    finally:
+        sys.meta_path[:0] = recorded
 
 
 def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> ModuleType:
@@ -90,10 +95,14 @@ def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> Mod
     for each, entry in code.items():
         if (other := sys.modules.get(each)) is not None and source_file(other) != Path(entry["file"]):
             _forget(each)
-    sys.meta_path.insert(0, _RecordedCode(code, where, hint))
+    finder = _RecordedCode(code, where, hint)
+    sys.meta_path.insert(0, finder)
     try:
         return import_module(name)
-    except ImportError as error:
+    except BaseException as error:
+        sys.meta_path.remove(finder)
+        if not isinstance(error, ImportError):
+            raise
         raise ValueError(
             f"{where}: the code {module} cannot be imported again ({_one_line(error)}). Name it: {hint}."
         ) from None

@@ -55,8 +55,8 @@ def write_robot(folder: Path, joint: str = "hinge") -> Path:
     (folder / "swing_limits.py").write_text(LIMITS)
     (folder / "swing.py").write_text(TASK.format(joint=joint))
     (folder / "sticky_effect.py").write_text(EFFECT)
-    time = np.arange(0, 2.0, 0.0025)
-    target = 0.8 * np.sin(2 * np.pi * (0.4 * time + 0.5 * time**2))
+    time = np.arange(0, 4.0, 0.0025)
+    target = 0.8 * np.sin(2 * np.pi * (0.4 * time + 0.25 * time**2))
     rows = np.column_stack([time, simulated(target), target])
     header = f"time,dof_pos/{joint},des_dof_pos/{joint}"
     np.savetxt(folder / "data" / "swing.csv", rows, delimiter=",", header=header, comments="", fmt="%.9f")
