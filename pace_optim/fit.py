@@ -80,8 +80,8 @@ def fit(
         env_cfg, place = load_env_cfg(settings.task), None
     else:
         env_cfg, place = before.load_cfg(), before.record.folder
-    settings = with_absolute_paths(settings, env_cfg)
     problem = _load(settings, env_cfg)
+    settings = with_absolute_paths(settings, env_cfg)
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
     folder.write_start(
