@@ -1,5 +1,6 @@
 """The identified drive gives the same torque wherever it runs: identification, training, mjlab, Isaac Lab."""
 
+import json
 import sys
 import warnings
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from other_simulators import ROOT, isaaclab_wheel, others_python, run
-from torque_sequence import DT, ENVS, JOINTS, STEPS, sequence, write_result
+from torque_sequence import DT, ENVS, GAINS, JOINTS, STEPS, sequence, write_result
 
 from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv, load_env_cfg
@@ -161,3 +162,29 @@ def test_mjlab_gives_the_torque_of_the_identification(reference, tmp_path):
     assert np.allclose(found["solref"], [2 * DT, 1.0])
     assert np.allclose(found["applied"], found["torque"][-1], rtol=1e-5, atol=1e-4)  # what the joints get, unclipped
     assert "drive_friction_event" in str(found["unexpanded"]) and "motor" in str(found["refused"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_newtons_actuators_give_the_drives_torque(tmp_path):
+    """Of the exported page, built in Python and authored in USD: delay in whole steps, bias and clamps included."""
+    result = write_result(tmp_path / "result.json", delay=3.0)
+    content = json.loads(result.read_text())
+    content["effects"] = ["torque_gain"]  # Newton has no others: the export says so
+    result.write_text(json.dumps(content))
+    exported = export(result, "newton")
+    exported.write(tmp_path / "drives.py")
+    run(others_python(), "newton_torques.py", tmp_path / "drives.py", tmp_path / "out.npz")
+    found, drives = np.load(tmp_path / "out.npz"), IdentifiedDrives.load(result)
+    expected = alone(PaceDCMotorCfg.from_result(result, physics_dt=DT), sequence())
+    scale = np.sqrt(np.square(expected).mean(axis=(0, 1)))
+    # driven faster than its line reaches, a motor with a torque gain brakes with another limit there
+    within = np.abs(sequence()["velocity"]) < GAINS["velocity_limit"] * (
+        1 + GAINS["effort_limit"] / GAINS["saturation_effort"]
+    )
+    assert within.mean() > 0.99
+    for name in ("torque", "usd_torque"):
+        assert (np.abs(found[name] - expected) * within < 1e-5 * scale).all(), name
+    for name, parameter in (("armature", "armature"), ("friction", "friction"), ("damping", "viscous_friction")):
+        value = list(drives.values(parameter, JOINTS).values())
+        assert np.allclose(found[name], value) and np.allclose(found[f"usd_{name}"], value), name

@@ -1,0 +1,92 @@
+"""Identified drives as Newton's actuators: delay of the command, PD control, clamping."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+
+from pace_actuators import IdentifiedDrives
+from pace_optim.export import newton_template
+from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
+
+_START = "# --- the page starts here\n"
+
+
+def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
+    """A page that needs Newton alone: drives for a ``newton.ModelBuilder``, or for a USD stage.
+
+    The encoder's bias is a constant torque before the clamps, kp · bias: exact, as targets are the encoder's.
+
+    Raises:
+        ValueError: If the environment of the identification is not available.
+    """
+    plain, notes = plain_drives(drives)
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
+    names = {"armature": "armature", "friction": "friction", "viscous_friction": "damping"}
+    joints = {
+        joint: {
+            name: drives.values(parameter, [joint])[joint]
+            for parameter, name in names.items()
+            if not is_undetermined(drives, parameter, joint)
+        }
+        for joint in plain
+    }
+    body = [
+        f'"""Drives identified with {drives.task}, for Newton 1.8: {drives.path.parent.name}.',
+        "",
+        *notes,
+        '"""',
+        "",
+        f"PHYSICS_DT = {drives.at.physics_dt!r}",
+        '"""Step of the identification [s]."""',
+        "",
+        f"JOINTS = {_table(joints)}",
+        '"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]."""',
+        "",
+        f"DRIVES = {_table({joint: _parts(drive) for joint, drive in plain.items()})}",
+        '"""Delay [s], control law and clamp, in SI units."""',
+    ]
+    functions = inspect.getsource(newton_template).split(_START)[1]
+    return "\n".join(body) + "\n" + functions, notes
+
+
+def _parts(drive: PlainDrive) -> dict[str, float]:
+    parts = {"delay_s": drive.delay_s, "kp": drive.stiffness, "kd": drive.damping}
+    parts["const_effort"] = drive.stiffness * drive.encoder_bias
+    limit = drive.effort_limit
+    if drive.has_line:
+        parts |= {"saturation_effort": drive.saturation_effort, "velocity_limit": drive.velocity_limit}
+        parts |= {"max_motor_effort": limit} if math.isfinite(limit) else {}
+    elif math.isfinite(limit):
+        parts["max_effort"] = limit
+    return parts
+
+
+def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
+    dt, delay = drives.at.physics_dt, max((drive.delay_s for drive in plain.values()), default=0.0)
+    notes = []
+    if delay:
+        steps = delay / dt
+        lost = "" if abs(steps - round(steps)) < 1e-6 else f", {1e3 * round(steps) * dt:.3g} ms"
+        notes.append(f"delay of {1e3 * delay:.3g} ms: {round(steps)} whole steps of {1e3 * dt:g} ms{lost}.")
+    most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
+    notes.append(
+        f"encoder bias (up to {most:.3g} rad): in const_effort. Targets are the encoder's, joint positions are true: "
+        "observe q - bias."
+    )
+    rates = {drive.run_dt for drive in plain.values()}
+    if 0.0 in rates:
+        notes.append("the drive ran continuously (implicit): use Newton's implicit effort mode.")
+    if max(rates, default=0.0) > dt * (1 + 1e-9):
+        notes.append(f"the controller ran every {1e3 * max(rates):.3g} ms: step the actuators at that rate.")
+    notes.append("joint friction: its solver's time constant is the simulation's (MuJoCo's: solreffriction).")
+    return notes
+
+
+def _table(values: Mapping[str, Mapping[str, float]]) -> str:
+    rows = []
+    for joint, row in values.items():
+        entries = ", ".join(f"{name!r}: {value:.10g}" for name, value in row.items())
+        rows.append(f"    {joint!r}: {{{entries}}},")
+    return "\n".join(["{", *rows, "}"])
