@@ -41,7 +41,7 @@ from pace_optim.run.settings import FitSettings
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 ROBOT, TASK = "Pace-AnymalD-v0", "Pace-AnymalD-Velocity-v0"
-HIDDEN = {"torque_gain": {"gain": -0.25}}
+HIDDEN = {"torque_gain": {"gain": 0.75}}
 """All drives give a quarter less torque than they say."""
 TRAINED_ON = ("chirp_medium", "triangle", "steps", "chirp_mass")
 """Recordings of the battery that are fitted; its multisine and other steps validate."""

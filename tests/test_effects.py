@@ -285,9 +285,9 @@ def test_limits_of_the_drive():
 def test_what_is_asked_is_limited_before_the_current_loop_and_the_torque_constant_and_the_line_comes_last():
     limited = {"stiffness": 100.0, "damping": 0.0, "effort_limit": 8.0, "saturation_effort": 20.0}
     limited["velocity_limit"] = 10.0
-    weak = Drive(["torque_gain"], {"torque_gain.gain": -0.5}, **limited)
+    weak = Drive(["torque_gain"], {"torque_gain.gain": 0.5}, **limited)
     assert weak.one(1.0) == pytest.approx(0.5 * 8.0)  # not min(50, 8)
-    strong = Drive(["torque_gain"], {"torque_gain.gain": 4.0}, **limited)
+    strong = Drive(["torque_gain"], {"torque_gain.gain": 5.0}, **limited)
     assert strong.one(1.0) == pytest.approx(20.0)  # of 40 the supply leaves the stall torque
     assert strong.one(1.0, v=5.0) == pytest.approx(10.0)
     lag = Drive(["drive_bandwidth"], {"drive_bandwidth.time_constant": 0.01}, **limited)
@@ -297,7 +297,7 @@ def test_what_is_asked_is_limited_before_the_current_loop_and_the_torque_constan
     assert lag.one(1.0) == pytest.approx(8.0 * mean)  # of the 8 that flow at last, not of the 100 asked for
     assert lag.one(1.0) == pytest.approx(8.0 * (rise + (1 - rise) * mean))
     order = ("torque_speed_limit", "torque_gain", "torque_limit", "drive_bandwidth")  # as named, not as they act
-    values = {"torque_gain.gain": -0.5, "torque_limit.effort": 6.0, "drive_bandwidth.time_constant": 0.0}
+    values = {"torque_gain.gain": 0.5, "torque_limit.effort": 6.0, "drive_bandwidth.time_constant": 0.0}
     values |= {"torque_speed_limit.velocity": 10.0, "torque_speed_limit.effort": 5.0}
     every = Drive(order, values, **limited)
     assert every.one(1.0) == pytest.approx(3.0)
@@ -311,7 +311,7 @@ def test_the_two_limits_without_anything_between_them_are_the_four_quadrant_clip
     line = (100 * stall, 60 * most, 1 + 30 * fastest)
     whole = clip_effort(effort, speed, *line)
     assert torch.equal(clip_to_line(effort.clamp(-line[1], line[1]), speed, *line), whole)
-    values = {"torque_gain.gain": 0.0, "drive_bandwidth.time_constant": 0.0}
+    values = {"torque_gain.gain": 1.0, "drive_bandwidth.time_constant": 0.0}
     limits = {"saturation_effort": 140.0, "effort_limit": 89.0, "velocity_limit": 8.5}
     plain, with_null = Drive([], **limits), Drive(["torque_gain", "drive_bandwidth"], values, **limits)
     for target, v in ((0.5, 0.0), (3.0, 2.0), (3.0, 12.0), (3.0, 20.0), (-3.0, 20.0), (-3.0, -20.0)):
@@ -319,9 +319,9 @@ def test_the_two_limits_without_anything_between_them_are_the_four_quadrant_clip
 
 
 def test_gains_torques_and_encoders():
-    assert Drive(["torque_gain"], {"torque_gain.gain": 0.2}).one(0.1) == pytest.approx(12.0)
-    assert Drive(["proportional_gain"], {"proportional_gain.gain": 0.2}).one(0.1, v=1.0) == pytest.approx(11.0)
-    assert Drive(["derivative_gain"], {"derivative_gain.gain": 0.2}).one(0.1, v=1.0) == pytest.approx(8.8)
+    assert Drive(["torque_gain"], {"torque_gain.gain": 1.2}).one(0.1) == pytest.approx(12.0)
+    assert Drive(["proportional_gain"], {"proportional_gain.gain": 1.2}).one(0.1, v=1.0) == pytest.approx(11.0)
+    assert Drive(["derivative_gain"], {"derivative_gain.gain": 1.2}).one(0.1, v=1.0) == pytest.approx(8.8)
     assert Drive(["torque_offset"], {"torque_offset.effort": -0.7}).one(0.1) == pytest.approx(9.3)
     spring = Drive(["parallel_spring"], {"parallel_spring.stiffness": 5.0, "parallel_spring.rest": 0.1})
     assert spring.one(0.3, q=0.3) == pytest.approx(-5.0 * 0.2)

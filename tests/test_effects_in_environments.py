@@ -172,7 +172,7 @@ def test_an_effect_acts_only_on_its_rows_and_joints():
     knees = [i for i, name in enumerate(cfg.sim2real.joint_order) if name.endswith("KFE")]
     base_values = {"armature": 0.1, "viscous_friction": 1.0, "friction": 0.5, "encoder_bias": 0.0, "delay": 1.0}
     targets = legs_chirp(cfg, 0.1)
-    bench = Bench(["torque_gain@.*KFE"], {"torque_gain.gain": 0.3}, task=ANYMAL, base=base_values)
+    bench = Bench(["torque_gain@.*KFE"], {"torque_gain.gain": 1.3}, task=ANYMAL, base=base_values)
     assert [k for p in bench.space.parameters if "." in p.name for k in p.keys] == [
         cfg.sim2real.joint_order[i] for i in knees
     ]
@@ -251,7 +251,7 @@ PAIRS = [
         ("stribeck_friction", "backlash"),
         {"stribeck_friction.effort": 1.0, "backlash.gap": 0.01, "backlash.encoder_side": 1.0},
     ),
-    (("joint_elasticity", "torque_gain"), {"joint_elasticity.stiffness": 300.0, "torque_gain.gain": 0.2}),
+    (("joint_elasticity", "torque_gain"), {"joint_elasticity.stiffness": 300.0, "torque_gain.gain": 1.2}),
     (("encoder_scale", "encoder_eccentricity"), {"encoder_scale.error": 0.05, "encoder_eccentricity.cosine": 0.02}),
     (
         ("load_dependent_friction", "measurement_delay", "drive_bandwidth"),

@@ -109,9 +109,9 @@ TWIN_CASES = {
     "friction_drift": {"ratio": -0.7, "time_constant": 1.0},
     "torque_offset": {"effort": 1.0},
     "parallel_spring": {"stiffness": 5.0, "rest": 0.2},
-    "torque_gain": {"gain": 0.1},
-    "proportional_gain": {"gain": 0.1},
-    "derivative_gain": {"gain": 0.5},
+    "torque_gain": {"gain": 1.1},
+    "proportional_gain": {"gain": 1.1},
+    "derivative_gain": {"gain": 1.5},
     "drive_bandwidth": {"time_constant": 0.005},
     "velocity_filter": {"time_constant": 0.02},
     "torque_limit": {"effort": 10.0},
@@ -228,14 +228,14 @@ def test_a_parameter_has_the_keys_of_its_joints_or_one_for_all():
     problem = problem.with_effects(["torque_gain@.*KFE", "torque_offset@shared", "clock_skew"])
     keys = {p.name: list(p.keys) for p in problem.space.parameters if "." in p.name}
     assert keys == {"torque_gain.gain": knees, "torque_offset.effort": ["all"], "clock_skew.skew": ["all"]}
-    effect = {"torque_gain.gain": 0.1, "torque_offset.effort": 0.7, "clock_skew.skew": 0.001}
+    effect = {"torque_gain.gain": 1.1, "torque_offset.effort": 0.7, "clock_skew.skew": 0.001}
     rollout = problem.evaluator().rollout(2)
     one = problem.space.from_dict({**base, "delay": 1.0, **effect})
-    none = problem.space.from_dict({**base, "delay": 1.0, **dict.fromkeys(effect, 0.0)})
+    none = problem.space.from_dict({**base, "delay": 1.0, **dict.fromkeys(effect, 0.0), "torque_gain.gain": 1.0})
     rollout.start(torch.stack([one, none]))
     stack = next(iter(rollout.robot.actuators.values())).effects
     at = [name in knees for name in problem.joint_names]
-    assert stack.find("torque_gain").gain[0].tolist() == [0.1 * x for x in at]
+    assert stack.find("torque_gain").gain[0].tolist() == [1.1 if x else 1.0 for x in at]
     assert stack.find("torque_offset").effort.tolist() == [[0.7] * 12, [0.0] * 12]
     assert stack.find("clock_skew").skew[0].tolist() == [0.001] * 12
 

@@ -72,13 +72,13 @@ def test_every_parameter_arrives(result):
 
 
 def test_a_group_of_joints_gets_its_own_values_and_effects(result):
-    changed(result, effects=["torque_gain@.*KFE"], parameters={"torque_gain.gain": {f"{leg}_KFE": 0.1 for leg in LEGS}})
+    changed(result, effects=["torque_gain@.*KFE"], parameters={"torque_gain.gain": {f"{leg}_KFE": 1.1 for leg in LEGS}})
     cfg = PaceDCMotorCfg.from_result(result, ".*(HAA|KFE)", stiffness=50.0)
     joints = [joint for joint in JOINTS if not joint.endswith("HFE")]
     made = motor(cfg, DT, joints)
     assert made.armature[0].tolist() == pytest.approx([0.05 + 0.005 * JOINTS.index(joint) for joint in joints])
     assert made.stiffness[0, 0] == 50.0
-    assert made.effects.effects[0].gain[0].tolist() == pytest.approx([0.0, 0.1] * 4)
+    assert made.effects.effects[0].gain[0].tolist() == pytest.approx([1.0, 1.1] * 4)
     assert PaceDCMotorCfg.from_result(result, ".*HAA").effects == ()
 
 
@@ -265,7 +265,7 @@ def test_draws_stay_physical(result):
     for name in ("armature", "friction", "viscous_friction", "delay"):
         assert all((values >= 0).all() for values in drawn[name].values()), name
     gain = torch.stack(list(drawn["torque_gain.gain"].values()))
-    assert gain.min() == -0.5 and gain.max() == 0.5
+    assert gain.min() == 0.1 and gain.max() == 10.0
 
 
 def test_every_environment_gets_drives_of_its_own(result):

@@ -21,7 +21,7 @@ HIDDEN = {
     ),
     "stribeck_friction": ({"stribeck": 0.8, "velocity": 0.2}, {"effort": 0.8, "velocity": 0.2}),
     "quadratic_friction": ({"quadratic": 0.08}, {"coefficient": 0.08}),
-    "torque_gain": ({"gain": -0.2}, {"gain": -0.2}),
+    "torque_gain": ({"gain": -0.2}, {"gain": 0.8}),
 }
 
 

@@ -223,7 +223,7 @@ def test_torque_gain_and_an_effort_free_payload_are_twins_only_at_one_load():
     """A gain of 1/(1+m) and a link (1+m) times as heavy differ once a known mass is added."""
     scale = {key: getattr(BASE, key) * 1.25 for key in ("armature", "viscous_friction", "friction")}
     heavy = Truth(base=replace(BASE, **scale), effects={"payload": {"m": 0.25}})
-    weak = Truth(base=BASE, effects={"torque_gain": {"gain": -0.2}})
+    weak = Truth(base=BASE, effects={"torque_gain": {"gain": 0.8}})
     runs = [
         run_of(chirp(amplitude=0.2)),
         replace(run_of(chirp(amplitude=0.2)), load=replace(BENCH_LOAD, added_mass={"load": 0.8})),
@@ -238,7 +238,7 @@ def test_the_four_quadrant_limit_holds_at_every_instant():
 
 
 def test_a_request_is_limited_before_the_torque_constant_makes_torque_of_it():
-    weak = Truth(base=BASE, effects={"torque_gain": {"gain": -0.5}})
+    weak = Truth(base=BASE, effects={"torque_gain": {"gain": 0.5}})
     limited = run_of(chirp(amplitude=0.8), drive=Drive(effort_limit=np.array([20.0])))
     motion = simulate_motions(ROBOT, [limited], [weak], EXACT)[0][0]
     assert np.abs(motion.torque).max() == pytest.approx(10.0)

@@ -31,7 +31,7 @@ def write_result(path: Path, delay_mode: str = "command", delay: float = 3.4) ->
         "encoder_bias": per_joint(0.08 * np.cos(i)),
         "delay": {"all": delay},
         "drive_bandwidth.time_constant": per_joint(0.003 + 0.0005 * i),
-        "torque_gain.gain": per_joint(0.1 * np.sin(i)),
+        "torque_gain.gain": per_joint(1 + 0.1 * np.sin(i)),
         "stribeck_friction.effort": per_joint(0.2 + 0.01 * i),
         "stribeck_friction.velocity": per_joint(0.2 + 0.02 * i),
     }

@@ -176,46 +176,42 @@ class OtherDelay(Effect):
 
 @register_effect
 class ProportionalGain(Effect):
-    """The controller's proportional gain is not what the recording says: kp (1 + g)."""
+    """The controller's proportional gain is not what the recording says: g kp."""
 
     name = "proportional_gain"
     stage = "controller"
-    parameters = (
-        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02, possible=(-0.9, 9.0)),
-    )
-    equation = "kp (1 + g)"
+    parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.02, scale="log"),)
+    equation = "g kp"
     looks = "static sag and stiffness off; parameters change from gain set to gain set"
     source = "EFFECTS of PACE on MuJoCo; users of PACE report drives whose gains are not in SI units"
-    probes = ({"gain": 0.02},)
+    probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
     scales = "proportional gain"
     separates = "recordings at another gain, and a known added mass"
     gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kp."""
-        s.stiffness *= 1 + self.gain
+        s.stiffness *= self.gain
 
 
 @register_effect
 class DerivativeGain(Effect):
-    """The controller's derivative gain is not what the recording says: kd (1 + g)."""
+    """The controller's derivative gain is not what the recording says: g kd."""
 
     name = "derivative_gain"
     stage = "controller"
-    parameters = (
-        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.05, possible=(-0.9, 9.0)),
-    )
-    equation = "kd (1 + g)"
+    parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.05, scale="log"),)
+    equation = "g kd"
     looks = "damping changes from gain set to gain set"
     source = "as proportional_gain"
-    probes = ({"gain": 0.05},)
+    probes = ({"gain": 1.05}, {"gain": 0.3}, {"gain": 3.0})
     scales = "derivative gain"
     separates = "recordings at another derivative gain"
     gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kd."""
-        s.damping *= 1 + self.gain
+        s.damping *= self.gain
 
 
 @register_effect

@@ -15,17 +15,15 @@ _RIPPLE_PERIODS = sorted({round(5 * 40 ** (i / 26)) for i in range(27)})
 
 @register_effect
 class TorqueGain(Effect):
-    """The drive gives more or less torque than it is asked for, of the limited torque too: τ -> (1 + g) τ."""
+    """The drive gives more or less torque than it is asked for, of the limited torque too: τ -> g τ."""
 
     name = "torque_gain"
     stage = "drive"
-    parameters = (
-        EffectParameter(name="gain", unit="1", lower=-0.5, upper=0.5, null=0.0, start=0.02, possible=(-0.9, 9.0)),
-    )
-    equation = "τ -> (1 + g) τ"
+    parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.02, scale="log"),)
+    equation = "τ -> g τ"
     looks = "static sag and amplitude off together"
     source = "a wrong torque constant, gear ratio or efficiency"
-    probes = ({"gain": 0.02},)
+    probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
     twins = ("payload",)
     scales = "torque"
     separates = "a recording with a known added mass"
@@ -33,8 +31,8 @@ class TorqueGain(Effect):
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
-        s.effort *= 1 + self.gain
-        s.speed_slope *= 1 + self.gain
+        s.effort *= self.gain
+        s.speed_slope *= self.gain
 
 
 @register_effect

@@ -233,5 +233,6 @@ def scaled(name: str, values: Mapping[str, Mapping[str, float]], factor: float) 
     for parameter, draw in effect_named(name).draws.items():
         of_role = {"size": factor, "inverse": 1 / factor, "shape": 1.0}[draw.role]
         cap = _STIFFEST if draw.role == "inverse" else np.inf
-        result[parameter] = {joint: min(v * of_role, cap) for joint, v in values[parameter].items()}
+        middle = 1.0 if draw.factor else 0.0
+        result[parameter] = {joint: min(middle + (v - middle) * of_role, cap) for joint, v in values[parameter].items()}
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -161,6 +162,8 @@ def starts_of(probe: Probe) -> torch.Tensor:
     for k, p in enumerate(probe.effect.parameters):
         if p.null == 0.0:
             values[:, k] = (values[:, k] * factor).clamp(p.lower, p.upper)
+        elif p.scale == "log" and p.null is not None and math.isfinite(p.null):  # a factor: its logarithm is the size
+            values[:, k] = (p.null * (values[:, k] / p.null) ** factor).clamp(p.lower, p.upper)
     return values
 
 

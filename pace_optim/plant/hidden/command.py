@@ -79,26 +79,26 @@ class OtherDelay(HiddenEffect):
 
 @hidden
 class ProportionalGain(HiddenEffect):
-    """kp (1 + g)."""
+    """g kp."""
 
     name = "proportional_gain"
-    draws = draws_of(gain=Draw(unit="1", low=0.08, high=0.35, signed=True))
+    draws = draws_of(gain=Draw(unit="1", low=0.08, high=0.35, signed=True, factor=True, null=1.0))
 
     def prepare(self, drives: Drives) -> None:
         """Change the gain."""
-        drives.stiffness = drives.stiffness * (1 + self.gain)
+        drives.stiffness = drives.stiffness * self.gain
 
 
 @hidden
 class DerivativeGain(HiddenEffect):
-    """kd (1 + g)."""
+    """g kd."""
 
     name = "derivative_gain"
-    draws = draws_of(gain=Draw(unit="1", low=0.15, high=0.5, signed=True))
+    draws = draws_of(gain=Draw(unit="1", low=0.15, high=0.5, signed=True, factor=True, null=1.0))
 
     def prepare(self, drives: Drives) -> None:
         """Change the gain."""
-        drives.damping = drives.damping * (1 + self.gain)
+        drives.damping = drives.damping * self.gain
 
 
 @hidden

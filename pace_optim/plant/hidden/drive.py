@@ -33,15 +33,15 @@ class DriveBandwidth(HiddenEffect):
 
 @hidden
 class TorqueGain(HiddenEffect):
-    """τ -> (1 + g) τ."""
+    """τ -> g τ."""
 
     name = "torque_gain"
-    draws = draws_of(gain=Draw(unit="1", low=0.06, high=0.3, signed=True))
+    draws = draws_of(gain=Draw(unit="1", low=0.06, high=0.3, signed=True, factor=True, null=1.0))
     drive_rank = 1
 
     def drive(self, torque: np.ndarray, state: State) -> np.ndarray:
         """The torque given [N m]."""
-        return (1 + self.gain) * torque
+        return self.gain * torque
 
 
 @hidden

@@ -35,6 +35,8 @@ class Draw:
     """Whether it is a whole number."""
     null: float = 0.0
     """Value of joints without the effect."""
+    factor: bool = False
+    """Whether the value multiplies something: 1 plus what is drawn, a tenth at least."""
 
     def sample(self, rng: np.random.Generator, torque_scale: float, boost: float) -> float:
         """A value; ``boost`` above 1 makes the effect larger than its range says."""
@@ -46,6 +48,8 @@ class Draw:
             value *= rng.choice((-1.0, 1.0))
         if self.torque:
             value *= torque_scale
+        if self.factor:
+            value = max(0.1, 1 + value)
         return float(np.round(value)) if self.integer else float(value)
 
 
