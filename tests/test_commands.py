@@ -1,66 +1,56 @@
-"""``pace VERB``: the commands of the scripts, from an installed package."""
+"""Position, velocity and torque commands, and their sum: each drive is identified to its noise."""
 
-import subprocess
-import sys
-from pathlib import Path
+from __future__ import annotations
 
+import numpy as np
 import pytest
-from command_lines import run_script
+from bench_recordings import CONTROL_DT, Bench, chirp, record
 
-from pace_optim import commands
+from pace_optim.fit import fit
+from pace_optim.run.settings import FitSettings
 
-ROOT = Path(__file__).parents[1]
-SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
-
-
-def pace(capfd, monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["pace", *words])
-    try:
-        status = commands.main()
-    except SystemExit as end:
-        status = end.code
-    return int(status or 0), *capfd.readouterr()
+TASK = "Pace-TestBench-v0"
 
 
-def test_every_script_is_a_verb_and_every_verb_a_script():
-    assert list(commands.verbs()) == SCRIPTS
-
-
-def test_help_lists_the_verbs_with_what_they_do(capfd, monkeypatch):
-    status, out, _ = pace(capfd, monkeypatch, "--help")
-    assert status == 0
-    for verb, what in commands.verbs().items():
-        assert f"  {commands._SPELT.get(verb, verb).replace('_', '-')} " in out and what in out and what
-
-
-def test_the_version_is_the_packages(capfd, monkeypatch):
-    assert pace(capfd, monkeypatch, "--version")[1].startswith("pace-mujoco ")
-
-
-@pytest.mark.parametrize("verb", ["list-envs", "list_envs"])
-def test_a_verb_may_have_a_dash_or_an_underscore(verb, capfd, monkeypatch):
-    status, out, _ = pace(capfd, monkeypatch, verb)
-    assert (status, out) == (0, run_script("list_envs").stdout)
-
-
-def test_a_misspelt_verb_is_one_line(capfd, monkeypatch):
-    status, out, err = pace(capfd, monkeypatch, "diagnos")
-    assert (status, out) == (2, "")
-    assert err == "error: there is no command 'diagnos'; did you mean diagnose? See pace --help.\n"
-
-
-def test_messages_name_the_command_as_it_was_called(capfd, monkeypatch):
-    status, _, err = pace(capfd, monkeypatch, "fit")
-    assert status == 2 and "pace list-envs" in err and "scripts/" not in err
-    assert "example:\n  pace fit --task" in pace(capfd, monkeypatch, "fit", "--help")[1]
-    assert "scripts/list_envs.py" in run_script("fit").stderr
-
-
-def test_help_and_version_load_nothing_heavy():
-    code = (
-        "import sys; sys.argv = ['pace', '--help']\n"
-        "from pace_optim.commands import main; main()\n"
-        "sys.exit(str({'torch', 'mujoco', 'numpy'} & set(sys.modules)) if 'torch' in sys.modules else 0)"
+def fitted(tmp_path, *paths, effects=(), physics_dt=5e-4):
+    """The result of a fit of recordings."""
+    settings = FitSettings(
+        task=TASK,
+        data=[str(path) for path in paths],
+        effects=list(effects),
+        optimizer="least_squares",
+        physics_dt=physics_dt,
+        log_dir=str(tmp_path / "logs"),
+        check_consistency=False,
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    return fit(settings)[0]
+
+
+def check_truth(result, bench: Bench, tolerance: float = 0.03):
+    """Base parameters as they are, and no more error than the noise."""
+    found = {name: next(iter(values.values())) for name, values in result.parameters.items()}
+    assert result.rmse["train"]["all"] < 1.15 * bench.noise
+    assert result.delay_s == pytest.approx(bench.delay, abs=2e-4)
+    for name, true in (("armature", bench.armature), ("viscous_friction", bench.viscous), ("friction", bench.coulomb)):
+        assert found[name] == pytest.approx(true, rel=tolerance), name
+
+
+def test_a_drive_follows_velocity_targets_beside_positions(tmp_path):
+    bench, position = Bench(kd=2.0, delay=0.0062), chirp(5.0)
+    record(tmp_path / "a.csv", bench, position, np.gradient(position, CONTROL_DT))
+    check_truth(fitted(tmp_path, tmp_path / "a.csv"), bench)
+
+
+def test_a_torque_is_fed_forward(tmp_path):
+    bench, position = Bench(), chirp(5.0)
+    record(tmp_path / "a.csv", bench, position, effort=1.96 * np.sin(position) + 0.3 * np.sign(np.gradient(position)))
+    check_truth(fitted(tmp_path, tmp_path / "a.csv"), bench)
+
+
+def test_a_wheel_is_a_velocity_drive(tmp_path):
+    bench = Bench(kd=3.0, bias=0.0, load_mass=0.3, load_length=0.1)
+    speed = 12 * (chirp(5.0, top=4.0) - 0.3)
+    record(tmp_path / "a.csv", bench, velocity=speed)
+    result = fitted(tmp_path, tmp_path / "a.csv")
+    assert result.rmse["train"]["all"] < 1.3 * bench.noise
+    assert next(iter(result.parameters["viscous_friction"].values())) == pytest.approx(bench.viscous, rel=0.03)

@@ -1,6 +1,13 @@
 """Terms of the managers: plain functions ``(env, **params)``, classes only where there is state."""
 
-from pace_envs.mdp.actions import JointPositionAction, JointPositionActionCfg
+from pace_envs.mdp.actions import (
+    JointEffortAction,
+    JointEffortActionCfg,
+    JointPositionAction,
+    JointPositionActionCfg,
+    JointVelocityAction,
+    JointVelocityActionCfg,
+)
 from pace_envs.mdp.commands import UniformVelocityCommand, UniformVelocityCommandCfg
 from pace_envs.mdp.contact_rewards import feet_air_time, feet_slide, undesired_contacts
 from pace_envs.mdp.curriculums import command_range_by_tracking
@@ -41,8 +48,12 @@ from pace_envs.mdp.terminations import (
 )
 
 __all__ = [
+    "JointEffortAction",
+    "JointEffortActionCfg",
     "JointPositionAction",
     "JointPositionActionCfg",
+    "JointVelocityAction",
+    "JointVelocityActionCfg",
     "UniformVelocityCommand",
     "UniformVelocityCommandCfg",
     "action_rate_l2",

@@ -67,3 +67,41 @@ class JointPositionActionCfg(ActionTermCfg):
 
     preserve_order: bool = False
     """Order of the action: by the expressions instead of by ``joint_names`` of the articulation."""
+
+
+class JointVelocityAction(JointPositionAction):
+    """Joint velocity targets: q̇* = scale * action + offset [rad/s]. Drives without stiffness follow them alone."""
+
+    def apply_actions(self) -> None:
+        """Set the joints' velocity targets."""
+        self._asset.set_joint_velocity_target(self.processed_actions, self._joint_ids)
+
+
+@dataclass(kw_only=True)
+class JointVelocityActionCfg(JointPositionActionCfg):
+    """Configuration of :class:`JointVelocityAction`; scale and offset in rad/s."""
+
+    class_type: type[ActionTerm] = JointVelocityAction
+    """The term's class."""
+
+    use_default_offset: bool = False
+    """Stays ``False``: default positions are no speeds."""
+
+
+class JointEffortAction(JointPositionAction):
+    """Torques, added to what the drives' controllers ask for: τ_ff = scale * action + offset [N m]."""
+
+    def apply_actions(self) -> None:
+        """Set the joints' feed-forward torques."""
+        self._asset.set_joint_effort_target(self.processed_actions, self._joint_ids)
+
+
+@dataclass(kw_only=True)
+class JointEffortActionCfg(JointPositionActionCfg):
+    """Configuration of :class:`JointEffortAction`; scale and offset in N m."""
+
+    class_type: type[ActionTerm] = JointEffortAction
+    """The term's class."""
+
+    use_default_offset: bool = False
+    """Stays ``False``: default positions are no torques."""

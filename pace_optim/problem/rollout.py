@@ -167,6 +167,10 @@ class Rollout:
             if enable is not None and (j == 0 or not torch.equal(enable[k], enable[k - 1])):
                 for actuator in self.robot.actuators.values():
                     actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
+            if data.command_vel is not None:
+                self.robot.set_joint_velocity_target(self._rows(data.command_vel[k]))
+            if data.command_effort is not None:
+                self.robot.set_joint_effort_target(self._rows(data.command_effort[k]))
             self.env.simulate(self._rows(data.command[k]))
         self.simulated_steps += (steps - 1) * self.env.num_envs
 
