@@ -142,6 +142,8 @@ def _read_npz(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as content:
             fields = {key: content[key] for key in content.files}
+        if foreign := [key for key, value in fields.items() if not isinstance(value, np.ndarray)]:
+            raise ValueError(f"{foreign[0]} is no array")
     except Exception as error:  # zip, value and end-of-file errors alike
         if "Object arrays" in str(error):
             problem, cure = "holds Python objects", "Store text as unicode arrays and dicts as JSON text."
