@@ -21,7 +21,7 @@ PYTEST_ARGS ?= -n auto --dist loadfile
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo docs test lint format clean
 
 help:  ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
@@ -37,6 +37,9 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 
 demo: install  ## hide an effect in a robot, fit, compare, diagnose, add what is missing
 	$(BIN)/python scripts/demo.py
+
+docs: install  ## the documentation as a site, build/site/index.html; fails on a broken link or reference
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
 lint: install  ## ruff and mypy
 	$(BIN)/ruff check .

@@ -14,7 +14,8 @@ from typing import Any
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-_OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
+_WEBGL_WITHOUT_GPU = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_OPTIONS = ("--headless", "--no-sandbox", *_WEBGL_WITHOUT_GPU, "--disable-dev-shm-usage", "--no-first-run")
 
 
 class Browser:

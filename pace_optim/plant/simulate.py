@@ -42,7 +42,7 @@ def simulate_runs(
 def simulate_truths(
     task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
 ) -> list[list[Recording]]:
-    """The same for several truths with the same effects and delay mode, with the same noise: [truth][run]."""
+    """The same for several truths with the same effects, delay mode and noise; indexed by truth, then by run."""
     return [[motion.recording for motion in motions] for motions in simulate_motions(task, runs, truths, cfg)]
 
 
@@ -61,7 +61,7 @@ class Motion:
 def simulate_motions(
     task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
 ) -> list[list[Motion]]:
-    """The same with positions and torques: [truth][run]."""
+    """The same with positions and torques, indexed by truth, then by run."""
     cfg = cfg or PlantCfg()
     robot = plant_robot(task) if isinstance(task, str) else task
     _check(robot, runs, truths)

@@ -84,9 +84,12 @@ def make_sections(run: RunData) -> list[Section]:
     return sections
 
 
-def render(run: RunData, sections: list[Section]) -> str:
-    """The page's HTML."""
+def render(run: RunData, sections: list[Section], *, figures: bool = True) -> str:
+    """The page's HTML; without ``figures`` it is smaller, as it does not hold plotly."""
     here = files(__package__)
+    texts = [get_plotlyjs(), here.joinpath("script.js").read_text("utf-8")] if figures else []
+    texts.append(here.joinpath("motion", "viewer.js").read_text("utf-8"))
+    scripts = "".join(f"<script>{text}</script>\n" for text in texts)
     links = "".join(f'<a href="#{esc(s.id)}">{esc(s.title)}</a>' for s in sections)
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -106,8 +109,7 @@ def render(run: RunData, sections: list[Section]) -> str:
 </main>
 <footer>The numbers behind this page are in <code>result.json</code> beside it; positions in
 <code>best_trajectory.pt</code>.</footer>
-<script>{get_plotlyjs()}</script>
-<script>{here.joinpath("script.js").read_text("utf-8")}</script>
+{scripts}
 </body>
 </html>
 """

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from pace_actuators.files import read_json, refuse
@@ -78,6 +79,26 @@ class RunData:
             settings=settings.get("settings", {}),
             new=new or {},
         )
+
+    def read_model(self) -> mujoco.MjModel | None:
+        """The compiled model that the run was made with, ``None`` if the folder does not hold it."""
+        path = self.folder / "model.mjb"
+        return mujoco.MjModel.from_binary_path(str(path)) if path.is_file() else None
+
+    def model(self) -> mujoco.MjModel:
+        """The compiled model that the run was made with.
+
+        Raises:
+            ValueError: If the folder does not hold it.
+        """
+        model = self.read_model()
+        if model is None:
+            raise ValueError(f"{self.folder} holds no compiled model to draw; an older version made it. Fit again.")
+        return model
+
+    def worst_first(self) -> list[RecordingData]:
+        """The recordings, those with the largest error first."""
+        return sorted(self.recordings, key=lambda each: -float(np.nan_to_num(each.error).std()))
 
     def read_json(self, name: str) -> Any | None:
         """Another file of the folder, ``None`` if it is not there; for sections about later steps."""

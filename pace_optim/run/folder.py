@@ -27,6 +27,7 @@ _README = """Identification of {robot} with {task}, started {started}.
 
 result.json          parameters, error bars, errors and warnings
 report.html          the same to look at
+replay.html          the robot in 3-D, once {replay} was run
 best_trajectory.pt   commanded, measured and simulated positions of the best parameters (torch.load)
 mean_xxx.pt          mean of the search after generation xxx, physical, in the layout of config.pt
 config.pt            joints, bounds and layout of the parameter vector
@@ -114,7 +115,7 @@ class RunFolder:
             task=problem.task,
             started=datetime.now().strftime("%Y-%m-%d %H:%M"),
             folder=self.path,
-            **{verb: command(verb) for verb in ("fit", "compare", "diagnose")},
+            **{verb: command(verb) for verb in ("fit", "compare", "diagnose", "replay")},
         )
         write_atomically(self.path / "README.txt", lambda file: file.write(text.encode()))
 

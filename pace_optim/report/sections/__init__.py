@@ -17,6 +17,7 @@ from .making import making
 from .overview import overview
 from .parameters import parameters
 from .recordings import recordings
+from .replay import replay
 from .scores import scores
 from .trajectories import trajectories
 

@@ -1,0 +1,123 @@
+"""What the joints of a robot did, measured and simulated, at a screen's rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from ..run_data import RecordingData
+from .scene import scalar_joints
+
+_RATE = 50.0
+"""Pictures a second of recorded time [Hz]."""
+_MOST_PICTURES = 3000
+"""Of one recording: a longer one is shown at fewer pictures a second."""
+_LOOP_ITERATIONS = 20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """One recording at K instants, all m hinge and slide joints of the model in its order."""
+
+    name: str
+    """The recording's name."""
+    time: np.ndarray
+    """(K,) [s]."""
+    measured: np.ndarray
+    """Measured joint positions, encoder bias taken off, (K, m) [rad or m]."""
+    simulated: np.ndarray
+    """Simulated joint positions, (K, m) [rad or m]."""
+
+
+def motions_of(
+    model: mujoco.MjModel,
+    joint_names: Sequence[str],
+    recordings: Sequence[RecordingData],
+    encoder_bias: Sequence[float],
+) -> list[Motion]:
+    """What a page shows of each recording.
+
+    Joints that no encoder measures stand at their home position; where the model closes loops they follow the measured
+    ones.
+
+    Args:
+        model: The compiled model.
+        joint_names: The n joints that were measured.
+        recordings: With columns in that order.
+        encoder_bias: What an encoder shows beyond the joint's position, (n,) [rad or m].
+
+    Raises:
+        ValueError: If the model has no such joint.
+    """
+    columns = _columns(model, joint_names)
+    home = _home(model)
+    bias = np.asarray(encoder_bias, dtype=float)
+    return [_motion(model, columns, home, recording, bias) for recording in recordings]
+
+
+def _motion(
+    model: mujoco.MjModel, columns: np.ndarray, home: np.ndarray, recording: RecordingData, bias: np.ndarray
+) -> Motion:
+    time = recording.time - recording.time[0]
+    count = int(min(max(2, np.ceil(time[-1] * _RATE)), len(time), _MOST_PICTURES))
+    kept = np.unique(np.searchsorted(time, np.linspace(0.0, time[-1], count)).clip(max=len(time) - 1))
+    positions = []
+    for shown in (recording.measured, recording.measured + recording.error):
+        whole = np.tile(home, (len(kept), 1))
+        whole[:, columns] = np.nan_to_num(shown[kept] - bias)
+        positions.append(_closed(model, columns, whole) if model.neq else whole)
+    return Motion(name=recording.name, time=time[kept], measured=positions[0], simulated=positions[1])
+
+
+def _columns(model: mujoco.MjModel, joint_names: Sequence[str]) -> np.ndarray:
+    names = [model.joint(j).name for j in scalar_joints(model)]
+    missing = [name for name in joint_names if name not in names]
+    if missing:
+        raise ValueError(f"The model has no joint {missing[0]!r}. Available: {', '.join(names)}.")
+    return np.array([names.index(name) for name in joint_names], dtype=int)
+
+
+def _home(model: mujoco.MjModel) -> np.ndarray:
+    """Positions of the hinge and slide joints in the first keyframe, else in the model's reference."""
+    qpos = model.key_qpos[0] if model.nkey else model.qpos0
+    return qpos[model.jnt_qposadr[scalar_joints(model)]]
+
+
+def _closed(model: mujoco.MjModel, columns: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """The same with the joints that no encoder measures moved until the model's equality constraints hold.
+
+    Gauss-Newton on the constraints' residuals, each instant from the one before; measured joints are not moved.
+    """
+    data = mujoco.MjData(model)
+    joints = scalar_joints(model)
+    address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    free = np.array([i for i in range(len(joints)) if i not in set(columns.tolist())], dtype=int)
+    if not len(free):
+        return positions
+    result = positions.copy()
+    for k in range(len(result)):
+        if k:
+            result[k, free] = result[k - 1, free]
+        for _ in range(_LOOP_ITERATIONS):
+            data.qpos[address] = result[k]
+            mujoco.mj_fwdPosition(model, data)
+            rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+            residual = data.efc_pos[: data.nefc][rows]
+            if not len(residual) or np.abs(residual).max() < 1e-8:
+                break
+            jacobian = _dense_jacobian(model, data)[rows][:, dofs[free]]
+            result[k, free] -= np.linalg.lstsq(jacobian, residual, rcond=1e-9)[0]
+    return result
+
+
+def _dense_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    if not mujoco.mj_isSparse(model):
+        return data.efc_J[: data.nefc * model.nv].reshape(data.nefc, model.nv)
+    dense = np.zeros((data.nefc, model.nv))
+    for row in range(data.nefc):
+        start, count = data.efc_J_rowadr[row], data.efc_J_rownnz[row]
+        dense[row, data.efc_J_colind[start : start + count]] = data.efc_J[start : start + count]
+    return dense

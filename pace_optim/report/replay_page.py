@@ -1,0 +1,35 @@
+"""The replay alone on a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pace_optim.terminal.atomic import write_atomically
+
+from .page import render
+from .run_data import RunData
+from .sections.replay import replay
+
+
+def write_replay(folder: str | Path, output: Path | None = None) -> Path:
+    """Write ``replay.html`` of a run: one file that opens offline.
+
+    Args:
+        folder: The run's folder.
+        output: The file; ``None``: in the run's folder.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If the run has no result, no trajectories or no model.
+    """
+    folder = Path(folder)
+    run = RunData.load(folder)
+    run.model()
+    section = replay(run)
+    if section is None:
+        raise ValueError(f"{folder} holds no trajectories to replay: the fit that made it has not ended. Resume it.")
+    path = output or folder / "replay.html"
+    write_atomically(path, lambda file: file.write(render(run, [section], figures=False).encode()))
+    return path

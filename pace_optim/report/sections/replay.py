@@ -1,0 +1,78 @@
+"""The robot in 3-D: measured motion and simulated motion over each other."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..markup import Section, choice, json_script
+from ..motion import Motion, motions_of, scene_of
+from ..motion.scene import scalar_joints
+from ..run_data import RunData
+
+_RECORDINGS_ON_PAGE = 8
+"""Those with the largest errors; each takes some 8 bytes a joint and picture."""
+_SPEEDS = (("real time", 1.0), ("1/4", 0.25), ("1/10", 0.1), ("1/50", 0.02))
+_EXAGGERATIONS = (1, 5, 20, 100)
+
+
+def replay(run: RunData) -> Section | None:
+    """The viewer; nothing where the run holds no model."""
+    model = run.read_model()
+    if model is None or not run.recordings:
+        return None
+    bias = run.result.parameters["encoder_bias"]
+    motions = motions_of(
+        model, run.joint_names, run.worst_first()[:_RECORDINGS_ON_PAGE], [bias[name] for name in run.joint_names]
+    )
+    return Section(
+        id="replay",
+        title="Replay",
+        lead="Blue: measured. Solid: simulated, coloured by its error. Drag to turn, wheel to come closer.",
+        html=viewer(model, motions),
+    )
+
+
+def viewer(model: mujoco.MjModel, motions: Sequence[Motion]) -> str:
+    """HTML of a viewer that the page's script brings to life."""
+    content = {
+        "scene": scene_of(model),
+        "joints": [model.joint(j).name for j in scalar_joints(model)],
+        "scale": _scale(motions),
+        "recordings": [_encode(motion) for motion in motions],
+    }
+    speeds = "".join(f'<option value="{value}">{text}</option>' for text, value in _SPEEDS)
+    times = "".join(f'<option value="{value}">{value}×</option>' for value in _EXAGGERATIONS)
+    return (
+        f'<div class="replay">{choice("recording", [motion.name for motion in motions], group="replay ")}'
+        '<canvas aria-label="The robot, measured and simulated"></canvas>'
+        '<div class="controls"><button type="button" class="play">Play</button>'
+        '<input type="range" name="at" min="0" max="1" value="0" step="any" aria-label="time">'
+        f'<label>Speed <select name="speed">{speeds}</select></label>'
+        f'<label>Error drawn <select name="exaggerate">{times}</select></label></div>'
+        f'<p class="replay-note"></p>{json_script(content)}</div>'
+    )
+
+
+def _scale(motions: Sequence[Motion]) -> list[float]:
+    """Error at which a joint's link is fully red, (m,) [rad or m]: what 99 % of all joints' samples stay below."""
+    errors = np.concatenate([np.abs(motion.simulated - motion.measured) for motion in motions])
+    largest = float(np.quantile(errors, 0.99)) if errors.size else 0.0
+    return [max(largest, 1e-6)] * motions[0].measured.shape[1]
+
+
+def _encode(motion: Motion) -> dict[str, Any]:
+    return {
+        "name": motion.name,
+        "time": _base64(motion.time),
+        "measured": _base64(motion.measured),
+        "simulated": _base64(motion.simulated),
+    }
+
+
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()

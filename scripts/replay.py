@@ -1,0 +1,9 @@
+"""``pace replay`` as a script; ``--help`` tells what it does."""
+
+import sys
+
+from pace_optim.commands.replay import main
+from pace_optim.terminal.cli import run_cli
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))

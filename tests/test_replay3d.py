@@ -1,0 +1,198 @@
+"""The robot in 3-D moves in the browser as MuJoCo moves it."""
+
+import mujoco
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+
+from pace_optim.commands.replay import main
+from pace_optim.report import write_report
+from pace_optim.report.motion import motions_of, scene_of
+from pace_optim.report.motion.window import add_ghost
+from pace_optim.report.run_data import RecordingData
+
+from run_folders import JOINTS, write_run  # isort: skip
+
+LEG = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0 0 0.5" quat="0.9 0.1 -0.2 0.3">
+      <geom type="box" size="0.1 0.05 0.03"/>
+      <body name="thigh" pos="0.1 0 0" euler="10 20 30">
+        <joint name="hip" axis="0 1 0" pos="0.01 0.02 0.03"/>
+        <joint name="knee" axis="1 0 0.5"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02"/>
+        <body name="foot" pos="0 0 -0.2">
+          <joint name="ankle" type="slide" axis="0 0 1" ref="0.1"/>
+          <geom type="ellipsoid" size="0.02 0.03 0.04" quat="0.7 0.7 0 0"/>
+          <geom type="cylinder" size="0.01 0.05"/><geom type="sphere" size="0.03"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+FOUR_BAR = """
+<mujoco>
+  <worldbody>
+    <body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .1" size=".01"/>
+      <body name="rod" pos="0 0 .1"><joint name="rod" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".01"/></body>
+    </body>
+    <body name="rocker" pos=".3 0 0"><joint name="rocker" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .1" size=".01"/></body>
+  </worldbody>
+  <equality><connect body1="rod" body2="rocker" anchor=".3 0 0"/></equality>
+</mujoco>
+"""
+
+
+def recording(n: int, samples: int = 400, seed: int = 0) -> RecordingData:
+    rng = np.random.default_rng(seed)
+    time = 3.0 + np.arange(samples) * 0.005
+    phase, tempo = rng.uniform(0, 6, n), rng.uniform(2, 5, n)
+    measured = 0.4 * np.sin(tempo * time[:, None] + phase)
+    error = 0.01 * np.cos(7 * time[:, None] + phase)
+    return RecordingData(
+        name="chirp", time=time, target=measured, measured=measured, error=error, train=np.ones(samples, dtype=bool)
+    )
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A run's report with a replay, in a browser."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here: apt-get install chromium")
+    folder = write_run(tmp_path_factory.mktemp("logs") / "leg" / "26_01_01_00-00-00")
+    mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(LEG), str(folder / "model.mjb"), None)
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    try:
+        browser.open(write_report(folder), ready="document.documentElement?.dataset.drawn === 'true'")
+        yield browser
+        assert not browser.problems
+    finally:
+        browser.close()
+
+
+@pytest.mark.parametrize("which", ["measured", "simulated"])
+def test_bodies_stand_in_the_browser_where_mujoco_puts_them(page, which):
+    model = mujoco.MjModel.from_xml_string(LEG)
+    content = page.evaluate("JSON.parse(document.querySelector('.replay script').textContent)")
+    assert content["joints"] == list(JOINTS)
+    shown = page.evaluate(
+        f"[0.0, 0.5, 1.0].map((t) => document.querySelector('.replay').replay.poses('{which}', t)"
+        ".map((body) => [...body.pos, ...body.quat]))"
+    )
+    joints = page.evaluate(
+        "[0.0, 0.5, 1.0].map((t) => { const r = document.querySelector('.replay').replay;"
+        f"return r.joints('{which}', t); }})"
+    )
+    data = mujoco.MjData(model)
+    for poses, qpos in zip(shown, joints, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        poses = np.array(poses)
+        assert poses[:, :3] == pytest.approx(data.xpos, abs=1e-5)
+        same_turn = np.abs((poses[:, 3:] * data.xquat).sum(axis=1))  # q and -q are one rotation
+        assert same_turn == pytest.approx(1.0, abs=1e-5)
+
+
+def test_the_picture_is_not_empty_and_moves(page):
+    look = (
+        "(() => { const c = document.querySelector('.replay canvas'), gl = c.getContext('webgl');"
+        "const p = new Uint8Array(4 * c.width * c.height); "
+        "gl.readPixels(0, 0, c.width, c.height, gl.RGBA, gl.UNSIGNED_BYTE, p);"
+        "let hash = 0, drawn = 0; for (let i = 0; i < p.length; i += 4) { drawn += p[i + 3] > 0;"
+        "hash = (hash * 31 + p[i] + 7 * p[i + 1] + 13 * p[i + 2]) | 0; } return [drawn, hash]; })()"
+    )
+    page.evaluate("document.querySelector('.replay').replay.seek(0)")
+    drawn, first = page.evaluate(look)
+    assert drawn > 2000
+    page.evaluate("document.querySelector('.replay').replay.seek(1.3)")
+    assert page.evaluate(look)[1] != first
+
+
+def test_play_goes_on_and_pause_stops(page):
+    page.evaluate("document.querySelector('.replay').replay.seek(0)")
+    page.click("document.querySelector('.replay .play')")
+    page.evaluate("new Promise((done) => setTimeout(done, 300))")
+    page.click("document.querySelector('.replay .play')")
+    at = page.evaluate("document.querySelector('.replay').replay.state.at")
+    assert 0.05 < at < 3.0
+    assert page.evaluate("document.querySelector('.replay').replay.state.at") == at
+
+
+def test_the_encoder_s_bias_is_taken_off():
+    model = mujoco.MjModel.from_xml_string(LEG)
+    shown = recording(3)
+    (motion,) = motions_of(model, JOINTS, [shown], [0.02, 0.0, -0.01])
+    assert motion.time[0] == 0.0
+    assert motion.measured[0] == pytest.approx(shown.measured[0] - [0.02, 0.0, -0.01])
+    assert motion.simulated[0] == pytest.approx(shown.measured[0] + shown.error[0] - [0.02, 0.0, -0.01])
+
+
+def test_joints_of_a_closed_chain_that_no_encoder_measures_follow():
+    model = mujoco.MjModel.from_xml_string(FOUR_BAR)
+    (motion,) = motions_of(model, ["crank"], [recording(1)], [0.0])
+    data = mujoco.MjData(model)
+    for qpos in motion.simulated[:: len(motion.time) // 7]:
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-6
+    assert np.ptp(motion.simulated[:, 2]) > 0.1
+
+
+def test_a_joint_that_the_model_does_not_have_is_told_of():
+    with pytest.raises(ValueError, match=r"no joint 'elbow'. Available: hip, knee, ankle"):
+        motions_of(mujoco.MjModel.from_xml_string(LEG), ["elbow"], [recording(1)], [0.0])
+
+
+def test_a_fine_mesh_is_drawn_as_its_hull():
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(300, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = np.concatenate([points, 0.2 * rng.normal(size=(4000, 3))])
+    spec = mujoco.MjSpec()
+    mesh = spec.add_mesh(name="blob", uservert=(0.1 * points).ravel().tolist())
+    mesh.userface = rng.integers(0, 4000, size=3 * 3000).tolist()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    body = spec.worldbody.add_body(name="ball")
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="blob")
+    model = spec.compile()
+    (geom,) = scene_of(model)["geoms"]
+    vertices = np.array(geom["vertices"]).reshape(-1, 3)
+    assert geom["shape"] == "mesh" and max(geom["faces"]) < len(vertices) < 400
+    assert np.linalg.norm(vertices, axis=1) == pytest.approx(0.1, abs=0.06)
+
+
+def test_a_run_without_a_model_has_no_replay(tmp_path):
+    folder = write_run(tmp_path / "leg" / "26_01_01_00-00-00")
+    assert 'class="replay"' not in write_report(folder).read_text("utf-8")
+
+
+def test_the_command_writes_a_page_of_its_own(tmp_path, monkeypatch, capsys):
+    folder = write_run(tmp_path / "leg" / "26_01_01_00-00-00")
+    mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(LEG), str(folder / "model.mjb"), None)
+    monkeypatch.setattr("sys.argv", ["replay", str(folder), "--viewer", "none"])
+    main()
+    page = (folder / "replay.html").read_text("utf-8")
+    assert 'class="replay"' in page and "Plotly" not in page and len(page) < 200_000
+    assert capsys.readouterr().out.splitlines()[-1] == f"run: {folder}"
+
+
+def test_without_a_model_the_command_says_so(tmp_path, monkeypatch):
+    folder = write_run(tmp_path / "leg" / "26_01_01_00-00-00")
+    monkeypatch.setattr("sys.argv", ["replay", str(folder), "--viewer", "none"])
+    with pytest.raises(ValueError, match=r"no compiled model to draw"):
+        main()
+    assert not (folder / "replay.html").exists()
+
+
+def test_the_ghost_of_mujoco_s_viewer_stands_where_it_was_measured():
+    model = mujoco.MjModel.from_xml_string(LEG)
+    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, maxgeom=50)
+    data.qpos[:] = (0.3, -0.4, 0.15)
+    add_ghost(model, data, scene)
+    moving = data.geom_xpos[1:]  # all but the box on the base
+    assert np.array([scene.geoms[i].pos for i in range(scene.ngeom)]) == pytest.approx(moving, abs=1e-6)
+    assert scene.geoms[0].rgba[3] < 0.5
