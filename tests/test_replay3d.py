@@ -196,3 +196,11 @@ def test_the_ghost_of_mujoco_s_viewer_stands_where_it_was_measured():
     moving = data.geom_xpos[1:]  # all but the box on the base
     assert np.array([scene.geoms[i].pos for i in range(scene.ngeom)]) == pytest.approx(moving, abs=1e-6)
     assert scene.geoms[0].rgba[3] < 0.5
+
+
+def test_a_damaged_model_is_told_of(tmp_path, monkeypatch):
+    folder = write_run(tmp_path / "leg" / "26_01_01_00-00-00")
+    (folder / "model.mjb").write_bytes(b"no model")
+    monkeypatch.setattr("sys.argv", ["replay", str(folder), "--viewer", "none"])
+    with pytest.raises(ValueError, match=r"model\.mjb is damaged"):
+        main()

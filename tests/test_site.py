@@ -55,10 +55,3 @@ def test_an_effect_s_page_says_what_it_is():
     page = effect_page(get_effect("stribeck_friction"), "../images/effects/stribeck_friction.png")
     for words in ("# stribeck_friction", "F_s exp", "rad/s", "--effects stribeck_friction", "stribeck_friction.png"):
         assert words in page
-
-
-def test_every_effect_of_the_library_has_a_picture_of_what_it_leaves():
-    known = [get_effect(name) for name in available_effects()]
-    named = {e.name for e in known if e.__module__.startswith("pace_actuators.") and not e.free_form}
-    have = {path.stem for path in (ROOT / "docs" / "images" / "effects").glob("*.png")}
-    assert named == have, "Draw them: python docs/site/effect_pictures.py"

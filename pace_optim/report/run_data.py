@@ -81,9 +81,18 @@ class RunData:
         )
 
     def read_model(self) -> mujoco.MjModel | None:
-        """The compiled model that the run was made with, ``None`` if the folder does not hold it."""
+        """The compiled model that the run was made with, ``None`` if the folder does not hold it.
+
+        Raises:
+            ValueError: If it is damaged, or of another version of MuJoCo.
+        """
         path = self.folder / "model.mjb"
-        return mujoco.MjModel.from_binary_path(str(path)) if path.is_file() else None
+        if not path.is_file():
+            return None
+        try:
+            return mujoco.MjModel.from_binary_path(str(path))
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({error}). Remove it.") from error
 
     def model(self) -> mujoco.MjModel:
         """The compiled model that the run was made with.

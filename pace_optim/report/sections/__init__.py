@@ -25,6 +25,7 @@ SECTIONS: dict[Callable[[RunData], Section | None], str | None] = {
     overview: None,
     ladder: "comparison.json",
     trajectories: None,
+    replay: "model.mjb",
     failure: "comparison.json",
     diagnosis: "diagnosis.json",
     parameters: None,
