@@ -9,7 +9,7 @@ from pace_optim.problem.problem import DELAY_MODES
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import given_options, make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_log_options, take_common_options
 
 _WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless")
 """Options that a resumed run takes; it has the others from its start."""
@@ -24,8 +24,9 @@ def main() -> None:
     add_common_options(parser)
     parser.add_argument("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
     parser.add_argument(
-        "--data", nargs="+", default=[], metavar="FILE", help="recordings (default: the robot's sample)"
+        "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
     )
+    add_log_options(parser)
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",

@@ -30,6 +30,8 @@ def compare(
     data: Sequence[str] = (),
     physics_dt: float | None = None,
     task: str | None = None,
+    columns: str | None = None,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Say where each run's model fails, and put several side by side.
 
@@ -40,6 +42,8 @@ def compare(
         data: Recordings to simulate in place of the runs' own.
         physics_dt: Simulate at this physics step in place of the runs' [s].
         task: Another environment in place of the runs' own.
+        columns: Column map of logs among ``data``; ``None``: guessed.
+        strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
 
     Returns:
         The content of the last run's comparison.json.
@@ -52,7 +56,7 @@ def compare(
         raise ValueError(f"{repeated[0]} is named twice. Name each run once, the base model first.")
     for path in paths:
         check_folder(path, anew=FILE)
-    runs = [load_tracks(path, data, physics_dt, task) for path in paths]
+    runs = [load_tracks(path, data, physics_dt, task, columns, strict) for path in paths]
     check_alike(runs)
     contents = [compare_run(run) for run in runs]
     if len(runs) > 1:

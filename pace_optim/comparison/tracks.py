@@ -67,7 +67,12 @@ class RunTracks:
 
 
 def load_tracks(
-    folder: Path, data: Sequence[str] = (), physics_dt: float | None = None, task: str | None = None
+    folder: Path,
+    data: Sequence[str] = (),
+    physics_dt: float | None = None,
+    task: str | None = None,
+    columns: str | None = None,
+    strict: bool = False,
 ) -> RunTracks:
     """A run's best parameters on its own recordings, or on others.
 
@@ -76,6 +81,8 @@ def load_tracks(
         data: Recordings to simulate in place of the run's own.
         physics_dt: Simulate at this physics step in place of the run's [s].
         task: Another environment in place of the run's.
+        columns: Column map of logs among ``data``; ``None``: guessed.
+        strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
 
     Raises:
         ValueError: If the run or a recording cannot be used.
@@ -86,7 +93,10 @@ def load_tracks(
     problem: Problem | None = None
     try:
         # the torque of the load does not depend on effects
-        problem = open_problem(folder, task=task, data=data, physics_dt=physics_dt, effects=None if simulate else ())
+        effects = None if simulate else ()
+        problem = open_problem(
+            folder, task=task, data=data, physics_dt=physics_dt, effects=effects, columns=columns, strict=strict
+        )
     except (ValueError, KeyError, OSError) as error:
         if simulate:
             raise

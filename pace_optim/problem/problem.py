@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 
@@ -18,7 +18,8 @@ from pace_optim.problem.drive_steps import check_loops, set_control_step, set_dr
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.recording import Recording, conform_recording, load_recording
+from pace_optim.problem.recordings import read_all
+from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 
 DELAY_MODES = ("command", "effort")
@@ -109,6 +110,8 @@ def load_problem(
     physics_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
     env_cfg: Any = None,
+    columns: str | Path | None = None,
+    strict: bool = False,
 ) -> Problem:
     """Read and check everything that a fit needs.
 
@@ -121,6 +124,8 @@ def load_problem(
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
+        columns: Column map of logs that are not in this project's own form; ``None``: guessed.
+        strict: Whether one recording that cannot be used refuses all, instead of being set aside.
 
     Raises:
         ValueError: If anything does not fit.
@@ -145,9 +150,8 @@ def load_problem(
     physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
-    paths = [Path(path) for path in data] or [Path(cfg.sim2real.data_dir)]
-    recordings = [_load(path, env, control_dt) for path in paths]
-    held_out = [_load(Path(path), env, control_dt) for path in validation]
+    recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
+    held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
     recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     problem = Problem(
         task=task,
@@ -177,19 +181,6 @@ def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
     """The recordings with what is to be told of their drives' loops."""
     notes = check_loops(env, recordings)
     return [replace(r, notes=(*r.notes, note)) if note else r for r, note in zip(recordings, notes, strict=True)]
-
-
-def _load(path: Path, env: ManagerBasedRLEnv, control_dt: float) -> Recording:
-    cfg = cast(PaceSim2realEnvCfg, env.cfg)
-    robot = env.scene["robot"]
-    return conform_recording(
-        load_recording(path),
-        joint_order=tuple(robot.joint_names),
-        control_dt=control_dt,
-        joint_pos_limits=robot.data.joint_pos_limits.numpy(),
-        load_bodies=robot.body_names,
-        accepts_load=cfg.sim2real.apply_load is not None,
-    )
 
 
 def as_vector(problem: Problem, values: dict) -> torch.Tensor:

@@ -31,12 +31,11 @@ def check_recording(
     time, origin, kind = _stamps("time", fields["time"], source)
     notes += [f"time holds {kind}: counted from its first sample here."] if kind else []
     des_time = _command_time(fields.get("des_time"), time, origin, source)
-    given = [key for key in JOINT_SERIES if fields.get(key) is not None]
+    clocks = {} if des_time is None else dict.fromkeys(COMMAND_SERIES, ("des_time", des_time))
     series: dict[str, Any] = {
-        key: _joint_series(
-            key, fields[key], time if des_time is None or key not in COMMAND_SERIES else des_time, source
-        )
-        for key in given
+        key: _joint_series(key, fields[key], *clocks.get(key, ("time", time)), source)
+        for key in JOINT_SERIES
+        if fields.get(key) is not None
     }
     num_joints = series["dof_pos"].shape[1]
     for key, array in series.items():
@@ -166,8 +165,8 @@ def _origin(value: Any, of_stamps: float, source: str) -> float:
     return float(array[0])
 
 
-def _joint_series(key: str, value: Any, time: np.ndarray, source: str) -> np.ndarray:
-    num_samples, stamps = len(time), "des_time" if key in COMMAND_SERIES else "time"
+def _joint_series(key: str, value: Any, stamps: str, time: np.ndarray, source: str) -> np.ndarray:
+    num_samples = len(time)
     array = _numeric(key, value, source)
     if array.ndim == 1 and len(array) == num_samples:
         array = array[:, None]  # one joint

@@ -44,7 +44,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         fields, found = read_csv(path)
     else:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
-    fields = _add_json_facts(fields, path)
+    fields = add_json_facts(fields, path)
     return check_recording(fields, source=str(path), default_name=path.stem, found=found)
 
 
@@ -155,7 +155,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
     }
 
 
-def _add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
+def add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return the fields with those of the JSON file of the same stem, where there is one."""
     facts_path = path.with_suffix(".json")
     if not facts_path.is_file():

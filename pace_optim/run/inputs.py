@@ -19,7 +19,8 @@ def with_absolute_paths(settings: FitSettings, env_cfg: Any) -> FitSettings:
     """The same settings, which mean the same from any folder; the robot's sample stands in ``data`` where none does."""
     sample = getattr(getattr(env_cfg, "sim2real", None), "data_dir", None)
     data = settings.data or ([str(sample)] if sample is not None else [])
-    return replace(settings, data=_absolute(data), validation=_absolute(settings.validation))
+    columns = None if settings.columns is None else str(Path(settings.columns).absolute())
+    return replace(settings, data=_absolute(data), validation=_absolute(settings.validation), columns=columns)
 
 
 def recording_digests(settings: FitSettings) -> dict[str, str]:
@@ -34,9 +35,12 @@ def input_digests(settings: FitSettings, record: EnvironmentRecord) -> dict[str,
     """
     code = {entry["file"]: entry["sha256"] for entry in record.code.values()}
     beside = [
-        Path(name).with_suffix(".json") for name in (*settings.data, *settings.validation) if name.endswith(".csv")
+        Path(name).with_suffix(".json")
+        for name in (*settings.data, *settings.validation)
+        if not name.endswith((".npz", ".pt"))
     ]
-    return {**record.files, **code, **{str(path): _digest_if_there(path) for path in beside}}
+    columns = {} if settings.columns is None else {settings.columns: file_digest(settings.columns)}
+    return {**record.files, **code, **columns, **{str(path): _digest_if_there(path) for path in beside}}
 
 
 def check_unchanged(run: Run) -> None:

@@ -74,6 +74,8 @@ class Run:
         data: Sequence[str | Path] = (),
         physics_dt: float | None = None,
         effects: Sequence[Any] | None = None,
+        columns: str | None = None,
+        strict: bool = False,
     ) -> Problem:
         """The problem that the run solves, on its own recordings or on others.
 
@@ -81,13 +83,16 @@ class Run:
             data: Recordings in place of its own.
             physics_dt: Another physics step [s].
             effects: Other effects; ``None`` keeps its own.
+            columns: Column map of logs among ``data``; ``None``: guessed.
+            strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
 
         Raises:
             ValueError: If a recording has gone, or anything does not fit.
         """
         settings = self.settings
         if data:
-            settings = replace(settings, data=[str(path) for path in data], validation=[])
+            own = {"data": [str(path) for path in data], "validation": []}
+            settings = replace(settings, **own, columns=columns, strict=strict)  # type: ignore[arg-type]
         problem = problem_of(replace(settings, physics_dt=physics_dt or settings.physics_dt), self.load_cfg())
         return problem if effects is None else problem.with_effects(effects)
 
@@ -104,9 +109,13 @@ def open_problem(
     data: Sequence[str | Path] = (),
     physics_dt: float | None = None,
     effects: Sequence[Any] | None = None,
+    columns: str | None = None,
+    strict: bool = False,
 ) -> Problem:
     """The problem of a run of any robot; :meth:`Run.open` and :meth:`Run.problem` tell the arguments."""
-    return Run.open(run, task).problem(data=data, physics_dt=physics_dt, effects=effects)
+    return Run.open(run, task).problem(
+        data=data, physics_dt=physics_dt, effects=effects, columns=columns, strict=strict
+    )
 
 
 def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
@@ -124,6 +133,8 @@ def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
         physics_dt=settings.physics_dt,
         effects=settings.effects,
         env_cfg=env_cfg,
+        columns=settings.columns,
+        strict=settings.strict,
     )
 
 

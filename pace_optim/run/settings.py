@@ -67,6 +67,12 @@ class FitSettings:
     check_consistency: bool = True
     """Whether each of several recordings is fitted alone too, to see whether they agree."""
 
+    columns: str | None = None
+    """Column map of logs that are not in this project's own form; ``None``: guessed."""
+
+    strict: bool = False
+    """Whether one recording that cannot be used refuses all, instead of being set aside."""
+
     log_dir: str = "logs/pace"
     """Where runs are kept."""
 

@@ -16,8 +16,8 @@ from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.recordings import read_all
 from pace_optim.problem.rollout import Rollout
-from pace_optim.recording import Recording, conform_recording, load_recording
 from pace_optim.recording.dataset import make_dataset
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, rmse_by_joint
@@ -93,9 +93,11 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     control_dt = _control_dt(env_cfg)
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
     paths = settings.data or [str(fitted_cfg.sim2real.data_dir)]
-    dataset = make_dataset(
-        [_load(path, env, control_dt) for path in paths], [_load(path, env, control_dt) for path in settings.validation]
+    trained, held_out = (
+        read_all(each, env, control_dt, columns=settings.columns, strict=settings.strict)
+        for each in (paths, settings.validation)
     )
+    dataset = make_dataset(trained, held_out)
     env.close()
     env = ManagerBasedRLEnv(_with_envs(env_cfg, dataset.num_recordings))
     error = _errors(env, Rollout(env, dataset, _AsItIs()))  # type: ignore[arg-type]
@@ -151,18 +153,6 @@ def _with_recorded_gains(drive: Any, fitted: PaceSim2realEnvCfg) -> Any:
     groups = [each for each in fitted.scene.robot.actuators.values() if each.joint_names_expr == drive.joint_names_expr]
     names = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
     return replace(drive, **{name: getattr(groups[0], name) for name in names}) if groups else drive
-
-
-def _load(path: str, env: ManagerBasedRLEnv, control_dt: float) -> Recording:
-    robot = env.scene["robot"]
-    return conform_recording(
-        load_recording(path),
-        joint_order=tuple(robot.joint_names),
-        control_dt=control_dt,
-        joint_pos_limits=robot.data.joint_pos_limits.numpy(),
-        load_bodies=robot.body_names,
-        accepts_load=env.cfg.sim2real.apply_load is not None,  # type: ignore[attr-defined]
-    )
 
 
 def _control_dt(cfg: PaceSim2realEnvCfg) -> float:

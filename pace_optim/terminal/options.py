@@ -51,3 +51,15 @@ def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
     if options.get("effects"):
         options["effects"] = [import_effect(text) for text in options["effects"]]
     return options
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Options of every command that reads recordings."""
+    parser.add_argument(
+        "--columns",
+        metavar="MAP",
+        help="column map of logs (.toml: joints, units, signs, gear ratios); without it, it is guessed and told",
+    )
+    parser.add_argument(
+        "--strict", action="store_true", help="refuse all recordings where one cannot be used (default: set it aside)"
+    )

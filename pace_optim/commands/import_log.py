@@ -1,0 +1,81 @@
+"""Read a log of another program, say what was understood, and write it as a recording."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pace_optim.recording import SUFFIXES, save_recording
+from pace_optim.robot_logs import ColumnMap, Robot, is_log, load_recordings, read_map, understood, write_map
+from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_common_options, take_common_options
+
+
+def main() -> None:
+    """Parse the command line, read the log, write recordings."""
+    parser = make_parser(
+        "Read a log (.mcap .db3 .bag .parquet .csv, rosbag2 and LeRobot folders), print what was understood (topics,\n"
+        "joints, units, rates, gaps) and write it as a recording. Several files are parts of one log, of one clock.",
+        example="scripts/import_log.py rosbag2_2026_11_25 --task my_arm.xml --output arm.csv",
+    )
+    parser.add_argument("log", nargs="+", metavar="LOG", help="the log's file or folder")
+    add_common_options(parser)
+    parser.add_argument("--columns", metavar="MAP", help="column map (.toml); without it, it is guessed")
+    parser.add_argument("--output", metavar="FILE", help="recording to write (.csv, .npz, .pt); episodes get numbers")
+    parser.add_argument("--write_map", metavar="MAP", help="write the map that was used, to correct it")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
+
+    path = Path("+".join(args.log))
+    columns = read_map(Path(args.columns)) if args.columns else None
+    if not is_log(path, columns):
+        found = load_recordings(path)
+        print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
+        parts = [(recording, columns) for recording in found]
+    else:
+        each = understood(path, _robot(args.task), columns)
+        for line in each[0].lines:
+            print(line)
+        if len(each) > 1:
+            print(f"  {len(each)} episodes")
+        parts = [(one.recording, one.columns) for one in each]
+    if args.write_map and parts[0][1] is not None:
+        _write_map(Path(args.write_map), parts[0][1], args.overwrite)
+    if not args.output:
+        print("nothing written: --output FILE writes the recording")
+        return
+    targets = _targets(Path(args.output), len(parts))
+    if there := [str(target) for target in targets if target.exists() and not args.overwrite]:
+        raise ValueError(f"{there[0]} is there already. Choose another --output, or give --overwrite.")
+    for (recording, _), target in zip(parts, targets, strict=True):
+        save_recording(target, recording)
+        print(f"recording: {target} ({recording.num_samples} samples, {recording.duration:.4g} s)")
+
+
+def _robot(task: str | None) -> Robot:
+    """What a task says of the robot's joints."""
+    if task is None:
+        return Robot()
+    from pace_envs import ManagerBasedRLEnv, load_env_cfg
+
+    cfg = load_env_cfg(task)
+    cfg.scene.num_envs = 1
+    env = ManagerBasedRLEnv(cfg)  # type: ignore[arg-type]
+    robot = env.scene["robot"]
+    known = Robot(joint_names=tuple(robot.joint_names), limits=np.array(robot.data.joint_pos_limits))
+    env.close()
+    return known
+
+
+def _write_map(path: Path, columns: ColumnMap, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} is there already. Choose another --write_map, or give --overwrite.")
+    write_map(path, columns)
+    print(f"map: {path}", file=sys.stderr)
+
+
+def _targets(path: Path, count: int) -> list[Path]:
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--output {path}: expected one of {', '.join(SUFFIXES)}. Correct its name.")
+    return [path] if count == 1 else [path.with_stem(f"{path.stem}_{i:03d}") for i in range(count)]

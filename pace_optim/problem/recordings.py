@@ -1,0 +1,81 @@
+"""The recordings that a command line names, on a robot's joints and control grid."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pace_optim.recording import Recording, conform_recording
+from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, paired_files, read_map
+
+if TYPE_CHECKING:
+    from pace_envs import ManagerBasedEnv
+
+
+def tell_on_stderr(text: str) -> None:
+    """Tell a user something beside a command's results."""
+    print(text, file=sys.stderr)
+
+
+def read_all(
+    paths: Sequence[str | Path],
+    env: ManagerBasedEnv,
+    control_dt: float,
+    *,
+    columns: str | Path | None = None,
+    strict: bool = False,
+    tell: Callable[[str], None] = tell_on_stderr,
+) -> list[Recording]:
+    """Read recordings and logs, and put each on the robot's joints and control grid.
+
+    Args:
+        paths: Files and folders, each as :func:`pace_optim.robot_logs.load_recordings` takes it; two files that are the
+            halves of one log (states, commands) are joined.
+        env: The robot.
+        control_dt: Control step [s].
+        columns: Column map of the logs among them; ``None``: guessed.
+        strict: Whether one that cannot be used refuses all, instead of being set aside.
+        tell: Is told what was understood of logs, and what was set aside.
+
+    Raises:
+        ValueError: If none can be used, or one cannot and ``strict``.
+    """
+    chosen = None if columns is None else read_map(Path(columns))
+    names = paired_files([str(path) for path in paths])
+    result: list[Recording] = []
+    faults: list[str] = []
+    for name in names:
+        try:
+            result += _conformed(name, env, control_dt, chosen, tell)
+        except ValueError as error:
+            if strict or len(names) == 1 or not Path(name).exists():
+                raise
+            faults.append(" ".join(str(error).split()))
+    if faults and not result:
+        more = f" (The other {len(faults) - 1} files cannot be used either.)" if len(faults) > 1 else ""
+        raise ValueError(faults[0] + more)
+    for fault in faults:
+        tell(f"warning: set aside (--strict would refuse all): {fault}")
+    return result
+
+
+def _conformed(
+    name: str, env: ManagerBasedEnv, control_dt: float, columns: ColumnMap | None, tell: Callable[[str], None]
+) -> list[Recording]:
+    robot = env.scene["robot"]
+    limits = robot.data.joint_pos_limits.numpy()
+    known = Robot(joint_names=tuple(robot.joint_names), limits=limits)
+    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
+    return [
+        conform_recording(
+            recording,
+            joint_order=known.joint_names,
+            control_dt=control_dt,
+            joint_pos_limits=limits,
+            load_bodies=robot.body_names,
+            accepts_load=sim2real.apply_load is not None,
+        )
+        for recording in load_recordings(name, known, columns, tell)
+    ]

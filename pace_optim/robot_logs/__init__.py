@@ -1,0 +1,18 @@
+"""Logs of other programs as recordings: rosbag2, ROS 1 bags, LeRobot datasets, parquet, and CSV with any names.
+
+>>> for recording in load_recordings("leg_mcap", Robot(joint_names=("hip", "knee"))): ...
+"""
+
+from .column_map import ColumnMap, read_map, write_map
+from .load import Robot, is_log, load_recordings, paired_files, understood
+
+__all__ = [
+    "ColumnMap",
+    "Robot",
+    "is_log",
+    "load_recordings",
+    "paired_files",
+    "read_map",
+    "understood",
+    "write_map",
+]

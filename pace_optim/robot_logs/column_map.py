@@ -1,0 +1,174 @@
+"""The column map: which channel of a log is which series of which joint, in which unit, sign and gear ratio."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pace_optim.recording.keys import FACTS, JOINT_SERIES, did_you_mean, listed
+from pace_optim.terminal.atomic import write_atomically
+
+from .words import CURRENTS, TIME_UNITS, UNITS
+
+_ENTRY = ("from", "unit", "sign", "offset", "gear_ratio", "factor")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where a series of a joint comes from.
+
+    Positions and speeds: ``sign * value * unit / gear_ratio + offset``; torques, with ``factor`` [N m/A] for currents:
+    ``sign * value * unit * factor * gear_ratio + offset``.
+    """
+
+    channel: str
+    unit: str
+    sign: float = 1.0
+    offset: float = 0.0
+    """In SI units, at the joint."""
+    gear_ratio: float = 1.0
+    """Turns of what was logged to one of the joint."""
+    factor: float = 1.0
+
+    def scale(self, series: str) -> float:
+        """What one logged unit is in SI units at the joint."""
+        quantity = series.removeprefix("des_")
+        unit = self.sign * UNITS[quantity][self.unit]
+        return (
+            unit * self.factor * self.gear_ratio if quantity == "dof_effort" else unit * self.factor / self.gear_ratio
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnMap:
+    """A whole map; joints in the order of the recording's columns."""
+
+    joints: Mapping[str, Mapping[str, Source]]
+    """{joint: {series: source}}."""
+    time: str = ""
+    """The column of time; "": as guessed, or the topics' stamps."""
+    time_unit: str = ""
+    """Its unit: s, ms, us or ns; "": as guessed."""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """Facts of the recording: stiffness, added_mass, ..."""
+
+
+def read_map(path: Path) -> ColumnMap:
+    """Read a column map.
+
+    Raises:
+        ValueError: If it is no such map; the message names the key.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file. Give --columns a column map, as pace import writes it.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is not TOML ({error}). Correct it.") from None
+    _check_keys(path, "the map", content, ("time", "joints", "facts"))
+    joints = _table(path, "joints", content.get("joints", {}))
+    if not joints:
+        raise ValueError(
+            f'{path}: has no joints; expected [joints."NAME"] with dof_pos = {{from = "COLUMN"}}. Add them.'
+        )
+    time = _table(path, "time", content.get("time", {}))
+    _check_keys(path, "time", time, ("column", "unit"))
+    if (unit := time.get("unit", "")) not in ("", *TIME_UNITS):
+        raise ValueError(f"{path}: time.unit is {unit!r}; expected one of {listed(TIME_UNITS)}. Correct it.")
+    facts = _table(path, "facts", content.get("facts", {}))
+    _check_keys(path, "facts", facts, FACTS)
+    return ColumnMap(
+        joints={joint: _sources(path, joint, _table(path, joint, entries)) for joint, entries in joints.items()},
+        time=str(time.get("column", "")),
+        time_unit=unit,
+        facts=facts,
+    )
+
+
+def _sources(path: Path, joint: str, entries: Mapping[str, Any]) -> dict[str, Source]:
+    _check_keys(path, f"joints.{joint}", entries, JOINT_SERIES)
+    return {series: _source(path, f"joints.{joint}.{series}", series, entry) for series, entry in entries.items()}
+
+
+def _source(path: Path, where: str, series: str, entry: Any) -> Source:
+    entry = _table(path, where, {"from": entry} if isinstance(entry, str) else entry)
+    _check_keys(path, where, entry, _ENTRY)
+    if not isinstance(entry.get("from"), str):
+        raise ValueError(f'{path}: {where} names no column; expected {{from = "COLUMN"}}. Add it.')
+    units = UNITS[series.removeprefix("des_")]
+    unit = entry.get("unit", next(iter(units)))
+    if unit not in units:
+        raise ValueError(f"{path}: {where}.unit is {unit!r}; expected one of {listed(units)}. Correct it.")
+    if unit in CURRENTS and "factor" not in entry:
+        raise ValueError(f"{path}: {where} is a current; expected factor = N m per A beside it. Add it.")
+    numbers = {key: entry[key] for key in ("sign", "offset", "gear_ratio", "factor") if key in entry}
+    for key, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
+            raise ValueError(f"{path}: {where}.{key} is {value!r}; expected a number. Correct it.")
+        if (key != "offset" and value == 0) or (key == "sign" and abs(value) != 1):
+            raise ValueError(f"{path}: {where}.{key} is {value}; expected {'1 or -1' if key == 'sign' else 'not 0'}.")
+    return Source(channel=entry["from"], unit=unit, **{key: float(value) for key, value in numbers.items()})
+
+
+def _table(path: Path, where: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{path}: {where} is {value!r}; expected a table. Correct it.")
+    return value
+
+
+def _check_keys(path: Path, where: str, content: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    for key in content:
+        if key not in known:
+            raise ValueError(
+                f"{path}: {where} has the unknown key '{key}'{did_you_mean(key, known)} Keys: {listed(known)}."
+            )
+
+
+def write_map(path: Path, columns: ColumnMap, comments: tuple[str, ...] = ()) -> None:
+    """Write a map that reads back the same.
+
+    Args:
+        path: Where to.
+        columns: The map.
+        comments: Lines for its head.
+    """
+    text = map_text(columns, comments)
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
+    """A map as TOML."""
+    lines = [f"# {printable(comment)}" for comment in comments]
+    if columns.time or columns.time_unit:
+        lines += ["", "[time]"]
+        lines += [f"column = {json.dumps(columns.time)}"] if columns.time else []
+        lines += [f'unit = "{columns.time_unit}"'] if columns.time_unit else []
+    if columns.facts:
+        lines += ["", "[facts]", *(f"{key} = {_value(value)}" for key, value in columns.facts.items())]
+    for joint, sources in columns.joints.items():
+        lines += ["", f"[joints.{json.dumps(joint)}]"]
+        for series, source in sources.items():
+            entry = [f"from = {json.dumps(source.channel)}", f'unit = "{source.unit}"']
+            entry += [
+                f"{key} = {value!r}"
+                for key in ("sign", "offset", "gear_ratio", "factor")
+                if (value := getattr(source, key)) != (0.0 if key == "offset" else 1.0)
+                or (key == "factor" and source.unit in CURRENTS)
+            ]
+            lines.append(f"{series} = {{{', '.join(entry)}}}")
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(str(key))} = {_value(item)}" for key, item in value.items()) + "}"
+    return json.dumps(value)
+
+
+def printable(text: str) -> str:
+    """Text without control characters, which a terminal would obey."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

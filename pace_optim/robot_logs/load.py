@@ -1,0 +1,252 @@
+"""Read recordings from any file or folder: this project's own form, or a log of another program."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pace_optim.recording import Recording, load_recording
+from pace_optim.recording.checks import check_recording
+from pace_optim.recording.files import SUFFIXES, add_json_facts
+from pace_optim.recording.keys import listed
+
+from .build import fields_of, rates_of
+from .column_map import ColumnMap, map_text, printable, write_map
+from .guess import Robot, guess_map
+from .log import Log
+from .rosbag import read_rosbag
+from .tables import is_joint_table, read_csv_log, read_parquet_log
+
+BAGS = (".mcap", ".db3", ".bag")
+TABLES = (".csv", ".parquet")
+LOG_SUFFIXES = (*BAGS, ".parquet")
+_JOIN = "+"
+"""Between the files of one log: states.csv+commands.csv."""
+
+__all__ = ["Robot", "Understood", "is_log", "load_recordings", "paired_files", "understood"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Understood:
+    """One recording of a log, and how the log was read."""
+
+    recording: Recording
+    columns: ColumnMap
+    lines: tuple[str, ...]
+    """What was understood, for people."""
+
+
+def load_recordings(
+    path: str | os.PathLike[str],
+    robot: Robot | None = None,
+    columns: ColumnMap | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> list[Recording]:
+    """Read the recordings of a file or folder: one, or one per episode.
+
+    Args:
+        path: A recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a ROS 1 .bag, a .parquet, the
+            folder of a LeRobot dataset, a .csv with any names, or CSV files of one log joined by `+`.
+        robot: The robot's joints and limits; without it, the log's own names are kept.
+        columns: Which column is what; without it, it is guessed.
+        tell: Is told what a guess understood.
+
+    Raises:
+        ValueError: If nothing can be read; the message says all that is missing.
+    """
+    path = Path(path)
+    if not is_log(path, columns):
+        return [load_recording(path)]
+    found = understood(path, robot or Robot(), columns)
+    if tell and columns is None:
+        for line in found[0].lines:
+            tell(line)
+    return [each.recording for each in found]
+
+
+def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
+    """Whether a path is a log of another program, and not a recording in this project's own form."""
+    if columns is not None and path.suffix.lower() not in (".npz", ".pt"):
+        return True
+    if path.is_dir() or path.suffix.lower() in LOG_SUFFIXES or (_JOIN in str(path) and not path.exists()):
+        return True
+    return path.suffix.lower() == ".csv" and path.is_file() and not _is_own_csv(path)
+
+
+def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> list[Understood]:
+    """Read a log and say what was understood.
+
+    Args:
+        path: As `load_recordings` takes it, less this project's own form.
+        robot: The robot's joints and limits, as far as they are known.
+        columns: Which column is what; without it, it is guessed.
+    """
+    result = []
+    for log in _logs(path, columns):
+        used, notes = columns, list(log.notes)
+        if used is None:
+            guess = guess_map(log, robot)
+            used, notes = guess.columns, [*notes, *guess.notes]
+            if guess.missing:
+                raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
+        names = robot.joint_names or tuple(used.joints)
+        _check_map(path, used, names)
+        fields, more = fields_of(log, used, names)
+        facts = add_json_facts(fields, Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path)
+        recording = check_recording(facts, source=str(path), default_name=log.name)
+        if len(log.name) > len(path.stem):  # an episode
+            recording = replace(recording, name=log.name)
+        lines = [printable(line) for line in (f"{path}: read as", *rates_of(log, used), *notes, *more)]
+        result.append(
+            Understood(
+                recording=replace(recording, notes=(*recording.notes, *notes, *more)),
+                columns=used,
+                lines=tuple(lines[:1] + [f"  {line}" for line in lines[1:]]),
+            )
+        )
+    return result
+
+
+def paired_files(paths: Sequence[str]) -> list[str]:
+    """Join files that are two halves of one log: positions without commands, and commands without positions.
+
+    Args:
+        paths: In the order of the command line. A half is joined with the nearest other half after it, else before it.
+    """
+    halves = {i: half for i, path in enumerate(paths) if (half := _half(Path(path)))}
+    result: list[str | None] = list(paths)
+    for i, half in halves.items():
+        if half != "states" or result[i] is None:
+            continue
+        others = [j for j, other in halves.items() if other == "commands" and result[j] is not None]
+        if others:
+            j = min(others, key=lambda other: (abs(other - i), other < i))
+            result[i], result[j] = paths[i] + _JOIN + paths[j], None
+    return [path for path in result if path is not None]
+
+
+def _half(path: Path) -> str:
+    """`states` or `commands` where a table has one of them alone, else ""."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return ""
+    positions, commands = is_joint_table(_header(path))
+    return "" if positions == commands else "states" if positions else "commands"
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            line = file.readline(1 << 20)
+    except (UnicodeDecodeError, OSError):
+        return []
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=max(",;\t", key=line.count)), [])]
+
+
+def _is_own_csv(path: Path) -> bool:
+    """Whether a CSV is meant to be a recording: it has the time and joints of one of the series by their names."""
+    header = _header(path)
+    own = [column.partition("/")[0] for column in header if "/" in column]
+    return not header or any(series in ("dof_pos", "des_dof_pos") for series in own) or len(header) < 2
+
+
+def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
+    if _JOIN in str(path) and not path.exists():
+        yield _joined([Path(part) for part in str(path).split(_JOIN)], columns)
+        return
+    if not path.exists():
+        folder = path.parent
+        near = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+        raise ValueError(f"{path}: no such file. There are in {folder}: {listed(near)}. Correct the path.")
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            yield read_rosbag(path)
+        elif (path / "meta" / "info.json").is_file():
+            yield from read_parquet_log(path, columns)
+        elif bags := sorted(p for p in path.iterdir() if p.suffix.lower() in BAGS):
+            for bag in bags:
+                yield read_rosbag(bag)
+        else:
+            there = listed(sorted(p.name for p in path.iterdir()))
+            raise ValueError(
+                f"{path}: this folder is neither a rosbag2 (metadata.yaml) nor a LeRobot dataset "
+                f"(meta/info.json). It has: {there}. Name the files themselves."
+            )
+    elif suffix in BAGS:
+        yield read_rosbag(path)
+    elif suffix == ".parquet":
+        yield from read_parquet_log(path, columns)
+    elif suffix == ".csv":
+        yield from read_csv_log(path, columns)
+    else:
+        raise ValueError(
+            f"{path}: found the suffix '{path.suffix}'; expected one of {listed((*SUFFIXES, *LOG_SUFFIXES))}, or a "
+            "folder of a rosbag2 or a LeRobot dataset. Convert the log."
+        )
+
+
+def _joined(paths: Sequence[Path], columns: ColumnMap | None) -> Log:
+    """CSV files of one clock as one log."""
+    logs = [read_csv_log(path, columns)[0] for path in paths]
+    origins = {bool(log.time_origin) for log in logs}
+    if len(origins) > 1:
+        raise ValueError(f"{_JOIN.join(map(str, paths))}: one has Unix time and one has not. Give both on one clock.")
+    first = min(log.time_origin for log in logs)
+    channels = {}
+    for log, path in zip(logs, paths, strict=True):
+        for key, channel in log.channels.items():
+            name = key if key not in channels else f"{path.stem}:{key}"
+            shifted = channel.time + (log.time_origin - first) if first else channel.time
+            channels[name] = replace(channel, key=name, time=shifted)
+    return Log(
+        name=paths[0].stem,
+        channels=channels,
+        time_origin=first,
+        notes=tuple(note for log in logs for note in log.notes),
+    )
+
+
+def _check_map(path: Path, columns: ColumnMap, names: Sequence[str]) -> None:
+    missing = [name for name in names if "dof_pos" not in columns.joints.get(name, {})]
+    if missing:
+        raise ValueError(
+            f"{path}: the column map has no dof_pos of {listed(missing)}; it has the joints {listed(columns.joints)}. "
+            "Add them."
+        )
+
+
+def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: ColumnMap, notes: Sequence[str]) -> str:
+    """The message, and a map to correct beside it."""
+    found = any(columns.joints.values())
+    target = _free(Path(f"{log.name.replace(' ', '_')}_map.toml"))
+    known = [f"{key}: {len(channel.time)} values at {channel.rate:.4g} Hz" for key, channel in log.channels.items()]
+    head = (
+        f"Guessed from {path}; correct it and give it with --columns. Missing: {'; '.join(missing)}.",
+        *notes,
+        'Entries: {from = "COLUMN", unit = "deg", sign = -1, offset = 0.1, gear_ratio = 9.0, factor = 1.2}',
+        "The log holds:",
+        *known,
+    )
+    try:
+        if found:
+            write_map(target, columns, head)
+        where = f"What was guessed is in {target}: complete it and give it with --columns {target}."
+        where = where if found else "Write a column map, and give it with --columns."
+    except OSError:
+        where = "Give a column map with --columns:\n" + map_text(columns)
+    return printable(
+        f"{path}: missing {'; '.join(missing)}. The log holds {listed(log.channels, 24)}. {' '.join(notes)} {where}"
+    )
+
+
+def _free(path: Path) -> Path:
+    """A name that no file has."""
+    number = 2
+    free = path
+    while free.exists():
+        free = path.with_stem(f"{path.stem}_{number}")
+        number += 1
+    return free

@@ -1,0 +1,255 @@
+"""CSV with any names, parquet, and LeRobot datasets: columns over a column of time."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pace_optim.recording.keys import listed
+from pace_optim.recording.stamps import seconds_of, unix_unit
+
+from .column_map import ColumnMap
+from .log import Log, cleaned
+from .optional import reader
+from .words import TIME_UNITS, is_time, meaning, time_unit
+
+_FASTEST, _SLOWEST = 5e-5, 0.12
+"""Steps that a log of joints may have [s]."""
+_NANO = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
+
+
+def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
+    """Read a CSV of any names; cells may be empty where a column has no value at an instant.
+
+    Raises:
+        ValueError: If it cannot be read as a table over time.
+    """
+    return [_log(path.stem, path, _csv_columns(path), columns)]
+
+
+def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
+    """Read a parquet file or a LeRobot dataset (a folder with meta/info.json), one log per episode.
+
+    Raises:
+        ValueError: If it cannot be read as a table over time, or the reader is not installed.
+    """
+    parquet = reader("pyarrow.parquet", path)
+    root = path if path.is_dir() else next((p for p in path.parents if (p / "meta" / "info.json").is_file()), None)
+    info = _info(root) if root else {}
+    files = sorted((path / "data").glob("**/*.parquet")) if path.is_dir() else [path]
+    if not files:
+        raise ValueError(
+            f"{path}: holds no data/**/*.parquet. Give the folder of a LeRobot dataset, or a parquet file."
+        )
+    logs: list[Log] = []
+    for file in files:
+        try:
+            table = parquet.read_table(file)
+        except Exception as error:  # pyarrow raises many kinds
+            text = " ".join(str(error).split())[:200]
+            raise ValueError(
+                f"{file}: cannot be read as parquet ({type(error).__name__}: {text}). Copy it again."
+            ) from error
+        every: dict[str, np.ndarray] = {}
+        for name in table.column_names:
+            if not name.startswith("observation.images"):
+                every |= dict(_unfolded(name, table.column(name), _names_of(info, name)))
+        for episode, part in _episodes(every):
+            name = path.stem if episode is None else f"{path.stem} episode {episode}"
+            logs.append(_log(name, path, _with_exact_time(part, info), columns))
+    if len(logs) == 1:
+        logs = [replace(logs[0], name=path.stem)]
+    return logs
+
+
+def _csv_columns(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            head = file.read(65536)
+            file.seek(0)
+            first = head.splitlines()[0] if head.splitlines() else ""
+            marks = max(",;\t", key=first.count)
+            rows = [row for row in csv.reader(file, delimiter=marks) if any(cell.strip() for cell in row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8.") from error
+    if len(rows) < 2:
+        raise ValueError(f"{path}: holds no samples; expected a line of column names, then one line per sample.")
+    header = [cell.strip() for cell in rows[0]]
+    if not all(header):
+        raise ValueError(
+            f"{path}: column {header.index('') + 1} has no name in the header ({listed(h or '?' for h in header)}). "
+            "Name every column."
+        )
+    if repeated := sorted({name for name in header if header.count(name) > 1}):
+        raise ValueError(f"{path}: the column(s) {listed(repeated)} appear twice. Keep one of each.")
+    body = rows[1:]
+    if len(body[-1]) != len(header):
+        body = body[:-1]  # cut short where the logger was stopped
+    for line, row in enumerate(body, start=2):
+        if len(row) != len(header):
+            raise ValueError(f"{path}: row {line} has {len(row)} cells but the header has {len(header)}. Complete it.")
+    comma = marks == ";" and not any("." in cell for row in body[:20] for cell in row)
+    return {name: _cells([row[i].strip() for row in body], comma) for i, name in enumerate(header)}
+
+
+def _cells(cells: Sequence[str], comma: bool) -> np.ndarray:
+    """A column's cells as numbers (NaN where empty), whole numbers exactly, or as text."""
+    if comma:
+        cells = [cell.replace(",", ".") for cell in cells]
+    if all(re.fullmatch(r"-?\d{13,19}", cell) for cell in cells[:50]):
+        with suppress(ValueError, OverflowError):
+            return np.array([int(cell) for cell in cells])
+    words = {"": "nan", "true": "1", "false": "0", "none": "nan", "null": "nan", "na": "nan"}
+    with suppress(ValueError):
+        return np.array([float(words.get(cell.lower(), cell)) for cell in cells])
+    return np.array(cells)
+
+
+def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    """A parquet column as columns of numbers: lists by the names of their items, else by their places."""
+    text = str(column.type)
+    if "list" not in text:
+        if text.startswith(("timestamp", "date")):
+            yield name, column.to_numpy().astype("datetime64[ns]")
+        elif text in ("string", "large_string"):
+            yield name, np.array(["" if cell is None else cell for cell in column.to_pylist()])
+        elif text.startswith(("int", "uint", "float", "double", "bool", "half")):
+            values = column.to_numpy()
+            yield name, values if values.dtype.kind in "iuf" else values.astype(np.float64)
+        return
+    rows = column.to_pylist()
+    length = next((len(row) for row in rows if row is not None), 0)
+    if not length or not isinstance(rows[0], list) or isinstance(rows[0][0], (list, str)):
+        return
+    values = np.array(
+        [row if row is not None and len(row) == length else [np.nan] * length for row in rows], dtype=float
+    )
+    for i in range(length):
+        yield f"{name}[{names[i] if len(names) == length else i}]", values[:, i]
+
+
+def _info(root: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{root / 'meta' / 'info.json'}: cannot be read ({error}). Is this a LeRobot dataset?"
+        ) from None
+    return content if isinstance(content, Mapping) else {}
+
+
+def _names_of(info: Mapping[str, Any], feature: str) -> tuple[str, ...]:
+    """The names of a feature's items: a list, or a list within a dict, as the versions of LeRobot have them."""
+    names: Any = info.get("features", {}).get(feature, {}).get("names")
+    while isinstance(names, Mapping) and names:
+        names = next(iter(names.values()))
+    return tuple(str(name) for name in names) if isinstance(names, list) else ()
+
+
+def _episodes(columns: dict[str, np.ndarray]) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
+    number = columns.get("episode_index")
+    if number is None:
+        yield None, columns
+        return
+    for episode in np.unique(number):
+        at = number == episode
+        yield int(episode), {name: values[at] for name, values in columns.items()}
+
+
+def _with_exact_time(columns: dict[str, np.ndarray], info: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Stamps in float32 that are frame / fps, as such."""
+    fps, frame, stamp = info.get("fps"), columns.get("frame_index"), columns.get("timestamp")
+    if not isinstance(fps, (int, float)) or fps <= 0 or frame is None:
+        return columns
+    exact = frame / fps
+    if stamp is None or (stamp.dtype.kind == "f" and np.abs(stamp - exact).max() < 0.02 / fps):
+        return {**columns, "timestamp": exact}
+    return columns
+
+
+def _log(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> Log:
+    column, unit = _time_column(path, columns, chosen)
+    time, origin, note = _seconds(path, column, columns[column], unit)
+    numbers = {
+        key: values
+        for key, values in columns.items()
+        if key != column and values.dtype.kind in "biuf" and not is_time(key)
+    }
+    channels, notes = cleaned("", time, numbers)
+    return Log(
+        name=name,
+        channels={channel.key: channel for channel in channels},
+        time_origin=origin,
+        notes=(note, *notes),
+    )
+
+
+def _time_column(path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> tuple[str, str]:
+    if chosen and chosen.time:
+        if chosen.time not in columns:
+            raise ValueError(f"{path}: has no column '{chosen.time}' for the time. Columns: {listed(columns)}.")
+        return chosen.time, chosen.time_unit
+    unit = chosen.time_unit if chosen else ""
+    pairs = [name for name in columns if set(re.split(r"[^a-z]+", name.lower())) & _NANO]
+    for nano in pairs:
+        whole = next(
+            (n for n in columns if re.fullmatch(re.sub(r"nano|n(?=secs?$)", "", nano) + r"(onds)?s?", n)), None
+        )
+        if whole and whole != nano:
+            stamp = columns[whole].astype(np.int64) * 1_000_000_000 + columns[nano].astype(np.int64)
+            columns[whole] = stamp
+            return whole, "ns"
+    times = [name for name in columns if is_time(name)]
+    rising = [n for n in times if columns[n].dtype.kind in "UM" or np.mean(np.diff(columns[n].astype(float)) > 0) > 0.5]
+    if not rising:
+        raise ValueError(
+            f"{path}: no column of time found. Columns: {listed(columns)}. Name them time, dof_pos/<joint>, "
+            'des_dof_pos/<joint>, or write a column map: [time] column = "NAME", unit = "s".'
+        )
+    return rising[0], unit or time_unit(rising[0])
+
+
+def _seconds(path: Path, column: str, values: np.ndarray, unit: str) -> tuple[np.ndarray, float, str]:
+    """Stamps [s], Unix time at zero, and a note on what they were taken for."""
+    if values.dtype.kind in "UM":
+        try:
+            time, origin, _ = seconds_of(values)
+        except ValueError as error:
+            raise ValueError(f"{path}: the column '{column}' holds no dates ({error}). Correct it.") from None
+        return time, origin, f"Time is '{column}', dates."
+    if unix := unix_unit(values):
+        time, origin, _ = seconds_of(values)
+        return time, origin, f"Time is '{column}', Unix time in {unix}."
+    if unit:
+        return values * TIME_UNITS[unit], 0.0, f"Time is '{column}' in {unit}."
+    step = np.diff(values.astype(np.float64))
+    median = float(np.median(step[step > 0])) if np.any(step > 0) else 0.0
+    fitting = [u for u, seconds in TIME_UNITS.items() if _FASTEST <= median * seconds <= _SLOWEST]
+    if 0.5 <= median <= 1.5 or not fitting:
+        raise ValueError(
+            f"{path}: '{column}' steps by {median:g}: in s that is {1 / median if median else 0:.3g} Hz, too slow for "
+            "joints; if it is another unit, say so in a column map: [time] unit = "
+            '"ms" (or "us", "ns").'
+        )
+    unit = "s" if "s" in fitting else fitting[0]
+    return (
+        values * TIME_UNITS[unit],
+        0.0,
+        f"Time is '{column}', taken to be in {unit} ({1 / (median * TIME_UNITS[unit]):.4g} Hz).",
+    )
+
+
+def is_joint_table(names: Sequence[str]) -> tuple[bool, bool]:
+    """Whether a table's columns hold measured positions, and whether they hold commands."""
+    found = [meaning(name) for name in names if not is_time(name)]
+    return any(m.quantity == "dof_pos" and not m.commanded for m in found), any(
+        m.quantity and m.commanded for m in found
+    )

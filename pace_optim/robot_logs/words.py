@@ -1,0 +1,160 @@
+"""What a column's name says: which series, which joint, which unit."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+POSITION, VELOCITY, EFFORT = "dof_pos", "dof_vel", "dof_effort"
+
+UNITS: dict[str, dict[str, float]] = {
+    POSITION: {"rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "turn": 2 * np.pi, "m": 1.0, "mm": 1e-3},
+    VELOCITY: {
+        "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "m/s": 1.0, "mm/s": 1e-3,
+    },
+    EFFORT: {"N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3},
+}  # fmt: skip
+"""Units of each quantity, in SI units; currents want a factor [N m/A] too."""
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+CURRENTS = ("A", "mA")
+
+_TIMES = {"t", "time", "timestamp", "timestamps", "stamp", "ts", "clock", "datetime", "date"}
+_COMMAND = {
+    "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets", "goal", "ref",
+    "reference", "setpoint", "set", "action", "actions", "sp", "ctrl", "input", "lowcmd",
+}  # fmt: skip
+_MEASURED = {
+    "meas", "measured", "actual", "act", "present", "current", "feedback", "fb", "obs", "observation", "state",
+    "states", "est", "real", "read", "encoder", "enc", "lowstate", "sensor", "filtered",
+}  # fmt: skip
+_NO_QUANTITY = {
+    "state", "states", "action", "actions", "cmd", "command", "commands", "commanded", "des", "desired", "target",
+    "goal", "ref", "reference", "setpoint", "actual", "measured", "meas", "present", "feedback",
+}  # fmt: skip
+"""Words that are said of positions where no quantity is."""
+_POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular"}
+_VELOCITY = {"vel", "velocity", "velocities", "dq", "qd", "qvel", "speed", "speeds", "omega", "qdot", "rate"}
+_EFFORT = {"effort", "efforts", "torque", "torques", "tau", "trq", "tq", "moment", "ff", "feedforward", "load"}
+_AMPERES = {"amp", "amps", "ampere", "amperes", "iq", "currents"}
+_OTHER = {
+    "error", "err", "errors", "temp", "temperature", "voltage", "volt", "volts", "kp", "kd", "ki", "gain", "gains",
+    "accel", "acc", "acceleration", "accelerations", "ddq", "qdd", "imu", "quat", "quaternion", "gyro", "index",
+    "frame", "episode", "task", "limit", "min", "max", "status", "fault", "mode", "std", "pwm", "power", "id",
+    "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum",
+}  # fmt: skip
+_GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
+_SIDES = {"l": "left", "r": "right"}
+_UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
+    (r"deg(rees?)?[ _]?(/|per)[ _]?s(ec)?|deg_s\b|dps\b|°/s", VELOCITY, "deg/s"),
+    (r"m?rad(ians?)?[ _]?(/|per)[ _]?s(ec)?|rad_s\b", VELOCITY, "rad/s"),
+    (r"\brpm\b", VELOCITY, "rpm"),
+    (r"(rev|turns?)[ _]?(/|per)[ _]?s(ec)?|rps\b", VELOCITY, "turn/s"),
+    (r"\bmn[ _.·*]?m\b", EFFORT, "mN m"),
+    (r"\bn[ _.·*]?m\b", EFFORT, "N m"),
+    (r"\bma\b|milliamps?", EFFORT, "mA"),
+    (r"\bamps?\b|\bamperes?\b|[\[( ]a[\]) ]|[ _]a$", EFFORT, "A"),
+    (r"\bmrad\b", POSITION, "mrad"),
+    (r"\bdeg(rees?)?\b|°", POSITION, "deg"),
+    (r"\brad(ians?)?\b", POSITION, "rad"),
+    (r"\b(turns?|revs?|revolutions?)\b", POSITION, "turn"),
+)
+_UNIT_WORDS = {
+    "deg", "degree", "degrees", "rad", "radian", "radians", "rpm", "nm", "mnm", "n", "m", "s", "ms", "us", "ns",
+    "a", "ma", "turn", "turns", "rev", "dps", "per", "sec", "mrad", "rps",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meaning:
+    """What a name says; "" and () where it says nothing."""
+
+    quantity: str
+    """`dof_pos`, `dof_vel`, `dof_effort`, `torque_enable` or ""."""
+    commanded: bool
+    unit: str
+    joint: tuple[str, ...]
+    """Words of the joint's name."""
+
+
+def words(name: str) -> list[str]:
+    """The words of a name in lower case: ``leftHip_J2`` has left, hip, j, 2."""
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])", " ", name)
+    return [_SIDES.get(word, word) for word in re.split(r"[^a-z0-9°]+", parted.lower()) if word]
+
+
+def joint_words(name: str) -> tuple[str, ...]:
+    """The words that tell a joint from others."""
+    found = tuple(word for word in words(name) if word not in _GENERIC)
+    return found or tuple(words(name))
+
+
+def meaning(name: str, table: str = "") -> Meaning:
+    """What a column's name says.
+
+    Args:
+        name: The column's name.
+        table: What names the topic or file, in which a command may be told.
+    """
+    own, around = words(name), words(table)
+    unit, of_unit = _unit(name)
+    said = set(own)
+    current = (
+        bool(said & _AMPERES)
+        or unit in CURRENTS
+        or ("current" in said and not said & _POSITION and not said & _VELOCITY)
+    )
+    if said & _OTHER:
+        quantity = ""
+    elif said >= {"torque", "enable"} or said & {"enabled", "enable"}:
+        quantity = "torque_enable"
+    elif current or said & _EFFORT:
+        quantity = EFFORT
+    elif said & _VELOCITY:
+        quantity = VELOCITY
+    elif said & _POSITION:
+        quantity = POSITION
+    else:
+        quantity = of_unit or _of_table(said, set(around))
+    commanded = bool((said | set(around)) & _COMMAND) and not (said & _MEASURED - {"current"} and not said & _COMMAND)
+    if quantity == EFFORT and said & {"ff", "feedforward"}:
+        commanded = True
+    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(around)
+    joint = tuple(word for word in own if word not in spoken)
+    if not unit and current and quantity == EFFORT:
+        unit = "A"
+    return Meaning(quantity=quantity, commanded=commanded, unit=unit if of_unit in ("", quantity) else "", joint=joint)
+
+
+def is_time(name: str) -> bool:
+    """Whether a column is called as time is."""
+    own = set(words(name)) - _UNIT_WORDS
+    return bool(own & _TIMES) and not own - _TIMES - {"header", "ros", "log", "unix", "epoch", "since", "start", "utc"}
+
+
+def time_unit(name: str) -> str:
+    """The unit that a column of time states, or ""."""
+    found = [
+        word for word in words(name) if word in (*TIME_UNITS, "sec", "secs", "seconds", "milliseconds", "nanoseconds")
+    ]
+    spelt = {"sec": "s", "secs": "s", "seconds": "s", "milliseconds": "ms", "nanoseconds": "ns"}
+    return spelt.get(found[-1], found[-1]) if found else ""
+
+
+def _of_table(said: set[str], around: set[str]) -> str:
+    every = said | around
+    for quantity, names in ((EFFORT, _EFFORT), (VELOCITY, _VELOCITY), (POSITION, _POSITION)):
+        if every & names:
+            return quantity
+    return POSITION if every & _NO_QUANTITY else ""
+
+
+def _unit(name: str) -> tuple[str, str]:
+    """Unit and the quantity that it is of."""
+    text = re.sub(r"[_.]", " ", name.lower()) + " "
+    for source in (name.lower(), text):
+        for pattern, quantity, unit in _UNIT_PATTERNS:
+            if re.search(pattern, source.strip() if pattern.endswith("$") else source):
+                return unit, quantity
+    return "", ""
