@@ -108,6 +108,13 @@ class Articulation:
         """Whether the base is held in place."""
         return self._layout.root is None
 
+    @property
+    def slide_joints(self) -> tuple[str, ...]:
+        """Those of the joints that slide."""
+        model = self._sim.model
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        return tuple(name for name in self.joint_names if int(model.joint(name).type[0]) == slide)
+
     def find_joints(
         self, name_keys: str | Sequence[str], *, preserve_order: bool = False
     ) -> tuple[list[int], list[str]]:

@@ -181,7 +181,7 @@ class Simulation:
         self.expand("dof_damping")[:, columns] = viscous
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What hinge joints carry, as it was computed last, (num_envs, len(columns)) each.
+        """What joints carry, as it was computed last, (num_envs, len(columns)) each; gravity pulls no slide back.
 
         Args:
             columns: Their degrees of freedom.
@@ -200,7 +200,8 @@ class Simulation:
         axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
         weight = self.expand("body_subtreemass")[:, bodies, None] * gravity
         turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
-        return inertia, -(axis * turned).sum(dim=-1), inertia * self._stands_alone[columns]
+        turns = torch.as_tensor(self.model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
+        return inertia, -(axis * turned).sum(dim=-1) * turns, inertia * self._stands_alone[columns]
 
     def _link_place(self, columns: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Where the fields of degrees of freedom are: entries of M, joints, bodies, and gravity; looked up once."""
@@ -308,6 +309,8 @@ class Simulation:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if not self.cfg.contacts:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        for body in spec.bodies[1:]:
+            body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
         timeconst = 2 * self.cfg.dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
         impedance = self.cfg.friction_impedance
         for joint in spec.joints:

@@ -1,11 +1,16 @@
 """Closed chains: passive joints start where the loops close."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
+from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.loop_check import refuse_open_loops
+from pace_optim.recording import Recording
 
 FOUR_BAR = """
 <mujoco model="four_bar">
@@ -63,3 +68,38 @@ def test_the_assembly_is_the_one_that_the_model_or_the_configuration_has(four_ba
     assert other.scene["robot"].closed_loops.gap(other.sim.qpos[0].numpy())[0] < 1e-8
     assert (other.sim.qpos[0, 1:] - own[1:]).abs().min() > 0.3
     other.close()
+
+
+def test_a_loop_that_no_bias_closes_is_refused_with_its_distance(tmp_path):
+    path = tmp_path / "short.xml"
+    path.write_text(FOUR_BAR.replace("0 0 0 0.2 0 0", "0 0 0 0.12 0 0").replace('"tip" pos="0.2', '"tip" pos="0.12'))
+    env = ManagerBasedRLEnv(cfg_from_model(path))
+    good = Recording(
+        name="reach", joint_names=("crank",), time=np.arange(30) / 400, dof_pos=np.full((30, 1), 0.8),
+        des_dof_pos=np.full((30, 1), 0.8),
+    )  # fmt: skip
+    refuse_open_loops(env, [good])
+    far = dataclasses.replace(good, dof_pos=np.full((30, 1), -1.57))
+    with pytest.raises(ValueError, match=r"reach: .*\(connect of tip and end\) is open by 0\.0"):
+        refuse_open_loops(env, [far])
+    env.close()
+
+
+TWO_ARMS = """
+<mujoco><default><geom size="0.02"/></default><worldbody>{bodies}</worldbody>
+  <equality><joint joint1="a1" joint2="a0"/><joint joint1="b0" joint2="c0"/></equality></mujoco>
+""".format(
+    bodies="".join(
+        f'<body pos="{i} 0 0"><joint name="{arm}0"/><geom pos="0.1 0 0"/>'
+        f'<body pos="0.2 0 0"><joint name="{arm}1" axis="0 1 0"/><geom pos="0.1 0 0"/></body></body>'
+        for i, arm in enumerate("abc")
+    )
+)
+
+
+def test_constraints_couple_the_trees_that_they_tie_and_no_others(tmp_path):
+    path = tmp_path / "arms.xml"
+    path.write_text(TWO_ARMS)
+    env = ManagerBasedRLEnv(cfg_from_model(path))
+    assert independent_trees(env) == [["a0"], ["b1", "c0", "c1"]]  # a1 and b0 follow
+    env.close()

@@ -1,11 +1,15 @@
 """A configuration from a model file alone."""
 
+import importlib.util
+import sys
+
 import mujoco
 import pytest
 import torch
 
-from pace_envs import ManagerBasedRLEnv
+from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
+from pace_optim.commands.new_robot import main as new_robot
 
 ARM = """
 <mujoco model="two link arm">
@@ -189,3 +193,24 @@ def test_missing_meshes_and_pictures_are_left_out_and_inertias_kept(tmp_path):
     env = made(cfg)
     assert env.sim.model.body(1).mass[0] == 0.3
     env.close()
+
+
+def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, monkeypatch, capsys):
+    (tmp_path / "robot.xml").write_text(ARM)
+    output = tmp_path / "conf" / "my_arm.py"
+    monkeypatch.setattr(sys, "argv", ["new_robot", str(tmp_path / "robot.xml"), "--output", str(output)])
+    new_robot()
+    task = capsys.readouterr().out.split(f"{output}:")[1].split()[0]
+    spec = importlib.util.spec_from_file_location("my_arm_of_a_test", output)
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml")
+    assert written.sim2real.joint_order == own.sim2real.joint_order
+    torch.testing.assert_close(written.sim2real.bounds_params, own.sim2real.bounds_params, rtol=1e-4, atol=1e-9)
+    for field in ("stiffness", "damping", "effort_limit", "implicit", "control_decimation"):
+        assert getattr(drive_of(written), field) == getattr(drive_of(own), field)
+    assert (written.sim.dt, written.decimation, written.sim.gravity) == (own.sim.dt, own.decimation, own.sim.gravity)
+    env = made(written)
+    assert env.scene["robot"].data.default_joint_pos[0].tolist() == [-0.7, 0.4, 0.02]
+    env.close()
+    with pytest.raises(ValueError, match="exists"):
+        new_robot()

@@ -75,6 +75,7 @@ class TorqueRipple(Effect):
 
     name = "torque_ripple"
     stage = "drive"
+    joint_types = ("hinge",)
     parameters = (
         EffectParameter(name="sine", unit="N m", lower=-3.0, upper=3.0, null=0.0, start=0.1),
         EffectParameter(name="cosine", unit="N m", lower=-3.0, upper=3.0, null=0.0, start=0.0),

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 
+from pace_actuators.joint_units import JOINT_TYPES, JointType
+
 if TYPE_CHECKING:
     from pace_actuators.effects.drive_state import DriveState
 
@@ -92,6 +94,8 @@ class Effect:
     """Where on the drive's path it acts."""
     parameters: ClassVar[tuple[EffectParameter, ...]]
     """Its numbers."""
+    joint_types: ClassVar[tuple[JointType, ...]] = JOINT_TYPES
+    """Joints on which it means something: ``"hinge"``, ``"slide"`` or both. It is not tried on others."""
     equation: ClassVar[str] = ""
     """Its equation, as text."""
     looks: ClassVar[str] = ""

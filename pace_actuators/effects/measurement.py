@@ -39,6 +39,7 @@ class EncoderEccentricity(Effect):
 
     name = "encoder_eccentricity"
     stage = "measurement"
+    joint_types = ("hinge",)
     parameters = (
         EffectParameter(name="sine", unit="rad", lower=-0.05, upper=0.05, null=0.0, start=0.0005),
         EffectParameter(name="cosine", unit="rad", lower=-0.05, upper=0.05, null=0.0, start=0.0),

@@ -53,6 +53,7 @@ class ComOffset(Effect):
 
     name = "com_offset"
     stage = "model"
+    joint_types = ("hinge",)
     parameters = (EffectParameter(name="angle", unit="rad", lower=-0.3, upper=0.3, null=0.0, start=0.01),)
     equation = "centre of mass turned about the joint's axis by α"
     looks = "a lean that depends on the pose"

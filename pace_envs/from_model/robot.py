@@ -17,7 +17,7 @@ from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
-from pace_envs.from_model.scaling import base_bounds, gains, motion, sample_values
+from pace_envs.from_model.scaling import base_bounds, gains, motion, runs_continuously, sample_values
 from pace_envs.model_file import ModelFile, read_model_file
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -72,7 +72,7 @@ def read_robot(path: str | Path) -> Robot:
         name=_folder_name(file),
         joints=tuple(joints),
         home=home,
-        notes=(*file.notes, *notes, *_assumptions(joints, key, model)),
+        notes=(*file.notes, *notes, *_assumptions(joints, key, model), _loop_note(joints, model)),
     )
 
 
@@ -92,10 +92,12 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     robot = read_robot(path)
     joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
     position, orientation = _base_pose(robot)
+    continuous = runs_continuously(joints, robot.model)
+    steps = 1 if continuous else defaults.STEPS_OF_A_HELD_TORQUE
     articulation = ArticulationCfg(
         mjcf_path=Path(path),
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
-        actuators={"drives": _drive_cfg(joints)},
+        actuators={"drives": _drive_cfg(joints, continuous=continuous, steps=steps)},
         joint_order=names,
     )
     rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
@@ -103,7 +105,8 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
-        sim=SimulationCfg(dt=defaults.CONTROL_DT, gravity=_gravity(robot.model)),
+        sim=SimulationCfg(dt=defaults.CONTROL_DT / steps, gravity=_gravity(robot.model)),
+        decimation=steps,
         sim2real=PaceCfg(
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",
@@ -115,12 +118,13 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
                 scale=tuple(amplitude for _, amplitude in moves),
             ),
             sample_params={**samples, "delay": 2.0},
+            slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
             notes=robot.notes,
         ),
     )
 
 
-def _drive_cfg(joints: Sequence[JointFacts]) -> PaceDCMotorCfg:
+def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool, steps: int) -> PaceDCMotorCfg:
     pairs = [gains(joint) for joint in joints]
     limits = [joint.effort_limit for joint in joints]
     speeds = [joint.velocity_limit for joint in joints]
@@ -131,7 +135,8 @@ def _drive_cfg(joints: Sequence[JointFacts]) -> PaceDCMotorCfg:
         effort_limit=limits if np.isfinite(limits).any() else None,
         velocity_limit=speeds if np.isfinite(speeds).any() else None,
         max_delay=_longest_delay(),
-        implicit=any(joint.drive is not None for joint in joints),
+        implicit=continuous,
+        control_decimation=steps,
     )
 
 
@@ -193,6 +198,12 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) 
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
         notes.append("the base is held in the air, and nothing touches")
     return notes
+
+
+def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel) -> str:
+    if runs_continuously(joints, model):
+        return "the drives' loops run continuously, as MuJoCo holds the file's gains"
+    return "the drives' loops run at the control rate and hold their torque; drive_dt or implicit in a configuration"
 
 
 def _folder_name(file: ModelFile) -> str:

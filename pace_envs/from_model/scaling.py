@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
 from pace_envs.from_model import defaults
@@ -39,6 +41,23 @@ def gains(joint: JointFacts) -> tuple[float, float]:
     if joint.command == "effort":
         return 0.0, 0.0
     return (0.0 if joint.command == "velocity" else stiffness), damping
+
+
+def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel) -> bool:
+    """Whether the drives' loops are those of the file's actuators, which MuJoCo evaluates at every step.
+
+    Loops are held at the control rate, as in PACE, where the file has no gains, or gains with a damping that is stable
+    there and that the file's own integrator treats explicitly too.
+    """
+    if any(joint.drive is None for joint in joints):
+        return False
+    implicit = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    if int(model.opt.integrator) in implicit or not any(gains(joint)[1] for joint in joints):
+        return True
+    dt = defaults.CONTROL_DT
+    return any(
+        gains(joint)[1] * dt + 0.5 * gains(joint)[0] * dt**2 > joint.inertia + joint.armature for joint in joints
+    )
 
 
 def base_bounds(joint: JointFacts) -> dict[str, Bounds]:

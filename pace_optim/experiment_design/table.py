@@ -17,7 +17,7 @@ def design_table(design: Design) -> str:
     own = [p for p in space.parameters if not p.shared]
     joints = design.trajectory.joint_names
     width = max(len(joint) for joint in [*joints, "joint"])
-    titles = [f"{p.name} [{p.unit}]" for p in own]
+    titles = [f"{p.name} [{' or '.join(dict.fromkeys(p.units or (p.unit,)))}]" for p in own]
     columns = [max(len(title), 19) for title in titles]
     lines = [
         f"expected error bars (one standard deviation) for encoder noise of {design.noise:g} rad: "

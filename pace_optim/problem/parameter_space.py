@@ -77,9 +77,18 @@ class ParameterSpace:
         return x
 
     @property
-    def units(self) -> dict[str, str]:
-        """Unit of each parameter, by name."""
-        return {parameter.name: parameter.unit for parameter in self.parameters}
+    def units(self) -> dict[str, str | dict[str, str]]:
+        """Unit of each parameter, by name; where hinges and slides have it, the unit of each key."""
+        result: dict[str, str | dict[str, str]] = {}
+        for p in self.parameters:
+            each = {key: p.unit_of(key) for key in p.keys}
+            alike = set(each.values())
+            result[p.name] = alike.pop() if len(alike) == 1 else each or p.unit
+        return result
+
+    def unit_of(self, name: str, key: str) -> str:
+        """Unit of a parameter of a joint, or of all (``"all"``)."""
+        return next(p for p in self.parameters if p.name == name).unit_of(key)
 
     def __getitem__(self, name: str) -> slice:
         """Where a parameter's entries are."""

@@ -17,6 +17,7 @@ from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.problem.drive_steps import check_loops, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all
 from pace_optim.recording import Recording
@@ -150,8 +151,10 @@ def load_problem(
     physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
+    plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
     recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
+    refuse_open_loops(env, [*recordings, *held_out])
     recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     problem = Problem(
         task=task,

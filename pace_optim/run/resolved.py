@@ -28,7 +28,7 @@ def resolved(problem: Problem) -> dict[str, Any]:
     return {
         "configuration": as_data(problem.env_cfg),
         "parameters": {
-            label: {"unit": _unit(space.units, label), "lower": low, "upper": high}
+            label: {"unit": space.unit_of(*label.split("/", 1)), "lower": low, "upper": high}
             for label, low, high in zip(space.labels, space.lower.tolist(), space.upper.tolist(), strict=True)
         },
         "effects": [
@@ -109,10 +109,6 @@ def write_model(problem: Problem, path: Path) -> None:
 
 def _bounds(cfg: Any) -> list[Any]:
     return list(cfg.effect_class.parameters)
-
-
-def _unit(units: Mapping[str, str], label: str) -> str:
-    return units.get(label.rpartition("/")[0] or label, "")
 
 
 def _name(value: Any) -> str:

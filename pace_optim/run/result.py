@@ -13,6 +13,7 @@ from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.drive_result import ALL, CURE, DriveResult
 from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.joint_units import JointType
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -25,7 +26,7 @@ class FitResult(DriveResult):
 
     robot_name: str
     std: dict[str, dict[str, float | None]]
-    units: dict[str, str]
+    units: dict[str, Any]
     at_bound: list[str]
     no_influence: list[str]
     indistinguishable: list[list[str]]
@@ -75,6 +76,15 @@ class FitResult(DriveResult):
     def save(self, path: Path) -> None:
         """Write the file atomically."""
         write_json(path, asdict(self))
+
+    def unit_of(self, name: str, key: str) -> str:
+        """The unit of a parameter of a joint, or of all joints (``"all"``)."""
+        unit = self.units.get(name, "")
+        return unit if isinstance(unit, str) else unit.get(key, "")
+
+    def joint_type(self, joint: str) -> JointType:
+        """Whether a joint turns or slides."""
+        return "slide" if self.unit_of("encoder_bias", joint) == "m" else "hinge"
 
 
 def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[str, ...]) -> dict[str, float]:

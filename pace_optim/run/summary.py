@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pace_actuators.joint_units import JOINT_TYPES, JointType, in_slide_units, unit_for
 from pace_optim.run.result import FitResult
 
 
@@ -9,28 +10,40 @@ def summary(result: FitResult) -> str:
     """The table of parameters with error bars, the errors and the warnings."""
     names = [name for name, values in result.parameters.items() if set(values) != {"all"}]
     width = max(len(joint) for joint in [*result.joint_names, "joint"])
-    columns = [f"{name} [{result.units[name]}]" for name in names]
-    lines = ["  ".join(["joint".ljust(width), *(c.rjust(26) for c in columns), "train / validation [mrad]".rjust(26)])]
-    for joint in result.joint_names:
-        cells = [_value(result, name, joint).rjust(26) for name in names]
-        lines.append("  ".join([joint.ljust(width), *cells, _errors(result, joint).rjust(26)]))
-    lines.append("")
+    lines: list[str] = []
+    for joint_type in JOINT_TYPES:
+        joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
+        lines += _table(result, names, joints, joint_type, width)
+    whole = in_slide_units if all(result.joint_type(joint) == "slide" for joint in result.joint_names) else str
     for name, values in result.parameters.items():
         if set(values) == {"all"}:
-            text = f"{name}: {_value(result, name, 'all')} {result.units[name]}"
+            text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
             if name == "delay":
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
-    lines.append(
-        f"error, all joints: {_errors(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
-    )
+    error = f"error, all joints: {_errors(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
+    lines.append(whole(error))
     lines.append(
         f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s; "
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
-    lines += [f"note: {note}" for note in result.notes]
-    lines += [f"warning: {warning}" for warning in result.warnings]
+    lines += [f"note: {whole(note)}" for note in result.notes]
+    lines += [f"warning: {whole(warning)}" for warning in result.warnings]
     return "\n".join(lines)
+
+
+def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:
+    """The joints of one type, a line each, under a head with their units."""
+    if not joints:
+        return []
+    names = [name for name in names if set(joints) & set(result.parameters[name])]
+    unit = {name: next(result.unit_of(name, j) for j in joints if j in result.parameters[name]) for name in names}
+    columns = [f"{name} [{unit[name]}]".rjust(26) for name in names]
+    lines = ["  ".join(["joint".ljust(width), *columns, unit_for("train / validation [mrad]", joint_type).rjust(26)])]
+    for joint in joints:
+        cells = [_value(result, name, joint).rjust(26) for name in names]
+        lines.append("  ".join([joint.ljust(width), *cells, _errors(result, joint).rjust(26)]))
+    return [*lines, ""]
 
 
 def _value(result: FitResult, name: str, key: str) -> str:

@@ -109,18 +109,20 @@ def _fit_from(problem: Problem, x: torch.Tensor) -> _Fit:
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
     """One sentence per parameter that a recording sees otherwise than the others do."""
     width = (space.upper - space.lower).numpy()
-    found: dict[tuple[str, str], list[str]] = {}
+    found: dict[tuple[str, str, str], list[str]] = {}
     for i, label in enumerate(space.labels):
         odd = _odd_one_out(values[:, i], std[:, i], _SMALLEST_PART * float(width[i]))
         if odd is not None:
             r, mean, error = odd
-            name, key = label.split("/")
+            name, key = label.split("/", 1)
             text = f"{values[r, i]:.4g} ± {std[r, i]:.1g} against {mean:.4g} ± {error:.1g}"
-            found.setdefault((name, names[r]), []).append(text if key == GLOBAL else f"{key} {text}")
+            found.setdefault((name, space.unit_of(name, key), names[r]), []).append(
+                text if key == GLOBAL else f"{key} {text}"
+            )
     return [
-        f"{name.replace('_', ' ')} [{space.units[name]}] is another in {recording} than in the other recordings: "
+        f"{name.replace('_', ' ')} [{unit}] is another in {recording} than in the other recordings: "
         f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}."
-        for (name, recording), places in found.items()
+        for (name, unit, recording), places in found.items()
     ]
 
 

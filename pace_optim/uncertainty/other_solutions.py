@@ -39,6 +39,6 @@ def with_other_solutions(uncertainty: Uncertainty, descents: Sequence[Descent], 
         apart = np.flatnonzero((difference > 2 * _APART) & (difference > _APART_STD * std))
         by_key: dict[str, list[str]] = {}
         for i in apart.tolist():
-            by_key.setdefault(space.labels[i].split("/")[1], []).append(space.labels[i])
+            by_key.setdefault(space.labels[i].split("/", 1)[1], []).append(space.labels[i])
         groups += [tuple(labels) for labels in by_key.values() if len(labels) > 1 and tuple(labels) not in groups]
     return replace(uncertainty, indistinguishable=tuple(groups))

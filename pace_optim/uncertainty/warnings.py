@@ -62,7 +62,7 @@ def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
     """One sentence for each kind of parameters that cannot be told apart, with the joints."""
     kinds: dict[tuple[str, ...], list[str]] = {}
     for group in groups:
-        keys = {label.split("/")[1] for label in group} - {GLOBAL}
+        keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
     return [
@@ -131,11 +131,11 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
     places: dict[tuple[str, str, float], list[str]] = {}
     for label in uncertainty.at_bound:
         i = space.labels.index(label)
-        name, key = label.split("/")
+        name, key = label.split("/", 1)
         side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
         places.setdefault((name, side, bound), []).append(key)
     return [
-        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.units[name]})"
+        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.unit_of(name, keys[0])})"
         + _of(keys).replace(" of ", " on ", 1)
         + ": widen the bound, or physics is missing that this parameter stands in for."
         for (name, side, bound), keys in places.items()
@@ -145,10 +145,10 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
 def in_words(labels: tuple[str, ...]) -> str:
     """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
     names = [label.split("/")[0].replace("_", " ") for label in labels]
-    keys = {label.split("/")[1] for label in labels} - {"all"}
+    keys = {label.split("/", 1)[1] for label in labels} - {"all"}
     if len(keys) == 1:
         return f"{_listed(names)} of {keys.pop()}"
-    return _listed([f"{name} of {label.split('/')[1]}" for name, label in zip(names, labels, strict=True)])
+    return _listed([f"{name} of {label.split('/', 1)[1]}" for name, label in zip(names, labels, strict=True)])
 
 
 def _listed(words: list[str]) -> str:

@@ -88,6 +88,9 @@ class PaceCfg:
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
+    slide_joints: tuple[str, ...] = ()
+    """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
+
     notes: tuple[str, ...] = ()
     """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
 

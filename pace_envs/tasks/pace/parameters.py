@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from pace_actuators.effects import effect_cfgs
+from pace_actuators.joint_units import JointType, unit_for
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 
 if TYPE_CHECKING:
@@ -56,8 +57,15 @@ class Parameter:
     start: float | None = None
     """Where a search starts; ``None``: in the middle of the bounds, on the parameter's scale."""
 
+    units: tuple[str, ...] | None = None
+    """Unit of each key, where they differ from ``unit``."""
+
     per_joint_copies: bool = False
     """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
+
+    def unit_of(self, key: str) -> str:
+        """The unit of one of its keys."""
+        return self.unit if self.units is None else self.units[self.keys.index(key)]
 
     @property
     def shared(self) -> bool:
@@ -100,6 +108,7 @@ def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             upper=tuple(bounds[i * n : (i + 1) * n, 1].tolist()),
             apply=apply[name],
             keys=joints,
+            units=_units(UNITS[name], joints, cfg),
         )
         for i, name in enumerate(PARAMETER_GROUPS)
     ]
@@ -123,7 +132,7 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     for effect in effect_cfgs(cfg.effects):
         if effect.env_rows is not None:  # only tried, side by side with others
             continue
-        own = tuple(effect.joints(joints))
+        own = tuple(joint for joint in effect.joints(joints) if _type(joint, cfg) in effect.effect_class.joint_types)
         ids = [joints.index(joint) for joint in own]
         kind = effect.effect_class
         for parameter in kind.parameters:
@@ -139,9 +148,19 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
                     keys=keys,
                     scale=parameter.scale,
                     start=parameter.start,
+                    units=_units(parameter.unit, own if effect.shared else keys, cfg)[: len(keys)],
                 )
             )
     return tuple(result)
+
+
+def _type(joint: str, cfg: PaceCfg) -> JointType:
+    return "slide" if joint in cfg.slide_joints else "hinge"
+
+
+def _units(unit: str, joints: Sequence[str], cfg: PaceCfg) -> tuple[str, ...]:
+    """A hinge's unit for each of some joints."""
+    return tuple(unit_for(unit, _type(joint, cfg)) for joint in joints)
 
 
 def _apply_effect(

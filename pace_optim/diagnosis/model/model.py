@@ -30,6 +30,8 @@ class JointModel:
     """(n, P), physical."""
     log: torch.Tensor
     """Which entries have a logarithmic scale, (P,) bool."""
+    slides: torch.Tensor
+    """Which joints slide, (n,) bool: effects that mean nothing there are not tried."""
     barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
     """Effects that some joints cannot get, (n,) bool."""
     shared: frozenset[type[Effect]] = frozenset()
@@ -47,6 +49,7 @@ class JointModel:
             lower=torch.stack(lower, dim=1),
             upper=torch.stack(upper, dim=1),
             log=torch.zeros(len(BASE), dtype=torch.bool),
+            slides=torch.tensor([joint in problem.env_cfg.sim2real.slide_joints for joint in problem.joint_names]),
         )
 
     @property
@@ -90,6 +93,7 @@ class JointModel:
             lower=self.lower[joints][:, entries],
             upper=self.upper[joints][:, entries],
             log=self.log[entries],
+            slides=self.slides[joints],
             barred={effect: barred[joints] for effect, barred in self.barred.items()},
         )
         return model, entries
@@ -194,6 +198,9 @@ class JointModel:
         for other, has in zip(self.effects, self.has, strict=True):
             if other is effect or (other.parts_motor_and_link and effect.parts_motor_and_link):
                 excluded |= has
+        for joint_type, those in (("slide", self.slides), ("hinge", ~self.slides)):
+            if joint_type not in effect.joint_types:
+                excluded |= those
         return ~excluded
 
     def at_bounds(self, x: torch.Tensor) -> torch.Tensor:

@@ -60,5 +60,6 @@ def _plot(run: RunData, content: dict, number: int, name: str) -> str:
         )
     ticks = {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if key == "all" else key for key in keys]}
     layout = {"xaxis": {"range": [-0.5, len(keys) - 0.5], "zeroline": False} | ticks, "showlegend": True}
-    heading = f"<h3>{esc(in_words(name))} <small>{esc(pretty_unit(run.result.units.get(name, '')))}</small></h3>"
+    unit = " or ".join(dict.fromkeys(pretty_unit(run.result.unit_of(name, key)) for key in keys))
+    heading = f"<h3>{esc(in_words(name))} <small>{esc(unit)}</small></h3>"
     return heading + figure(f"consistency-{number}", data, layout, height=240)

@@ -19,7 +19,9 @@ def parameters(run: RunData) -> Section:
     shared = [name for name, values in result.parameters.items() if set(values) == {"all"}]
     cards = [_card(run, name) for name in result.parameters if name not in shared]
     if shared:
-        rows = [_row(run, name, "all", in_words(name), pretty_unit(result.units[name]), None) for name in shared]
+        rows = [
+            _row(run, name, "all", in_words(name), pretty_unit(result.unit_of(name, "all")), None) for name in shared
+        ]
         note = (
             f"<p>The delay is that of the <b>{esc(result.delay_mode)}</b>: "
             f"{1e3 * result.delay_s:.4g} ms at a control step of {1e3 * result.control_dt:g} ms.</p>"
@@ -42,11 +44,14 @@ def _card(run: RunData, name: str) -> str:
     values, std = run.result.parameters[name], run.result.std.get(name, {})
     ends = [v + side * _CONFIDENCE * (std.get(key) or 0.0) for key, v in values.items() for side in (-1, 1)]
     low, high = _padded(min(ends), max(ends), run, name)
-    rows = [_row(run, name, key, key, "", (low, high)) for key in values]
+    unit = " or ".join(pretty_unit(u) for u in dict.fromkeys(run.result.unit_of(name, key) for key in values))
+    mixed = " or " in unit
+    titles = {key: f"{key} [{pretty_unit(run.result.unit_of(name, key))}]" if mixed else key for key in values}
+    rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
     head = ["joint", "value", "± std", "value and 95 % interval", "between its bounds", ""]
-    unit = pretty_unit(run.result.units.get(name, ""))
-    return f"<article><h3>{esc(in_words(name))} <small>{esc(unit)}</small></h3>{table(head, rows, 'values')}</article>"
+    small = f"<small>{esc(unit)}</small>"
+    return f"<article><h3>{esc(in_words(name))} {small}</h3>{table(head, rows, 'values')}</article>"
 
 
 def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, float]:

@@ -1,0 +1,28 @@
+"""Write a robot's configuration, to be edited, from its model file."""
+
+from pathlib import Path
+
+from pace_envs.from_model.writing import configuration_text
+from pace_optim.terminal.cli import make_parser
+
+
+def main() -> None:
+    """Read the model file, write the configuration."""
+    parser = make_parser(
+        "Write the configuration that a model file (MJCF or URDF) stands for as a short Python file to edit.",
+        example="scripts/new_robot.py robot.urdf --output my_robot.py",
+    )
+    parser.add_argument("model", metavar="MODEL", help="model file, .xml or .urdf")
+    parser.add_argument("--output", required=True, type=Path, metavar="FILE.py", help="Python file to write")
+    args = parser.parse_args()
+    if args.output.suffix != ".py" or not args.output.stem.isidentifier():
+        raise ValueError(f"--output {args.output}: expected a name that Python can import, such as my_robot.py.")
+    if args.output.exists():
+        raise ValueError(f"{args.output} exists and may hold your edits. Choose another --output, or delete it.")
+    text, task, cfg = configuration_text(args.model, args.output)
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    args.output.write_text(text, encoding="utf-8")
+    for note in cfg.sim2real.notes:
+        print(f"note: {note}")
+    print(f"{len(cfg.sim2real.joint_order)} joints, task {args.output}:{task}")
+    print(f"configuration: {args.output}")
