@@ -13,6 +13,7 @@ import torch
 from pace_actuators.effects import effect_modules
 from pace_envs import load_env_cfg
 from pace_envs.task_source import EnvironmentRecord
+from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
@@ -382,6 +383,8 @@ class _Fit:
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
         rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
         self.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
+        bias = physical[space["encoder_bias"]].numpy()
+        self.folder.write_json("drives.json", drive_loads(problem, self.assessor, bias))
         score = float(every.error[0].square()[where["train"]].sum(dim=1).mean())
         consistency = self._check_consistency(outcome, score)
         result = make_result(

@@ -326,3 +326,8 @@ def test_the_load_torque_of_a_pendulum_is_its_equation():
 def test_no_module_of_the_comparison_is_long():
     folder = Path(__file__).parents[1] / "pace_optim" / "comparison"
     assert all(len(path.read_text().splitlines()) < 300 for path in folder.glob("*.py"))
+
+
+def test_a_joint_that_never_turns_round_has_no_reversal():
+    motion = motion_of(np.linspace(0.0, 1.0, 400), DT, 1e-5)
+    assert np.isinf(motion.since_reversal).all() and (motion.direction == 1).all()

@@ -11,6 +11,7 @@ from problems import BENCH, CALM, TRUTH, chirp, make_problem, physical, record
 from run_folders import make_result
 
 from pace_actuators import IdentifiedDrives
+from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.export import FORMATS
 from pace_optim.fit import fit
 from pace_optim.optimizers.least_squares import LeastSquaresCfg
@@ -119,3 +120,19 @@ def test_least_squares_in_a_wrong_valley_is_not_converged(tmp_path):
     assert "converged" not in result.stop_reasons and "times the noise" in result.stop_reasons[-1]
     assert "times the measurement noise" in result.warnings[0]
     assert "± ?" in summary(result)
+
+
+def test_what_is_asked_of_a_drive_and_what_gravity_takes_are_told():
+    recording = record(chirp(1.0), CALM)
+    problem = make_problem(recording)
+    (told,) = drive_loads(problem, problem.evaluator(), np.zeros(1))
+    servo = told["joints"]["servo"]
+    kp, kd = servo["stiffness"], servo["damping"]
+    speed = np.gradient(recording.dof_pos[:, 0], recording.time)
+    offset = (problem.dataset.recordings[0].command - problem.dataset.recordings[0].dof_pos)[:, 0]
+    assert servo["asked_peak"] == pytest.approx(np.abs(kp * offset - kd * speed).max(), rel=0.05)
+    largest = np.abs(np.sin(recording.dof_pos)).max()
+    assert servo["gravity_peak"] == pytest.approx(9.81 * 0.2 * largest, rel=0.02)
+    assert servo["asked_rms"] < servo["asked_peak"] and servo["speed_peak"] == pytest.approx(
+        np.abs(speed).max(), rel=0.1
+    )

@@ -33,12 +33,12 @@ def load_torques(evaluator: Evaluator, encoder_bias: np.ndarray) -> list[np.ndar
     joints = rollout.robot.joint_names
     result = []
     for r, recording in enumerate(rollout.dataset.recordings):
-        model = _model_of(rollout.env, r)
+        model = model_of(rollout.env, r)
         dt = float(recording.time[1] - recording.time[0])
         position = smoothed(recording.dof_pos, dt) + encoder_bias
         speed = np.gradient(position, dt, axis=0)
         acceleration = np.gradient(speed, dt, axis=0)
-        result.append(_inverse(model, joints, position, speed, acceleration))
+        result.append(inverse_dynamics(model, joints, position, speed, acceleration))
     return result
 
 
@@ -50,7 +50,7 @@ def smoothed(position: np.ndarray, dt: float) -> np.ndarray:
     return signal.sosfiltfilt(filter_, position, axis=0, padlen=min(len(position) - 1, round(3 / (cutoff * dt))))
 
 
-def _model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
+def model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
     """One environment's model, with drives that neither weigh nor rub."""
     model = copy.deepcopy(env.sim.model)
     for name in _MODEL_FIELDS:
@@ -60,9 +60,10 @@ def _model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
     return model
 
 
-def _inverse(
+def inverse_dynamics(
     model: mujoco.MjModel, joints: Sequence[str], position: np.ndarray, speed: np.ndarray, acceleration: np.ndarray
 ) -> np.ndarray:
+    """Torques of some joints that make a model move as given, (K, n) [N m]; positions, speeds and so on (K, n)."""
     data = mujoco.MjData(model)
     qpos = [model.joint(name).qposadr[0] for name in joints]
     dof = [model.joint(name).dofadr[0] for name in joints]

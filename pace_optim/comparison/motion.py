@@ -74,6 +74,6 @@ def _reversals(speed: np.ndarray, standstill: float, dt: float) -> tuple[np.ndar
     for turn, i in zip(turns, np.flatnonzero(np.diff(direction)) + 1, strict=True):
         direction[turn:i] = direction[i]
     since = np.full(len(speed), np.inf)
-    for turn, following in zip(turns, [*turns[1:], len(speed)], strict=True):
+    for turn, following in zip(turns, [*turns, len(speed)][1:], strict=True):
         since[turn:following] = dt * np.arange(following - turn)
     return direction, since

@@ -28,6 +28,7 @@ _README = """Identification of {robot} with {task}, started {started}.
 result.json          parameters, error bars, errors and warnings
 report.html          the same to look at
 replay.html          the robot in 3-D, once {replay} was run
+drives.json          the drives in force, and what each recording asked of them
 best_trajectory.pt   commanded, measured and simulated positions of the best parameters (torch.load)
 mean_xxx.pt          mean of the search after generation xxx, physical, in the layout of config.pt
 config.pt            joints, bounds and layout of the parameter vector

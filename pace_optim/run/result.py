@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
@@ -110,23 +111,31 @@ def correlation_matrix(space: ParameterSpace, uncertainty: Uncertainty) -> dict[
     return {"labels": list(space.labels), "matrix": rows}
 
 
+def configured_drive(problem: Problem) -> dict[str, np.ndarray]:
+    """Gains and limits as the configuration has them, by field, (n,) each; NaN where it says nothing."""
+    joints = list(problem.joint_names)
+    found = {name: np.full(len(joints), np.nan) for name in DRIVE_FIELDS}
+    for cfg in problem.env_cfg.scene.robot.actuators.values():
+        own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
+        for name, values in found.items():
+            if (value := getattr(cfg, name)) is not None:
+                at = [joints.index(joint) for joint in own]
+                values[at] = resolve_joint_values(value, own, field=name).numpy()
+    return found
+
+
 def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
     """Gains and limits per joint that were in force in every recording; one that differed is left out."""
     joints, found = list(problem.joint_names), {}
-    recordings = problem.dataset.recordings
+    recordings, configured = problem.dataset.recordings, configured_drive(problem)
     for name in DRIVE_FIELDS:
-        configured: dict[str, float] = {}
-        for cfg in problem.env_cfg.scene.robot.actuators.values():
-            own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
-            if (value := getattr(cfg, name)) is not None:
-                configured |= dict(zip(own, resolve_joint_values(value, own, field=name).tolist(), strict=True))
         stated = [getattr(recording.drive, name) for recording in recordings]
         values = {
-            joint: {float(each[i]) if each is not None else configured.get(joint) for each in stated}
+            joint: {float(each[i]) if each is not None else float(configured[name][i]) for each in stated}
             for i, joint in enumerate(joints)
         }
         known = {joint: next(iter(each)) for joint, each in values.items() if len(each) == 1}
-        found[name] = {j: v for j, v in known.items() if v is not None and math.isfinite(v)}
+        found[name] = {j: v for j, v in known.items() if math.isfinite(v)}
     return {name: values for name, values in found.items() if values}
 
 

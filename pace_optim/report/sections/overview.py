@@ -86,10 +86,16 @@ def _worst_joint(result: FitResult) -> tuple[str, float]:
 def _figures(result: FitResult) -> str:
     """The handful of numbers that everyone asks for."""
     worst, error = _worst_joint(result)
+    held_out, train = result.rmse.get("validation", {}).get("all"), result.rmse["train"].get("all")
+    factor, unit = angle_unit([held_out, train, error])
+
+    def said(value: float | None) -> str:
+        return "–" if value is None else f"{factor * value:.3g} {unit}"
+
     figures = [
-        ("Validation", angle_text(result.rmse.get("validation", {}).get("all")), "error of all joints"),
-        ("Training", angle_text(result.rmse["train"].get("all")), "error of all joints"),
-        ("Worst joint", angle_text(error), worst),
+        ("Validation", said(held_out), "error of all joints"),
+        ("Training", said(train), "error of all joints"),
+        ("Worst joint", said(error), worst),
         ("Delay", f"{1e3 * result.delay_s:.3g} ms", f"of the {result.delay_mode}"),
         ("Score", f"{result.score:.2e}", "rad², sum over the joints"),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),

@@ -1,27 +1,50 @@
-"""What was fitted, and what was noticed when it was read."""
+"""What was fitted, the worst first: what was noticed when it was read, and what it asked of the drives."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+
+from pace_optim.report.number_text import angle_unit, three_figures
+from pace_optim.report.trajectory_errors import rms
 
 from ..markup import Section, bullets, esc, table
 from ..run_data import RecordingData, RunData
 
+_DRIVES = 40
+"""Rows of the table of drives that are shown at once."""
+
 
 def recordings(run: RunData) -> Section:
-    """A row per recording, its notes underneath."""
+    """A row per recording, its notes underneath; then the drives in each."""
     rows, notes = [], list(run.result.notes)
-    for recording in run.recordings:
+    ordered = by_error(run.recordings)
+    factor, unit = angle_unit([error_of(recording) for recording in ordered])
+    for recording in ordered:
         own = [note for note in notes if note.startswith(f"{recording.name}: ")]
         notes = [note for note in notes if note not in own]
         said = bullets([note.removeprefix(f"{recording.name}: ") for note in own], "notes") if own else ""
-        rows.append([f"<b>{esc(recording.name)}</b>", *_facts(recording), said])
-    head = ["recording", "used for", "length", "samples", "rate", "notes"]
+        error = three_figures(factor * error_of(recording))
+        rows.append([f"<b>{esc(recording.name)}</b>", error, *_facts(recording), said])
+    head = ["recording", f"error [{unit}]", "used for", "length", "samples", "rate", "notes"]
     html = table(head, rows, "recordings") if rows else ""
     if not rows:
         for use, names in run.result.recordings.items():
             html += f"<p>{esc(use.capitalize())}: {esc(', '.join(names) or 'nothing')}</p>"
-    return Section(id="recordings", title="Recordings", html=html + (bullets(notes, "notes") if notes else ""))
+    html += bullets(notes, "notes") if notes else ""
+    return Section(id="recordings", title="Recordings", html=html + _drives(run, [each.name for each in ordered]))
+
+
+def error_of(recording: RecordingData) -> float:
+    """Root mean square over all joints and samples; large where it is no number."""
+    return rms(np.nan_to_num(recording.error, nan=1e3, posinf=1e3, neginf=-1e3)) or 0.0
+
+
+def by_error(every: Sequence[RecordingData]) -> list[RecordingData]:
+    """The recordings, the one with the largest error first."""
+    return sorted(every, key=error_of, reverse=True)
 
 
 def _facts(recording: RecordingData) -> list[str]:
@@ -40,3 +63,57 @@ def _facts(recording: RecordingData) -> list[str]:
         f"{len(recording.time)}",
         f"{1 / step:.4g} Hz" if step > 0 else "–",
     ]
+
+
+def _drives(run: RunData, order: list[str]) -> str:
+    """The drive in force in each recording, what was asked of it, and what gravity takes."""
+    every = run.read_json("drives.json") or []
+    every = sorted(every, key=lambda each: order.index(each["recording"]) if each["recording"] in order else len(order))
+    rows = [
+        [f"<b>{esc(each['recording'])}</b>", esc(joint), *_drive(own)]
+        for each in every
+        for joint, own in each["joints"].items()
+    ]
+    if not rows:
+        return ""
+    head = [
+        "recording",
+        "joint",
+        "kp",
+        "kd",
+        "torque asked, peak",
+        "RMS",
+        "limit",
+        "gravity, peak",
+        "speed, peak",
+        "limit",
+    ]
+    shown = table(head, rows[:_DRIVES])
+    if more := rows[_DRIVES:]:
+        shown += f"<details><summary>{len(more)} more</summary>{table(head, more)}</details>"
+    about = "gains and limits in force; torques in N m, speeds in rad/s, of a slide in N and m/s"
+    return f"<h3>What was asked of the drives<small>{about}</small></h3>{shown}"
+
+
+def _drive(own: dict[str, Any]) -> list[str]:
+    limits = [own[name] for name in ("effort_limit", "saturation_effort") if own[name] is not None]
+    limit = min(limits) if limits else None
+    return [
+        _number(own["stiffness"]),
+        _number(own["damping"]),
+        _beyond(own["asked_peak"], limit),
+        f"{own['asked_rms']:.3g}",
+        _number(limit),
+        f"{own['gravity_peak']:.3g}",
+        _beyond(own["speed_peak"], own["velocity_limit"]),
+        _number(own["velocity_limit"]),
+    ]
+
+
+def _beyond(value: float, limit: float | None) -> str:
+    """A value, flagged where it is beyond its limit."""
+    return f"{value:.3g}" if limit is None or value <= limit else f'{value:.3g} <span class="flag">beyond</span>'
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pace_optim.report.number_text import angle_text, angle_unit
+from pace_optim.report.number_text import angle_unit, three_figures
 from pace_optim.report.trajectory_errors import held_out_spans, rms
 
 from ..markup import Section, choice, json_script
 from ..run_data import RecordingData, RunData
+from .recordings import by_error
 
 _SAMPLES_ON_PAGE = 160_000
 """Of all joints and recordings together; each takes some 19 bytes of the page."""
@@ -23,19 +24,20 @@ def trajectories(run: RunData) -> Section | None:
     """Curves to choose from."""
     if not run.recordings:
         return None
+    ordered = by_error(run.recordings)
     per_curve = _SAMPLES_ON_PAGE // (len(run.recordings) * len(run.joint_names))
     per_curve = min(max(per_curve, _FEWEST_PER_CURVE), _MOST_PER_CURVE)
     content = {
         "joints": list(run.joint_names),
-        "recordings": [_encode(recording, per_curve) for recording in run.recordings],
+        "recordings": [_encode(recording, per_curve) for recording in ordered],
     }
-    r, j = _largest_error(run.recordings)
+    r, j = _largest_error(ordered)
     return Section(
         id="trajectories",
         title="Trajectories",
         lead="Drag to zoom, double click to see all. The zoom stays when the joint changes.",
         html=(
-            f'<div class="explorer">{choice("recording", [each.name for each in run.recordings], at=r)}'
+            f'<div class="explorer">{choice("recording", [each.name for each in ordered], at=r)}'
             f"{choice('joint', run.joint_names, at=j)}"
             f'<p class="errors-here"></p><div class="canvas" style="height:540px"></div>{json_script(content)}</div>'
         ),
@@ -68,7 +70,8 @@ def _encode_joint(recording: RecordingData, j: int, per_curve: int) -> dict:
     kept = samples_to_draw((error, measured, target), per_curve)
     factor, unit = angle_unit([float(np.abs(error).max(initial=0.0))])
     train, held_out = rms(error[recording.train]), rms(error[~recording.train])
-    parts = [("training", train), ("validation", held_out)]
+    parts = [(name, value) for name, value in (("training", train), ("validation", held_out)) if value is not None]
+    words = ", ".join(f"{three_figures(factor * value)} {unit} in {name}" for name, value in parts)
     return {
         "sample": None if len(kept) == len(error) else _base64(kept, "<u4"),
         "target": _base64(target[kept].round(6), "<f4"),
@@ -76,7 +79,7 @@ def _encode_joint(recording: RecordingData, j: int, per_curve: int) -> dict:
         "error": _base64(error[kept], "<f4"),
         "factor": factor,
         "unit": unit,
-        "text": "Error: " + ", ".join(f"{angle_text(value)} in {name}" for name, value in parts if value is not None),
+        "text": f"Error: {words}",
     }
 
 

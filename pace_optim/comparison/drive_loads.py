@@ -1,0 +1,67 @@
+"""What each recording asks of the drives: their gains and limits, the torque that is asked, and what gravity takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pace_actuators.identified import DRIVE_FIELDS
+from pace_optim.comparison.load_torque import inverse_dynamics, model_of, smoothed
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.problem import Problem
+from pace_optim.run.result import configured_drive
+
+_STRIDE = 10
+"""Gravity is computed at every so many samples."""
+
+
+def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray) -> list[dict[str, Any]]:
+    """Of each recording ``{"recording", "joints": {joint: {...}}}``, for ``drives.json``; torques in N m.
+
+    What is asked is computed from what was recorded, without the delay:
+
+        τ = kp (q* − q) + kd (q̇* − q̇) + τ_ff
+
+    Args:
+        problem: Recordings and drives.
+        evaluator: Its environments hold each recording's load.
+        encoder_bias: Of each joint, (n,) [rad].
+    """
+    rollout, configured = evaluator.rollout(1), configured_drive(problem)
+    result = []
+    for r, recording in enumerate(rollout.dataset.recordings):
+        dt = float(np.median(np.diff(recording.time)))
+        position = smoothed(recording.dof_pos, dt)
+        speed = np.gradient(position, dt, axis=0)
+        here = slice(None, None, recording.sample_stride)
+        facts = {name: _in_force(getattr(recording.drive, name), configured[name]) for name in DRIVE_FIELDS}
+        asked = np.zeros_like(position)
+        if recording.command is not None:
+            target_speed = 0.0 if recording.command_vel is None else recording.command_vel[here][: len(speed)]
+            feed_forward = 0.0 if recording.command_effort is None else recording.command_effort[here][: len(speed)]
+            offset = recording.command[here][: len(position)] - recording.dof_pos
+            asked = np.nan_to_num(facts["stiffness"]) * offset + np.nan_to_num(facts["damping"]) * (
+                target_speed - speed
+            )
+            asked = asked + feed_forward
+        still = np.zeros_like(position[::_STRIDE])
+        model = model_of(rollout.env, r)
+        gravity = inverse_dynamics(model, rollout.robot.joint_names, (position + encoder_bias)[::_STRIDE], still, still)
+        joints = {}
+        for j, name in enumerate(rollout.robot.joint_names):
+            joints[name] = {
+                **{field: float(values[j]) if np.isfinite(values[j]) else None for field, values in facts.items()},
+                "asked_peak": float(np.abs(asked[:, j]).max()),
+                "asked_rms": float(np.sqrt(np.mean(asked[:, j] ** 2))),
+                "gravity_peak": float(np.abs(gravity[:, j]).max()),
+                "speed_peak": float(np.abs(speed[:, j]).max()),
+            }
+        result.append({"recording": recording.name, "joints": joints})
+    rollout.env.close()
+    return result
+
+
+def _in_force(stated: Any, configured: np.ndarray) -> np.ndarray:
+    """Per joint, what the recording states, else what the configuration does; NaN where neither does."""
+    return configured if stated is None else np.broadcast_to(np.asarray(stated, dtype=float), configured.shape)
