@@ -407,7 +407,7 @@ class _Fit:
             times_noise=times,
             std_means_nothing=far,
             warnings=[
-                *far_end(times, train, self.settings.optimizer, self._searched, str(self.folder.path)),
+                *far_end(times, train, self.settings.optimizer, self._searched),
                 *fit_warnings(problem, physical, uncertainty, rmse, left_open),
                 *consistency.sentences,
             ],

@@ -28,7 +28,7 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
     return rmse / noise if rmse and noise > 0 else None
 
 
-def far_end(times: float | None, rmse: float, optimizer: str, searched: int, folder: str) -> list[str]:
+def far_end(times: float | None, rmse: float, optimizer: str, searched: int) -> list[str]:
     """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
 
     Args:
@@ -36,7 +36,6 @@ def far_end(times: float | None, rmse: float, optimizer: str, searched: int, fol
         rmse: Its error [rad].
         optimizer: What ended there.
         searched: How many other starts ended no lower.
-        folder: The run's folder.
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
@@ -45,5 +44,5 @@ def far_end(times: float | None, rmse: float, optimizer: str, searched: int, fol
     return [
         f"The error of {1e3 * rmse:.3g} mrad is {times:.3g} times the measurement noise: physics is missing, a fact of "
         f"the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
-        f"{command('diagnose')} {folder} looks for what is missing."
+        f"{command('diagnose')} looks for what is missing."
     ]
