@@ -11,8 +11,8 @@ _HEAD = """\
 What a drive can have beyond the base model of armature, viscous friction, Coulomb friction, encoder bias and delay.
 `scripts/fit.py --effects NAME` identifies an effect beside the base parameters; on some joints only with
 `NAME@JOINTS` (a regular expression), with one value for all joints with `NAME@shared`, for some with
-`NAME@JOINTS@shared`. At its null value an effect vanishes exactly. A parameter without a null value shapes the effect;
-it matters only where the effect acts.
+`NAME@JOINTS@shared`; `@wide` at the end widens its bounds as far as physics allows. At its null value an effect
+vanishes exactly. A parameter without a null value shapes the effect; it matters only where the effect acts.
 
 Effects act where the drive's path has them, whatever the order in which they are named: command, measurement,
 controller, drive, friction, transmission; `model` changes the rigid body, `recording` only what the log shows. Within
