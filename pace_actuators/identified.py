@@ -168,7 +168,22 @@ class IdentifiedDrives:
             known = self.drive.get(name) or {}
             if all(joint in known for joint in joints):
                 fields[name] = _by_pattern({joint: float(known[joint]) for joint in joints})
-        return fields
+        return fields | self._rate_of(joints)
+
+    def _rate_of(self, joints: Sequence[str]) -> dict[str, Any]:
+        """How the controllers of some joints ran: the same torque law needs the same rate.
+
+        Raises:
+            ValueError: If they ran differently.
+        """
+        rates = {(self.drive.get("drive_dt", {}).get(j), bool(self.drive.get("implicit", {}).get(j))) for j in joints}
+        if len(rates) > 1:
+            raise ValueError(
+                f"{self.path}: the controllers of {', '.join(joints)} ran at different rates (drive_dt, implicit): "
+                f"{sorted(rates, key=str)}. Make them groups of their own."
+            )
+        drive_dt, implicit = rates.pop() if rates else (None, False)
+        return ({} if drive_dt is None else {"drive_dt": drive_dt}) | ({"implicit": True} if implicit else {})
 
     def _effects_of(self, joints: Sequence[str], on_the_rig: bool) -> list[EffectCfg]:
         """The effects with their values on those of some joints that have them."""

@@ -108,7 +108,8 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None
     Returns:
         What was changed, in words.
     """
-    dt, before = IdentifiedDrives.load(path).at.control_dt, cfg.sim.dt
+    drives, before = IdentifiedDrives.load(path), cfg.sim.dt
+    dt = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
     whole = cfg.sim.dt * cfg.decimation / dt
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
         return None

@@ -82,6 +82,24 @@ def test_a_group_of_joints_gets_its_own_values_and_effects(result):
     assert PaceDCMotorCfg.from_result(result, ".*HAA").effects == ()
 
 
+def test_the_controller_keeps_the_rate_of_the_identification(result):
+    changed(result, drive={"drive_dt": dict.fromkeys(JOINTS, 0.0005)})
+    assert motor(PaceDCMotorCfg.from_result(result), 0.0005).run_dt == pytest.approx(0.0005)
+    with pytest.raises(ValueError, match="Make the physics step finer"):
+        motor(PaceDCMotorCfg.from_result(result), DT)
+    env = walking(result)
+    assert env.cfg.sim.dt == pytest.approx(0.0005)
+    env.close()
+
+
+def test_a_continuous_controller_stays_one(result):
+    changed(result, drive={"implicit": {joint: 1.0 for joint in JOINTS if joint.endswith("KFE")}})
+    assert PaceDCMotorCfg.from_result(result, ".*KFE").implicit
+    assert not PaceDCMotorCfg.from_result(result, ".*HAA").implicit
+    with pytest.raises(ValueError, match="Make them groups of their own"):
+        PaceDCMotorCfg.from_result(result)
+
+
 LEGS = ("LF", "RF", "LH", "RH")
 
 

@@ -136,6 +136,12 @@ def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
         }
         known = {joint: next(iter(each)) for joint, each in values.items() if len(each) == 1}
         found[name] = {j: v for j, v in known.items() if math.isfinite(v)}
+    for cfg in problem.plain_cfg.scene.robot.actuators.values():
+        own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
+        if cfg.drive_dt is not None:
+            found.setdefault("drive_dt", {}).update(dict.fromkeys(own, cfg.drive_dt))
+        if cfg.implicit:
+            found.setdefault("implicit", {}).update(dict.fromkeys(own, 1.0))
     return {name: values for name, values in found.items() if values}
 
 
