@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -13,6 +14,7 @@ from command_lines import ROOT, run_script
 from own_robot import write_robot
 
 from pace_envs.task_source import use_task
+from pace_optim.fit import fit
 from pace_optim.run.open import Run, open_problem
 
 FIT = ("--optimizer", "least_squares", "--no_consistency")
@@ -97,6 +99,7 @@ def test_what_a_run_keeps(project):
         ("export", ("RUN", "--format", "mjcf", "--output", "out.xml")),
         ("export", ("RUN/result.json", "--format", "cfg")),
         ("play", ("--replay", "RUN")),
+        ("replay", ("RUN", "--viewer", "none", "--output", "replay.html")),
         ("fit", ("--resume", "RUN")),
         ("plot_trajectory", ("--robot_name", "swing", "--log_dir", "LOGS", "--output", "plots")),
     ],
@@ -111,10 +114,18 @@ def test_every_command_works_on_it_from_another_folder(script, words, project, e
 
 
 @pytest.mark.slow
-def test_it_is_diagnosed_and_fitted_again_from_another_folder(project, elsewhere):
-    done = run_script("diagnose", project[1], "--only", "--effects", "quadratic_friction", "--max_effects", "1")
+def test_it_is_diagnosed_from_another_folder(project, elsewhere):
+    words = ("--only", "--effects", "quadratic_friction", "--max_effects", "1", "--physics_dt", "0.0025", "--no_refit")
+    done = run_script("diagnose", project[1], *words)
     assert done.returncode == 0, done.stderr
     assert (project[1] / "diagnosis.json").is_file()
+
+
+def test_it_is_fitted_again_from_another_folder(project, elsewhere):
+    before = Run.open(project[1])
+    settings = replace(before.settings, effects=[], log_dir=str(elsewhere / "again"))
+    result, run = fit(settings, before=before)
+    assert result.environment["module"] == "swing" and open_problem(run).effects == []
 
 
 def test_a_mean_of_the_search_is_simulated_again(project, elsewhere):
