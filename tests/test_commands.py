@@ -7,6 +7,8 @@ import pytest
 from bench_recordings import CONTROL_DT, Bench, chirp, record
 
 from pace_optim.fit import fit
+from pace_optim.problem.stated_limits import contradicted_limits
+from pace_optim.recording import Recording
 from pace_optim.run.settings import FitSettings
 
 TASK = "Pace-TestBench-v0"
@@ -54,3 +56,16 @@ def test_a_wheel_is_a_velocity_drive(tmp_path):
     result = fitted(tmp_path, tmp_path / "a.csv")
     assert result.rmse["train"]["all"] < 1.3 * bench.noise
     assert next(iter(result.parameters["viscous_friction"].values())) == pytest.approx(bench.viscous, rel=0.03)
+
+
+def test_what_a_recording_contradicts_of_the_stated_limits_is_said():
+    time = np.arange(400) * CONTROL_DT
+    fast = Recording(
+        name="r", joint_names=("hip", "knee"), time=time, dof_pos=np.outer(np.sin(6 * time), [1.0, 5.0]),
+        des_dof_pos=np.zeros((400, 2)), dof_effort=np.outer(np.cos(6 * time), [8.0, 3.0]),
+    )  # fmt: skip
+    notes = contradicted_limits(fast, [20.0, 20.0], [5.0, 5.0])
+    assert len(notes) == 2
+    assert "no-load speed: knee reaches 30 rad/s, velocity_limit is 20 rad/s" in notes[0]
+    assert "torque limit: hip reaches 8 N m, effort_limit is 5 N m" in notes[1]
+    assert contradicted_limits(fast, [np.inf, 28.0], [np.nan, 8.0]) == []

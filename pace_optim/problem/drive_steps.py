@@ -61,7 +61,7 @@ def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
         cfg.scene.num_envs = 1
         env = ManagerBasedRLEnv(cfg)
         inverse = _inverse_inertia(env, upper=False)
-        damping = _of_joints(env, "damping", only_implicit=True)
+        damping = of_joints(env, "damping", only_implicit=True)
         env.close()
         steep = float((damping * cfg.sim.dt * inverse.diagonal()).max())
         if steep > _FINE:
@@ -82,12 +82,12 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
         ValueError: If a loop is unstable even with the largest armature that may be identified.
     """
     names = env.scene["robot"].joint_names
-    dt = _of_joints(env, "_run_dt")
+    dt = of_joints(env, "_run_dt")
     surely, likely = (_inverse_inertia(env, upper=upper) for upper in (True, False))
     notes = []
     for recording in recordings:
-        kp = _stated(recording.drive.stiffness, _of_joints(env, "stiffness"))
-        kd = _stated(recording.drive.damping, _of_joints(env, "damping"))
+        kp = _stated(recording.drive.stiffness, of_joints(env, "stiffness"))
+        kd = _stated(recording.drive.damping, of_joints(env, "damping"))
         pull = np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
         note = ""
         for inverse, certain in ((surely, True), (likely, False)):
@@ -117,12 +117,12 @@ def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
 
 def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     """Of the configuration, or the largest that may be identified, (n,) [kg m²]."""
-    own = _of_joints(env, "armature")
+    own = of_joints(env, "armature")
     bounds = env.cfg.sim2real.bounds_params[: len(own)].numpy()  # type: ignore[attr-defined]
     return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
 
 
-def _of_joints(env: ManagerBasedRLEnv, name: str, only_implicit: bool = False) -> np.ndarray:
+def of_joints(env: ManagerBasedRLEnv, name: str, only_implicit: bool = False) -> np.ndarray:
     """A drive's values per joint, (n,); ``_run_dt``: time between two runs of a loop that holds its torque [s]."""
     robot = env.scene["robot"]
     result = np.zeros(robot.num_joints)

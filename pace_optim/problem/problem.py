@@ -14,12 +14,13 @@ from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
-from pace_optim.problem.drive_steps import check_loops, set_control_step, set_drive_step
+from pace_optim.problem.drive_steps import check_loops, of_joints, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all
+from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 
@@ -182,8 +183,12 @@ def _configured(
 
 def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings with what is to be told of their drives' loops."""
-    notes = check_loops(env, recordings)
-    return [replace(r, notes=(*r.notes, note)) if note else r for r, note in zip(recordings, notes, strict=True)]
+    limits = of_joints(env, "velocity_limit"), of_joints(env, "effort_limit")
+    notes = [
+        [*([loop] if loop else []), *contradicted_limits(recording, *limits)]
+        for recording, loop in zip(recordings, check_loops(env, recordings), strict=True)
+    ]
+    return [replace(r, notes=(*r.notes, *own)) for r, own in zip(recordings, notes, strict=True)]
 
 
 def as_vector(problem: Problem, values: dict) -> torch.Tensor:
