@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pace_optim.recording import Recording
 
@@ -14,9 +13,7 @@ _SPAN = 0.02
 """Time over which a speed is taken from positions [s]."""
 
 
-def contradicted_limits(
-    recording: Recording, velocity_limit: Sequence[float], effort_limit: Sequence[float]
-) -> list[str]:
+def contradicted_limits(recording: Recording, velocity_limit: ArrayLike, effort_limit: ArrayLike) -> list[str]:
     """Measured speeds and torques beyond what is stated, in words.
 
     Args:
