@@ -117,6 +117,7 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
     model = SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")})
     model.at_bounds = lambda _: torch.zeros_like(has)
+    model.is_wide = lambda _: torch.zeros(has.shape[1], dtype=torch.bool)
     final = SimpleNamespace(model=model, x=None)
     return Outcome(
         problem=None,

@@ -126,8 +126,8 @@ OPTIONS = {
         ["--task", BENCH, "--data", "GOOD", "--log_dir", "GOOD"],
         r"good\.npz.*(ot a directory|exists)",
     ),
-    "nothing to resume": (["--resume", "nowhere"], "nowhere is no run that can be resumed"),
-    "a folder that is no run": (["--resume", "EMPTY"], "is no run that can be resumed: it has no settings.json"),
+    "nothing to resume": (["--resume", "nowhere"], "nowhere is no run"),
+    "a folder that is no run": (["--resume", "EMPTY"], "is no run: it has no settings.json"),
 }
 
 

@@ -383,7 +383,7 @@ def test_candidates_are_all_registered_effects_or_only_one_s_own():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["RUN"], r"result.json does not exist"),
+        (["RUN"], "is no run: it has no settings.json"),
         (["RUN", "--max_effects", "0"], "max_effects is 0, expected at least 1"),
         (["RUN", "--only"], "--only needs the effects to try"),
         (["FITTED", "--effects", "no_such_effect"], "There is no effect 'no_such_effect'"),

@@ -135,7 +135,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     script.write_text(
         "import os, sys\n"
         "from pace_actuators.effects import get_effect\n"
-        "from pace_optim.diagnosis import processes\n"
+        "from pace_optim.diagnosis.fitting import processes\n"
         "processes.available_processors = lambda: 2\n"
         "here = os.getpid()\n"
         "def work(own):\n"

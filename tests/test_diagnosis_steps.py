@@ -72,7 +72,7 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
     stuck_one = f"At a bound, so that it stands in for something else: {effect.name} (servo)."
     assert stand_ins(far, ["servo"], floor) == ([stuck_one] if stuck else [])
     assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
-    two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [-0.2]))
+    two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [0.8]))
     two = replace(far, final=two, unevenness=even.repeat(2, 1))
     assert verdict(two, floor)[0] == "effect"  # beside another that is inside its bounds
 
@@ -168,9 +168,9 @@ def two_joints(bench):
 @pytest.mark.parametrize(("rmse", "agree"), [(1.05e-4, True), (1.3e-4, False)])
 def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, no_fits, rmse, agree, stood_out):
     base, values = two_joints(bench), bench.truth_values.repeat(2, 1)
-    now = with_effects(base, values, (GAIN, [True, False], [-0.2]), (STRIBECK, [False, True], [1.0, 0.1]))
+    now = with_effects(base, values, (GAIN, [True, False], [0.8]), (STRIBECK, [False, True], [1.0, 0.1]))
     models = {
-        GAIN: with_effects(base, values, (GAIN, [True, True], [-0.21])),
+        GAIN: with_effects(base, values, (GAIN, [True, True], [0.79])),
         STRIBECK: with_effects(base, values, (STRIBECK, [True, True], [1.1, 0.1])),
     }
     trials = [
@@ -185,7 +185,7 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
         return
     assert labels(result.model, ["hip", "knee"]) == ["torque_gain"]
     gains = result.model.to_physical(result.x)[:, result.model.columns(GAIN)]
-    assert gains[:, 0].tolist() == pytest.approx([-0.2, -0.21])
+    assert gains[:, 0].tolist() == pytest.approx([0.8, 0.79])
     assert this.chosen == [GAIN, GAIN] and this.rivals == [[], [STRIBECK]]
 
 
@@ -200,7 +200,7 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
 def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, no_fits, alone, agree):
     base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
     now = with_effects(base, values, (STRIBECK, both, [1.0, 0.1]), (QUADRATIC, both, [0.2]))
-    models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [-0.1]))}
+    models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [0.9]))}
     trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4, significant=False)] for j in range(2)]
     this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []], models=models)
     later = Round(trials=[[], []], chosen=[QUADRATIC, QUADRATIC], rivals=[[STRIBECK], []])
@@ -212,7 +212,7 @@ def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, 
     assert labels(final.model, ["hip", "knee"]) == agree and this.chosen[0] is GAIN
     physical = final.model.to_physical(final.x)[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
-    assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([-0.1])
+    assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([0.9])
     assert later.chosen[0] is None and later.rivals[0] == []
 
 
@@ -222,7 +222,7 @@ def test_an_effect_of_the_whole_robot_is_not_replaced_on_one_joint(bench):
     trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4)] for j in range(2)]
     this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []])
     assert one_for_several._options(now, [this]) == {}
-    now = with_effects(base, values, (GAIN, both, [0.1]), (STRIBECK, both, [1.0, 0.1]))
+    now = with_effects(base, values, (GAIN, both, [1.1]), (STRIBECK, both, [1.0, 0.1]))
     this.trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(CLOCK, j, 6e-4)] for j in range(2)]
     assert one_for_several._options(now, [this]) == {}
 
@@ -244,7 +244,7 @@ def test_where_an_encoder_sits_is_held_in_exchanges(bench):
 def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench, no_fits):
     base, values = JointModel.base(bench.problem), bench.truth_values
     now = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]))
-    alone = with_effects(base, 1.1 * values, (GAIN, [True], [-0.1]))
+    alone = with_effects(base, 1.1 * values, (GAIN, [True], [0.9]))
     first = Round(
         trials=[[make_trial(STRIBECK, 0, 5e-4), make_trial(GAIN, 0, 6e-4)]],
         chosen=[STRIBECK],
@@ -263,7 +263,7 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
     physical = result.model.to_physical(result.x)[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
     assert physical[result.model.columns(QUADRATIC)].tolist() == pytest.approx([0.2])
-    assert physical[result.model.columns(GAIN)].tolist() == pytest.approx([-0.1])
+    assert physical[result.model.columns(GAIN)].tolist() == pytest.approx([0.9])
     assert first.chosen == [GAIN] and first.rivals == [[]] and second.chosen == [QUADRATIC]
     # what did not stand out, and no joint has, is not tried
     first.chosen, first.trials[0][1].significant = [STRIBECK], False

@@ -61,12 +61,12 @@ def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, monkeypatch,
     assert list(each.values()) == pytest.approx(expected, abs=1e-3)
     found = findings(outcome, each)
     assert summary_of(found, bench.problem).startswith(said)
-    assert shares(SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [-0.2])))) == {GAIN: 1.0}
+    assert shares(SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {GAIN: 1.0}
 
 
 def test_no_name_is_claimed_where_none_dominates(bench):
     base, values = JointModel.base(bench.problem), bench.truth_values
-    effects = ((STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]), (GAIN, [True], [-0.1]))
+    effects = ((STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]), (GAIN, [True], [0.9]))
     outcome = SimpleNamespace(
         final=with_effects(base, values, *effects),
         final_errors=errors_of(1e-4),

@@ -1,5 +1,6 @@
 """An effect that has another size in each recording stands in for something that is not known."""
 
+import shutil
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -130,7 +131,7 @@ def four_joints(problem):
 def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
     outcome, floor = four_joints(run.problem), FLOOR.expand(4)
     module = sys.modules[Findings.__module__]
-    twins = SimpleNamespace(with_physics_dt=lambda _: None, control_dt=0.0025)
+    twins = SimpleNamespace(with_physics_dt=lambda _: None, coarsest_dt=0.0025, control_dt=0.0025)
     for name, made in (
         ("fit_base", (twins, outcome.base, FLOOR)),
         ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
@@ -160,12 +161,13 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch, stopped)
 
     refit = run.folder.parent / "refit"
 
-    def fit(settings, progress, on_start, assess_interrupted):
+    def fit(settings, progress, on_start, assess_interrupted, before):
         refits.append(settings)
         told.append(len(seen))
         on_start(refit)
         if stopped == "interrupted":
             raise KeyboardInterrupt
+        shutil.copytree(run.folder, refit, dirs_exist_ok=True)
         return SimpleNamespace(stop_reasons=[stopped]), refit
 
     (run.folder.parent / "refit").mkdir(exist_ok=True)

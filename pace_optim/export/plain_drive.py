@@ -77,11 +77,11 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
             )
         }
         for i, joint in enumerate(joints):
-            gain = 1 + own["torque_gain"].get(joint, 0.0)
+            gain = own["torque_gain"].get(joint, 1.0)
             line = math.isfinite(found["saturation_effort"][i]) and math.isfinite(found["velocity_limit"][i])
             result[joint] = PlainDrive(
-                stiffness=found["stiffness"][i] * (1 + own["proportional_gain"].get(joint, 0.0)) * gain,
-                damping=found["damping"][i] * (1 + own["derivative_gain"].get(joint, 0.0)) * gain,
+                stiffness=found["stiffness"][i] * own["proportional_gain"].get(joint, 1.0) * gain,
+                damping=found["damping"][i] * own["derivative_gain"].get(joint, 1.0) * gain,
                 effort_limit=min(found["effort_limit"][i], own["torque_limit"].get(joint, math.inf)) * gain,
                 saturation_effort=found["saturation_effort"][i] if line else math.inf,
                 velocity_limit=found["velocity_limit"][i] if line else math.inf,

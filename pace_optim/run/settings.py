@@ -106,7 +106,7 @@ class FitSettings:
             ValueError: If the file is missing or unreadable.
         """
         if not path.exists():
-            raise ValueError(f"{path.parent} is no run that can be resumed: it has no {path.name}.")
+            raise ValueError(f"{path.parent} is no run: it has no {path.name}.")
         cure = "Start a new fit."
         content = checked(SettingsFile, read_json(path, cure), path, cure)
         settings = checked(cls, content.settings, f"{path}: settings", cure, strict=True)
