@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.joint_values import resolve_joint_values
 from pace_optim.export.configs import drive_groups
@@ -116,7 +117,7 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
 
 def is_undetermined(drives: IdentifiedDrives, parameter: str, joint: str) -> bool:
     """Whether the recordings say nothing of a value, so that it kept its prior and is not exported."""
-    return f"{parameter}/{joint}" in getattr(drives, "undetermined", ())
+    return not {f"{parameter}/{joint}", f"{parameter}/{ALL}"}.isdisjoint(drives.undetermined)
 
 
 def _of_effect(drives: IdentifiedDrives, name: str) -> dict[str, float]:
