@@ -39,6 +39,36 @@ class StribeckFriction(Effect):
 
 
 @register_effect
+class DynamicFriction(Effect):
+    """Friction while sliding is less than at rest: F_c breaks away, r F_c slides; PACE's ``separate_dynamic_friction``.
+
+    The base model's friction is then that at rest. Between the two, F(v) = F_c (r + (1 - r) exp(-(v/v_s)²)), v_s as
+    small as a step resolves: a Stribeck friction of fixed width.
+    """
+
+    name = "dynamic_friction"
+    stage = "friction"
+    parameters = (EffectParameter(name="ratio", unit="1", lower=0.0, upper=1.0, null=1.0, start=0.8, meaning="r"),)
+    equation = "F_c at rest, r F_c while sliding (beyond 0.02 rad/s)"
+    looks = "as stribeck_friction of a narrow width: error right after reversals"
+    source = "Bjelonic et al., PACE 0.2.0: dynamic friction as a ratio of static friction"
+    probes = ({"ratio": 0.8},)
+    two_sided = False
+    special_case_of = "stribeck_friction"
+    twins = ("stribeck_friction",)
+    separates = "a slow triangle"
+    ratio: torch.Tensor
+
+    creep = 0.02
+    """v_s [rad/s]."""
+
+    def friction(self, s: DriveState) -> None:
+        """Lower the level where it slides."""
+        stuck = torch.exp(-((s.motor_vel / self.creep) ** 2))
+        s.friction *= torch.lerp(self.ratio, torch.ones_like(self.ratio), stuck)
+
+
+@register_effect
 class LoadDependentFriction(Effect):
     """Friction grows with the load on the gear: F = F_c + k_l |τ - τ_g|."""
 

@@ -197,7 +197,7 @@ def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, pr
 
 
 def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
-    """What is tried: all registered effects but the curves of any form, and the user's; or only the user's.
+    """What is tried: all registered effects but curves of any form and special cases, and the user's; or only those.
 
     Raises:
         ValueError: If the user names a curve.
@@ -210,7 +210,7 @@ def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[
             f"told to. Leave it out, or fit it: scripts/fit.py --effects {curves[0]}."
         )
     every = [] if only else [get_effect(name) for name in available_effects()]
-    return list(dict.fromkeys([*(effect for effect in every if not effect.free_form), *own]))
+    return list(dict.fromkeys([*(e for e in every if not e.free_form and not e.special_case_of), *own]))
 
 
 @flushed_denormals()

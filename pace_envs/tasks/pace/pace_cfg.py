@@ -81,6 +81,13 @@ class PaceCfg:
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects identified beside the base parameters: ``"name"``, ``"name@joints"`` or ``"name@shared"``."""
 
+    separate_dynamic_friction: bool = False
+    """Whether friction at rest and while sliding are identified apart: ``friction`` is then that at rest, and
+    ``dynamic_friction.ratio`` of every joint the sliding one's share of it (5n+1 parameters), as in PACE 0.2.0."""
+
+    friction_ratio_bounds: tuple[float, float] = (0.0, 1.0)
+    """Lower and upper bound of that ratio."""
+
     extra_parameters: tuple[Any, ...] = ()
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 
@@ -103,6 +110,9 @@ class PaceCfg:
                 f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
                 f"for each of the {len(self.joint_order)} joints in joint_order, then the delay."
             )
+        low, high = self.friction_ratio_bounds
+        if not 0 <= low < high <= 1:
+            raise ValueError(f"friction_ratio_bounds is ({low:g}, {high:g}), expected 0 <= lower < upper <= 1.")
         wrong = (~(self.bounds_params[:, 0] <= self.bounds_params[:, 1])).nonzero()[:, 0]
         if len(wrong):
             row = int(wrong[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from pace_actuators import resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_actuators.effects.friction import DynamicFriction
 from pace_envs import mdp
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
 from pace_envs.managers import ActionTermCfg, ObservationGroupCfg, ObservationTermCfg, TerminationTermCfg
@@ -66,7 +67,7 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         """Use the identification's joint order everywhere."""
         robot = dataclasses.replace(self.scene.robot, joint_order=tuple(self.sim2real.joint_order))
         self.scene = dataclasses.replace(self.scene, robot=robot)
-        if self.sim2real.effects:
+        if self.sim2real.effects or self.sim2real.separate_dynamic_friction:
             self.set_effects(self.sim2real.effects)
 
     def set_effects(self, effects: Sequence[EffectCfg | str]) -> None:
@@ -79,6 +80,8 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
             ValueError: If an effect or a joint is unknown.
         """
         cfgs = effect_cfgs(effects)
+        if self.sim2real.separate_dynamic_friction and all(cfg.effect_class is not DynamicFriction for cfg in cfgs):
+            cfgs = [EffectCfg(effect=DynamicFriction.name), *cfgs]
         for cfg in cfgs:
             cfg.joints(self.sim2real.joint_order)  # complains about patterns that match nothing
         self.sim2real.effects = tuple(cfgs)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from pace_actuators.effects import effect_cfgs
+from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, unit_for
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 
@@ -138,6 +139,8 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
         for parameter in kind.parameters:
             keys = (GLOBAL,) if effect.shared else own
             lower, upper = parameter.widest if effect.wide else (parameter.lower, parameter.upper)
+            if kind is DynamicFriction:
+                lower, upper = cfg.friction_ratio_bounds
             result.append(
                 Parameter(
                     name=f"{kind.name}.{parameter.name}",
@@ -147,8 +150,8 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
                     apply=partial(_apply_effect, effect=kind.name, parameter=parameter.name, joint_ids=ids),
                     keys=keys,
                     scale=parameter.scale,
-                    start=parameter.start,
                     units=_units(parameter.unit, own if effect.shared else keys, cfg)[: len(keys)],
+                    start=min(max(parameter.start, lower), upper),
                 )
             )
     return tuple(result)

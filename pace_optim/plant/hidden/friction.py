@@ -26,6 +26,19 @@ class StribeckFriction(HiddenEffect):
 
 
 @hidden
+class DynamicFriction(HiddenEffect):
+    """The friction of the base model at rest, a share r of it while sliding."""
+
+    name = "dynamic_friction"
+    draws = draws_of(r=Draw(unit="1", low=0.3, high=0.8, null=1.0))
+
+    def friction(self, forward: np.ndarray, backward: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Both levels fall once the joint creeps faster than 0.02 rad/s."""
+        share = self.r + (1 - self.r) * np.exp(-((state.motor_vel / 0.02) ** 2))
+        return forward * share, backward * share
+
+
+@hidden
 class LoadDependentFriction(HiddenEffect):
     """F = F_c + k_l |τ - τ_g|, τ the drive's torque, τ_g = -bias that of gravity and load on the joint.
 
