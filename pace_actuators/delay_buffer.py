@@ -116,7 +116,11 @@ class DelayBuffer:
                 self._storage = data.new_empty((self._length * self._num_envs, *data.shape[1:]))
             self.reset()
         if self._any_stale:
-            self._storage.view(self._length, *data.shape)[:, self._stale] = data[self._stale]
+            history = self._storage.view(self._length, *data.shape)
+            if data.is_cuda:  # without waiting for the GPU to count them
+                torch.where(self._stale[:, None], data, history, out=history)
+            else:
+                history[:, self._stale] = data[self._stale]
             self._stale[:] = False
             self._any_stale = False
         self._head = (self._head + 1) % self._length

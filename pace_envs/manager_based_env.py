@@ -20,6 +20,7 @@ from pace_envs.managers import (
 )
 from pace_envs.scene import InteractiveScene, InteractiveSceneCfg
 from pace_envs.simulation import EnvIds, SimulationCfg
+from pace_envs.step_graphs import StepGraphs
 
 
 @dataclass(kw_only=True)
@@ -89,6 +90,8 @@ class ManagerBasedEnv(gym.Env):
         self.extras: dict[str, Any] = {}
         self.common_step_counter = 0
         self._renderer: Any = None
+        self._drive_graphs: StepGraphs | None = None
+        self._graphs_version = 0
         self.load_managers()
         self._configure_spaces()
         self.event_manager.apply("startup")
@@ -185,10 +188,24 @@ class ManagerBasedEnv(gym.Env):
         self.action_manager.process_action(action)
         for _ in range(self.cfg.decimation):
             self.action_manager.apply_action()
-            self.scene.write_data_to_sim()
+            self._drive()
             self.sim.step()
             self.scene.update()
         self.common_step_counter += 1
+
+    def _drive(self) -> None:
+        """Run the drives; on a GPU from CUDA graphs."""
+        if self.device.type != "cuda" or not self.cfg.sim.graphs:
+            self.scene.write_data_to_sim()
+            return
+        version = self.sim.version
+        if self._drive_graphs is None:
+            owners = [part for robot in self.scene.articulations.values() for part in (robot.data, robot.actuators)]
+            self._drive_graphs = StepGraphs(self.scene.write_data_to_sim, owners, self.device)
+        elif version != self._graphs_version:
+            self._drive_graphs.clear()
+        self._graphs_version = version
+        self._drive_graphs()
 
     def render(self) -> np.ndarray | None:
         """A picture of environment 0, (height, width, 3) uint8; ``None`` without a render mode."""

@@ -61,6 +61,9 @@ class SimulationCfg:
     device: str = "cpu"
     """Where it runs: ``"cpu"`` in float64, or ``"cuda:0"``, ``"cuda:1"``, … in float32 by MuJoCo Warp."""
 
+    graphs: bool = True
+    """Whether drives and physics are replayed from CUDA graphs on a GPU; else every kernel is launched by itself."""
+
     class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None
     """What builds the simulation; ``None`` means :class:`Simulation`, or on a GPU ``WarpSimulation``."""
 
@@ -92,9 +95,11 @@ class Simulation:
         device: Device of all tensors.
         dtype: Type of all tensors.
         model: The compiled model.
+        version: Grows where arrays were replaced: CUDA graphs that were captured before are of no use.
     """
 
     dtype = torch.float64
+    version = 0
     batch: Any
 
     @property

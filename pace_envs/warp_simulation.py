@@ -125,8 +125,6 @@ class WarpSimulation(Simulation):
         self._kept: list[Any] = []
         self._bound: set[str] = set()
         self.version = 0
-        self.version = 0
-        """Grows where arrays were replaced: graphs that were captured before are of no use."""
         flags = self.model.opt.disableflags
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp never starts again by itself
         with self._on_stream():
@@ -154,7 +152,7 @@ class WarpSimulation(Simulation):
 
     def _run(self, name: str) -> None:
         """Queue a step, a forward pass or the constants on torch's current stream."""
-        if self.device.type == "cpu":
+        if self.device.type == "cpu" or not self.cfg.graphs:
             with self._on_stream():
                 self._call(name)
             return

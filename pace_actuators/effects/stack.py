@@ -149,7 +149,7 @@ class EffectStack:
         chosen[env_ids] = True
         for effect in self.effects:
             own = chosen[effect.rows]
-            if bool(own.any()):
+            if own.is_cuda or bool(own.any()):  # a GPU is not waited for
                 effect.reset_state(own)
 
     def take_over(self, armature: torch.Tensor, friction: torch.Tensor, viscous_friction: torch.Tensor) -> None:
