@@ -19,9 +19,10 @@ from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.other_starts import other_valleys, scattered
 from pace_optim.optimizers.refine import refine
-from pace_optim.optimizers.search import RefiningPays, search
+from pace_optim.optimizers.search import RefiningPays, agree_to_stop, search
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
+from pace_optim.problem.processes import Processes
 from pace_optim.report import write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
@@ -60,6 +61,7 @@ def fit(
     before: Run | None = None,
     on_start: Callable[[Path], None] = lambda _: None,
     assess_interrupted: bool = True,
+    processes: Processes | None = None,
 ) -> tuple[FitResult, Path]:
     """Identify a robot.
 
@@ -70,6 +72,7 @@ def fit(
         on_start: Gets the run's folder before the first simulation.
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
             interruption is passed on at once, and the folder has what ``resume`` needs.
+        processes: Who shares the search's candidates; this one writes, the others call :func:`help_fit`.
 
     Returns:
         The result and the run's folder.
@@ -93,7 +96,8 @@ def fit(
         environment=record.to_dict(),
     )
     on_start(folder.path)
-    return _Fit(settings, problem, folder, progress or ProgressLine(), record).run(assess_interrupted)
+    run = _Fit(settings, problem, folder, progress or ProgressLine(), record, processes)
+    return run.run(assess_interrupted)
 
 
 def resume(
@@ -101,6 +105,8 @@ def resume(
     max_iteration: int | None = None,
     progress: ProgressLine | None = None,
     task: str | None = None,
+    device: str | None = None,
+    processes: Processes | None = None,
 ) -> tuple[FitResult, Path]:
     """Go on with an interrupted fit; the result is that of one that was never interrupted.
 
@@ -109,6 +115,8 @@ def resume(
         max_iteration: Another largest number of generations.
         progress: Shows how far it is.
         task: Where the run's environment is found now, if it has been moved.
+        device: Where the search simulates; ``None``: as before.
+        processes: As for :func:`fit`.
 
     Raises:
         ValueError: If the run cannot be resumed, or anything that it was started with has changed.
@@ -119,11 +127,53 @@ def resume(
     before = Run.open(folder.path, task)
     check_unchanged(before)
     settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
+    if device is not None:
+        settings = replace(settings, device=device)
     problem = _load(settings, before.load_cfg())
     check_same_configuration(before, problem)
-    run = _Fit(settings, problem, folder, progress or ProgressLine(), before.record)
+    run = _Fit(settings, problem, folder, progress or ProgressLine(), before.record, processes)
     run.restore(checkpoint)
     return run.run()
+
+
+def help_fit(processes: Processes, device: str, path: str | None = None, task: str | None = None) -> None:
+    """Simulate this process's share of the search's candidates, for the process that fits and writes.
+
+    Args:
+        processes: All of them.
+        device: Where this one simulates.
+        path: The run's folder, if it is resumed.
+        task: As for :func:`resume`.
+
+    Raises:
+        ValueError: If another process is lost, or there is nothing here of what it fits.
+    """
+    start: Any = processes.agree(None)
+    if start is None:
+        return
+    settings, history, line_generation = start
+    settings = replace(settings, device=device)
+    problem = _load(settings, load_env_cfg(settings.task) if path is None else Run.open(Path(path), task).load_cfg())
+    searcher = problem.for_search(device).training_evaluator()
+    optimizer = make_optimizer(problem, settings, processes)
+    optimizer.restore(history, line_generation)
+    search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
+
+
+def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
+    """The search of a fit."""
+    population = max(4, settings.num_envs // len(problem.dataset.trained()))
+    if settings.optimizer == "hybrid" and settings.device == "cpu":
+        population = min(population, _HYBRID_POPULATION)
+    return CMAESOptimizer(
+        problem.space,
+        population,
+        problem.env_cfg.sim2real.cmaes,
+        trees=problem.trees,
+        seed=settings.seed,
+        start=problem.space.start,
+        processes=processes,
+    )
 
 
 def _load(settings: FitSettings, env_cfg: Any) -> Problem:
@@ -178,6 +228,7 @@ class _Fit:
         folder: RunFolder,
         progress: ProgressLine,
         record: EnvironmentRecord,
+        processes: Processes | None,
     ):
         self.settings = settings
         self.record = record
@@ -186,11 +237,14 @@ class _Fit:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
-        coarse = problem.for_search()
+        coarse = problem.for_search(settings.device)
         self.searcher = self.evaluator if coarse is problem else coarse.training_evaluator()
         self.assessor: Evaluator = problem.evaluator()
+        self.processes = processes or Processes()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
-        self.optimizer = self._make_optimizer() if settings.optimizer != "least_squares" else None
+        self.optimizer = (
+            make_optimizer(problem, settings, self.processes) if settings.optimizer != "least_squares" else None
+        )
         self.descents: list[Descent] = []
         self._steps_before = 0
         self._search_stop: list[str] = []
@@ -231,6 +285,8 @@ class _Fit:
         self.descents = Descent.restore(checkpoint)
 
     def _optimize(self) -> Outcome:
+        if self.optimizer is None or self.descents:
+            self.processes.agree(None)  # there is nothing to share: the others may go
         if not self.descents:
             if self.settings.start is not None and self.optimizer is None:
                 return self._refine_from(as_vector(self.problem, self.settings.start))
@@ -282,28 +338,16 @@ class _Fit:
             if probe is not None:
                 probe(optimizer)
             self._after_generation(optimizer)
+            agree_to_stop(optimizer, self.processes)
 
         if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
             probe(optimizer)
-        search(optimizer, self.searcher.rollout(optimizer.population_size), after_generation)
+        self.processes.agree((self.settings, optimizer.history, optimizer.line_generation))
+        search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
         self._write_mean(optimizer)
         best = optimizer.best if probe is None or probe.refined is None else probe.refined
         return [best, *other_valleys(self.problem.space, optimizer.best)]
-
-    def _make_optimizer(self) -> CMAESOptimizer:
-        cfg = self.problem.env_cfg.sim2real.cmaes
-        population = max(4, self.settings.num_envs // self.evaluator.dataset.num_recordings)
-        if self.settings.optimizer == "hybrid":
-            population = min(population, _HYBRID_POPULATION)
-        return CMAESOptimizer(
-            self.problem.space,
-            population,
-            cfg,
-            trees=self.problem.trees,
-            seed=self.settings.seed,
-            start=self.problem.space.start,
-        )
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history

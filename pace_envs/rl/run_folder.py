@@ -53,6 +53,9 @@ class RunSettings:
     """Checkpoint, or a run's folder for its last one, that the training goes on from in a folder of its own; its
     iterations count. ``None`` starts with new networks."""
 
+    device: str = "cpu"
+    """Where it is trained: ``cpu``, or a GPU as ``cuda:0``."""
+
     log_dir: str = "logs/rsl_rl"
     """Where runs are kept."""
 
@@ -85,7 +88,8 @@ class RunSettings:
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
             # not in older runs
-            added = dict.fromkeys(("identified", "randomize_identified", "physics_dt", "start_from"))
+            added: dict[str, Any] = dict.fromkeys(("identified", "randomize_identified", "physics_dt", "start_from"))
+            added["device"] = "cpu"
             settings = cls(**{field.name: (added | data)[field.name] for field in fields(cls)})
             record = EnvironmentRecord.read(data.get("environment"), settings.task)
         except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:

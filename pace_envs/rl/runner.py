@@ -39,6 +39,18 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         self.learning_threads = learning_threads or min(available_processors(), _MOST_THREADS)
         self.alg.update = _with_threads(self.alg.update, self.learning_threads)
 
+    def _configure_multi_gpu(self) -> None:
+        """Join torchrun's other processes: rsl-rl's own way on GPUs, by gloo on processors."""
+        if str(self.device) != "cpu" or int(os.environ.get("WORLD_SIZE", "1")) == 1:
+            super()._configure_multi_gpu()
+            return
+        count, rank = int(os.environ["WORLD_SIZE"]), int(os.environ["RANK"])
+        self.gpu_world_size, self.gpu_global_rank, self.is_distributed = count, rank, True
+        self.gpu_local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+        self.cfg["multi_gpu"] = {"global_rank": rank, "local_rank": self.gpu_local_rank, "world_size": count}
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("gloo", rank=rank, world_size=count)
+
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save networks, optimizer and the curriculum's state, whole or not at all."""
         part = Path(path).with_name(f".{Path(path).name}.part")

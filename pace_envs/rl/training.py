@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,12 @@ from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.task_source import EnvironmentRecord
 from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
+
+
+def process_number() -> int:
+    """Of several processes that torchrun started, this one's number."""
+    return int(os.environ.get("RANK", "0"))
+
 
 EditCfg = Callable[[VelocityEnvCfg], None]
 
@@ -45,7 +52,8 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
     _use_drives(cfg, settings)
     if settings.num_envs is not None:
         cfg.scene.num_envs = settings.num_envs
-    cfg.seed = cfg.runner.seed = settings.seed
+    cfg.seed = cfg.runner.seed = settings.seed + process_number()  # each process has environments of its own
+    cfg.sim.device = settings.device
     if settings.max_iterations is not None:
         if settings.max_iterations < 1:
             raise ValueError(f"max_iterations is {settings.max_iterations}, expected at least 1.")
@@ -81,8 +89,10 @@ def make_env(cfg: VelocityEnvCfg, render_mode: str | None = None) -> RslRlVecEnv
     return RslRlVecEnvWrapper(ManagerBasedRLEnv(cfg, render_mode), clip_actions=cfg.runner.clip_actions)
 
 
-def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
+def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
     """Train a policy; returns the run's folder, with checkpoints and the exported policy.
+
+    Of several processes that torchrun started, the first writes it; the others return ``None``.
 
     Args:
         settings: The training.
@@ -90,6 +100,8 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
     """
     cfg = load_cfg(settings, edit)
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)
+    if process_number():
+        return _learn(cfg, None, start)
     folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
     settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
     if settings.identified is not None:
@@ -98,8 +110,12 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path:
 
 
 def resume(
-    run: str | Path, max_iterations: int | None = None, edit: EditCfg | None = None, task: str | None = None
-) -> Path:
+    run: str | Path,
+    max_iterations: int | None = None,
+    edit: EditCfg | None = None,
+    task: str | None = None,
+    device: str | None = None,
+) -> Path | None:
     """Go on with a training in its folder, up to ``max_iterations`` in all.
 
     Raises:
@@ -109,16 +125,20 @@ def resume(
     settings = RunSettings.read(folder, task)
     if max_iterations is not None:
         settings = replace(settings, max_iterations=max_iterations)
+    if device is not None:
+        settings = replace(settings, device=device)
     checkpoint = latest_checkpoint(folder)
     cfg = load_cfg(settings, edit)
+    if process_number():
+        return _learn(cfg, None, checkpoint)
     settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
     return _learn(cfg, folder, checkpoint)
 
 
-def _learn(cfg: VelocityEnvCfg, folder: Path, checkpoint: Path | None) -> Path:
+def _learn(cfg: VelocityEnvCfg, folder: Path | None, checkpoint: Path | None) -> Path | None:
     torch.manual_seed(cfg.runner.seed)
     env = make_env(cfg)
-    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict(), str(folder))
+    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict(), None if folder is None else str(folder))
     if checkpoint is not None:
         runner.load(str(checkpoint))
         torch.manual_seed(cfg.runner.seed + runner.current_learning_iteration)
@@ -130,6 +150,7 @@ def _learn(cfg: VelocityEnvCfg, folder: Path, checkpoint: Path | None) -> Path:
             f"{cfg.runner.max_iterations} iterations. Raise --max_iterations."
         )
     runner.learn(left, init_at_random_ep_len=True)
-    export_policy(runner, folder / "exported")
+    if folder is not None:
+        export_policy(runner, folder / "exported")
     env.close()
     return folder

@@ -4,14 +4,15 @@ import sys
 
 import torch
 
-from pace_optim.fit import fit, resume
+from pace_optim.fit import fit, help_fit, resume
 from pace_optim.problem.problem import DELAY_MODES
+from pace_optim.problem.processes import join
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import given_options, make_parser
-from pace_optim.terminal.options import add_common_options, add_log_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
 
-_WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless")
+_WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless", "--device")
 """Options that a resumed run takes; it has the others from its start."""
 
 
@@ -22,6 +23,7 @@ def main() -> None:
         example="scripts/fit.py --task Pace-AnymalD-v0 --num_envs 512",
     )
     add_common_options(parser)
+    add_device_option(parser)
     parser.add_argument("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
     parser.add_argument(
         "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
@@ -57,14 +59,20 @@ def main() -> None:
     del args["headless"]
 
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
+    asked = args.pop("device")
+    processes, device = join(asked or "cpu")
+    if not processes.writes:
+        help_fit(processes, device, args["resume"], args["task"])
+        return
     if run := args.pop("resume"):
         if ignored := [option for option in given_options(parser) if option not in _WITH_RESUME]:
             print(f"note: --resume goes on with the run's own settings; ignored: {', '.join(ignored)}", file=sys.stderr)
-        result, folder = resume(run, args["max_iteration"], task=args["task"])
+        own = asked and device
+        result, folder = resume(run, args["max_iteration"], task=args["task"], device=own, processes=processes)
     else:
         if args["task"] is None:
             raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
-        result, folder = fit(FitSettings(**args))
+        result, folder = fit(FitSettings(**args, device=device), processes=processes)
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
     print(f"run: {folder}")

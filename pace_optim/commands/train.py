@@ -6,8 +6,9 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from pace_envs.rl import RunSettings, resume, train
+from pace_optim.problem.processes import own_device
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options
 
 
 def main() -> None:
@@ -17,6 +18,7 @@ def main() -> None:
         example="scripts/train.py --task Pace-AnymalD-Velocity-v0 --max_iterations 500",
     )
     add_common_options(parser)
+    add_device_option(parser)
     parser.add_argument("--num_envs", type=int, help="robots at once (default: the task's)")
     parser.add_argument("--max_iterations", type=int, help="iterations in all (default: the task's)")
     parser.add_argument("--seed", type=int, default=42)
@@ -33,10 +35,13 @@ def main() -> None:
     parser.add_argument("--log_dir", default="logs/rsl_rl", metavar="DIR", help="where runs are kept")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted or finished run")
     args = take_common_options(vars(parser.parse_args()))
+    asked = args.pop("device")
+    device = own_device(asked or "cpu")
     if run := args.pop("resume"):
-        folder = resume(run, args["max_iterations"], task=args["task"])
+        folder = resume(run, args["max_iterations"], task=args["task"], device=asked and device)
     else:
         if args["task"] is None:
             raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
-        folder = train(RunSettings(**args))
-    print(f"run: {folder}")
+        folder = train(RunSettings(**args, device=device))
+    if folder is not None:
+        print(f"run: {folder}")

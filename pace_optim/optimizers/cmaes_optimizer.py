@@ -11,6 +11,7 @@ from pace_envs.tasks.pace import CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import Criterion, ScoreSpread
 from pace_optim.optimizers.tree_strategy import DIVERGED_SCORE, TreeStrategy
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.processes import Processes
 from pace_optim.problem.rollout import Rollout
 
 _CONSENSUS_SPREAD = 0.002
@@ -53,6 +54,7 @@ class CMAESOptimizer:
         seed: int = 0,
         start: torch.Tensor | None = None,
         criteria: Sequence[Criterion] | None = None,
+        processes: Processes | None = None,
     ):
         """Prepare the search.
 
@@ -64,6 +66,7 @@ class CMAESOptimizer:
             seed: Seed of the search.
             start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
             criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
+            processes: Who shares the candidates: each process has the same strategies, and simulates its part.
 
         Raises:
             ValueError: If the population is too small.
@@ -75,7 +78,9 @@ class CMAESOptimizer:
             )
         self.space = space
         self.cfg = cfg
+        self.processes = processes or Processes()
         self.population_size = population_size
+        self._shown_here = self.num_shown
         self.generation = 0
         self.history: list[np.ndarray] = []
         self.best_scores: list[float] = []
@@ -154,14 +159,18 @@ class CMAESOptimizer:
         Raises:
             ValueError: If the rollout is of another number of candidates.
         """
-        if rollout.num_candidates != self.population_size:
+        mine = self.processes.share(self.population_size)
+        self._shown_here = len(range(*mine.indices(self.population_size)))
+        if rollout.num_candidates != self._shown_here:
             raise ValueError(
-                f"There are {self.population_size} candidates in a generation, but the rollout simulates "
-                f"{rollout.num_candidates}. Take evaluator.rollout(optimizer.population_size)."
+                f"There are {self._shown_here} candidates of a generation to simulate here, but the rollout simulates "
+                f"{rollout.num_candidates}. Take evaluator.rollout(optimizer.num_shown)."
             )
-        rollout.start(self.candidates, per_joint=self._per_joint_copies())
+        copies = {name: values[mine] for name, values in self._per_joint_copies().items()}
+        rollout.start(self.candidates[mine], per_joint=copies)
         self.sim_params = rollout.physical
-        self.scores_buffer = torch.zeros(rollout.env.num_envs, len(self.joint_names), dtype=torch.float64)
+        shape = rollout.env.num_envs, len(self.joint_names)
+        self.scores_buffer = torch.zeros(shape, dtype=torch.float64, device=rollout.env.device)
         self.rollout = rollout
 
     def tell(self, sim_dof_pos: torch.Tensor, real_dof_pos: torch.Tensor) -> None:
@@ -204,7 +213,7 @@ class CMAESOptimizer:
         """End the generation: strategies learn from the scores."""
         if self.scores_buffer is None:
             raise ValueError("There are no scores to learn from. Call update_simulator and tell first.")
-        per_joint = self.scores_buffer.view(self.population_size, -1, len(self.joint_names)).sum(dim=1)
+        per_joint = self._of_all(self.scores_buffer.view(self._shown_here, -1, len(self.joint_names)).sum(dim=1))
         scores = torch.zeros(self.population_size, len(self.strategies), dtype=torch.float64)
         scores.index_add_(1, self._joint_group, per_joint)
         self.scores_buffer = None  # the next generation needs a rollout of its own
@@ -224,6 +233,11 @@ class CMAESOptimizer:
         self.rollout = None
 
     # ------------------------------------------------------------------ results
+
+    @property
+    def num_shown(self) -> int:
+        """Candidates of a generation that this process simulates."""
+        return len(range(*self.processes.share(self.population_size).indices(self.population_size)))
 
     @property
     def best_score(self) -> float:
@@ -284,6 +298,10 @@ class CMAESOptimizer:
                 after_generation(self)
 
     # ------------------------------------------------------------------ inside
+
+    def _of_all(self, scores: torch.Tensor) -> torch.Tensor:
+        """The scores of all candidates, from this process's own, on the processor."""
+        return self.processes.gather(scores, self.population_size).cpu()
 
     def _learn(self, scores: np.ndarray) -> None:
         self.scores = scores

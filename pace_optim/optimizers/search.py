@@ -11,6 +11,7 @@ from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import Colouring
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.processes import Processes
 from pace_optim.problem.rollout import Rollout
 
 _PROBE_ITERATIONS = 4
@@ -35,6 +36,13 @@ def search(
         optimizer.evolve()
         if after_generation is not None:
             after_generation(optimizer)
+
+
+def agree_to_stop(optimizer: CMAESOptimizer, processes: Processes) -> None:
+    """Stop where the process that writes has stopped: it may know more than the scores say."""
+    reasons = processes.agree(optimizer.stop_reasons)
+    if reasons and processes.count > 1:
+        optimizer.stop(reasons[0])
 
 
 class RefiningPays:

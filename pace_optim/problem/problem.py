@@ -42,6 +42,8 @@ class Problem:
     delay_mode: Literal["command", "effort"]
     control_dt: float
     """Control step [s]."""
+    device: str = "cpu"
+    """Where environments are built."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -58,10 +60,11 @@ class Problem:
         """Longest physics step that the drives allow [s]: the control step, unless a drive runs faster."""
         return self.plain_cfg.sim.dt
 
-    def for_search(self) -> Problem:
-        """The same at a longer physics step, to lead a search, where drives run continuously: all are stable."""
+    def for_search(self, device: str = "cpu") -> Problem:
+        """The same on a device, and at a longer physics step where drives run continuously: there all are stable."""
         implicit = any(drive.implicit for drive in self.plain_cfg.scene.robot.actuators.values())
-        return self.with_physics_dt(self.coarsest_dt) if implicit else self
+        problem = self.with_physics_dt(self.coarsest_dt) if implicit else self
+        return problem if device == problem.device else replace(problem, device=device)
 
     @property
     def effects(self) -> list[str]:
@@ -82,6 +85,7 @@ class Problem:
         """
         cfg = copy.deepcopy(self.env_cfg)
         cfg.scene.num_envs = num_envs
+        cfg.sim.device = self.device
         cfg.sim.class_type = simulation or cfg.sim.class_type
         return ManagerBasedRLEnv(cfg)
 

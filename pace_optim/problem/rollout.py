@@ -54,16 +54,17 @@ class Rollout:
             )
         self.env = env
         self.robot = env.scene["robot"]
-        self.dataset = dataset
+        self.dataset = dataset.to(env.device, env.dtype)
         self.space = space
         self.num_candidates = env.num_envs // count
         self.simulated_steps = 0
-        self._where = dataset.train
+        self._where = self.dataset.train
+        self._enable_changes = _changes(dataset.torque_enable)
         self.weight: torch.Tensor | float = 0.0
         self.physical = torch.empty(0)
         for r in range(count):
             self._set_facts(r)
-        begin = dataset.session_start.repeat(self.num_candidates)[:, None]
+        begin = self.dataset.session_start.repeat(self.num_candidates)[:, None]
         self._session_start = begin.expand(-1, self.robot.num_joints)
 
     @property
@@ -98,17 +99,18 @@ class Rollout:
             initial_offset: Added to each recording's first position, (num_candidates, n) [rad].
         """
         count = self.dataset.num_recordings
-        self._where = self.dataset.train if where is None else where
-        self.physical = physical.repeat_interleave(count, dim=0)
+        self.look_at(self.dataset.train if where is None else where)
+        on_device = self.env.sim.tensor
+        self.physical = on_device(physical).repeat_interleave(count, dim=0)
         self.env.scene.reset()
-        copies = {name: values.repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
+        copies = {name: on_device(values).repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
         self.space.apply(self.env, self.physical, copies)
-        self.begin(0.0 if initial_offset is None else initial_offset.repeat_interleave(count, dim=0))
+        self.begin(0.0 if initial_offset is None else on_device(initial_offset).repeat_interleave(count, dim=0))
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
         data = self.dataset
-        weights = self._where.double() / self._where.sum()
+        weights = (self._where.double() / self._where.sum()).to(self.env.dtype)
         counts = self._where.any(dim=1).tolist()
         for k, sim_dof_pos in self._samples():
             self._step = k
@@ -127,7 +129,8 @@ class Rollout:
         ahead = max(0, math.ceil(-float(lag.min()))) + 2
         behind = max(0, math.ceil(float(lag.max()))) + 2
         length = ahead + behind + 1
-        seen = torch.zeros(length, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        shape = length, self.env.num_envs, self.robot.num_joints
+        seen = torch.zeros(shape, dtype=self.env.dtype, device=self.env.device)
         late = (lag != 0).any(dim=2).any(dim=0).nonzero()[:, 0]
         first = lag[0, late]
         rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
@@ -143,7 +146,8 @@ class Rollout:
     def _observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
         dt = self.env.step_dt
-        total = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=torch.float64)
+        shape = 2, self.env.num_envs, self.robot.num_joints
+        total = torch.zeros(shape, dtype=self.env.dtype, device=self.env.device)
         start = self._rows(self.dataset.start_time[:, None])
         found = False
         for actuator in self.robot.actuators.values():
@@ -164,7 +168,7 @@ class Rollout:
             if j + 1 == steps:
                 break
             k = min(j, last)
-            if enable is not None and (j == 0 or not torch.equal(enable[k], enable[k - 1])):
+            if enable is not None and (j == 0 or k in self._enable_changes):
                 for actuator in self.robot.actuators.values():
                     actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
             if data.command_vel is not None:
@@ -183,7 +187,7 @@ class Rollout:
 
     def look_at(self, where: torch.Tensor) -> None:
         """Say which samples count, (T, R) bool."""
-        self._where = where
+        self._where = where.to(self.env.device)
 
     def positions_at_every_step(self) -> Iterator[torch.Tensor]:
         """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
@@ -216,13 +220,13 @@ class Rollout:
             for name in _DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
                 if value is not None:
-                    own = torch.as_tensor(value)[actuator.joint_indices]
+                    own = self.env.sim.tensor(value)[actuator.joint_indices]
                     if name == "saturation_effort":
                         own = own.clamp(max=torch.finfo(own.dtype).max)  # infinite: no torque-speed line
                     getattr(actuator, name)[rows] = own
             for name, loop in (("stiffness", position), ("damping", position | velocity)):  # without a target, no loop
                 gain = getattr(actuator, name)[rows]
-                gain[:, ~torch.as_tensor(loop)[actuator.joint_indices]] = 0.0
+                gain[:, ~torch.as_tensor(loop, device=gain.device)[actuator.joint_indices]] = 0.0
         load = {
             key: value
             for key in ("load_mass", "load_length", "arm_mass")
@@ -235,11 +239,18 @@ class Rollout:
             self.robot.add_body_mass(body, mass, rows)
 
 
+def _changes(enable: torch.Tensor | None) -> frozenset[int]:
+    """Steps at which a (T, R) mask is another than at the step before."""
+    if enable is None:
+        return frozenset()
+    return frozenset(((enable[1:] != enable[:-1]).any(dim=1).nonzero()[:, 0] + 1).tolist())
+
+
 def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
     """A ring of samples (length, m, n) at real-valued steps (m, n), by the cubic through four samples (Lagrange)."""
     whole = at.floor()
     f = (at - whole)[None]
-    index = whole.long()[None] + torch.arange(-1, 3)[:, None, None]
+    index = whole.long()[None] + torch.arange(-1, 3, device=at.device)[:, None, None]
     samples = seen.gather(0, index % len(seen))
     weights = torch.cat(
         [

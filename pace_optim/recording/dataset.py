@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -75,6 +75,16 @@ class Dataset:
             start_time=self.start_time[chosen],
             start_vel=self.start_vel[chosen],
         )
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> Dataset:
+        """The same with all tensors on a device, numbers of a type; itself where nothing changes."""
+        if self.command.device == device and self.command.dtype == dtype:
+            return self
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        for name, value in values.items():
+            if isinstance(value, torch.Tensor):
+                values[name] = value.to(device, dtype if value.is_floating_point() else value.dtype)
+        return Dataset(**values)
 
     def on_joints(self, joints: Sequence[int]) -> Dataset:
         """The same of some of the joints, by index."""

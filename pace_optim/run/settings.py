@@ -73,6 +73,9 @@ class FitSettings:
     strict: bool = False
     """Whether one recording that cannot be used refuses all, instead of being set aside."""
 
+    device: str = "cpu"
+    """Where the search simulates: ``cpu``, or a GPU as ``cuda:0``; the rest runs on the processor, in float64."""
+
     log_dir: str = "logs/pace"
     """Where runs are kept."""
 

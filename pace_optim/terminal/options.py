@@ -8,6 +8,13 @@ from typing import Any
 _TASK = "registered environment, module:Name, FILE.py:Name, or a model file"
 
 
+def add_device_option(parser: argparse.ArgumentParser) -> None:
+    """Where a command simulates."""
+    parser.add_argument(
+        "--device", metavar="DEVICE", help="cpu (default), or a GPU: cuda:0, cuda:1, ...; needs pace-mujoco[gpu]"
+    )
+
+
 def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, required: bool = False) -> None:
     """Options of every command that has to do with a robot.
 

@@ -1,0 +1,99 @@
+"""The processes that share a job, started by torchrun: who does which part, and who writes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+_LOST_AFTER = timedelta(minutes=10)
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Processes that share candidates; one alone, unless :func:`join` has found others."""
+
+    rank: int = 0
+    """This one's number."""
+    count: int = 1
+    """How many there are."""
+
+    @property
+    def writes(self) -> bool:
+        """Whether this is the one that writes files and prints."""
+        return self.rank == 0
+
+    def share(self, size: int) -> slice:
+        """This process's part of so many candidates; parts differ by one at most."""
+        return slice(size * self.rank // self.count, size * (self.rank + 1) // self.count)
+
+    def gather(self, mine: torch.Tensor, size: int) -> torch.Tensor:
+        """All rows (size, ...) of which each process has its share.
+
+        Raises:
+            ValueError: If another process is lost.
+        """
+        if self.count == 1:
+            return mine
+        whole = torch.zeros((size, *mine.shape[1:]), dtype=mine.dtype)
+        whole[self.share(size)] = mine.cpu()
+        _together(lambda: dist.all_reduce(whole))  # each row has one process that is not zero: the sum is exact
+        return whole
+
+    def agree(self, value: Any) -> Any:
+        """What the writing process has, in all of them.
+
+        Raises:
+            ValueError: If another process is lost.
+        """
+        if self.count == 1:
+            return value
+        held = [value]
+        _together(lambda: dist.broadcast_object_list(held, src=0))
+        return held[0]
+
+    def leave(self) -> None:
+        """End the sharing."""
+        if self.count > 1 and dist.is_initialized():
+            dist.destroy_process_group()
+
+
+def join(device: str = "cpu") -> tuple[Processes, str]:
+    """Find the other processes of a ``torchrun``, and this one's device.
+
+    Args:
+        device: ``"cpu"``, or ``"cuda"`` with any number: each process takes the GPU of its own number on its host.
+
+    Raises:
+        ValueError: If the others cannot be reached.
+    """
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        return Processes(), device
+    own = own_device(device)
+    if not dist.is_initialized():  # scores are few numbers: by gloo, which tells of a lost process at once
+        _together(lambda: dist.init_process_group("gloo", timeout=_LOST_AFTER))
+    return Processes(rank=dist.get_rank(), count=dist.get_world_size()), own
+
+
+def own_device(device: str) -> str:
+    """This process's device: of several that torchrun started on a host, each takes the GPU of its own number."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not device.startswith("cuda"):
+        return device
+    return f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
+
+
+def _together(action: Callable[[], object]) -> None:
+    try:
+        action()
+    except (RuntimeError, dist.DistBackendError) as error:
+        first = str(error).splitlines()[0]
+        raise ValueError(
+            f"A process that shares this job was lost ({first}). Its own message says why; --resume goes on from the "
+            "last checkpoint."
+        ) from None
