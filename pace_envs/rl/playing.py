@@ -57,6 +57,9 @@ class PlaySettings:
     export: str | None = None
     """Folder for the policy as TorchScript and ONNX."""
 
+    device: str = "cpu"
+    """Where it walks: ``cpu``, or a GPU as ``cuda:0``; wherever it was trained."""
+
 
 def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | None:
     """Play a policy; returns its figures, or nothing after a window was closed.
@@ -116,5 +119,6 @@ def _run_settings(checkpoint: Path, settings: PlaySettings) -> RunSettings:
         raise ValueError(f"There is no {SETTINGS_FILE} beside {checkpoint}: say with --task what it was trained for.")
     run.task = settings.task or run.task
     run.num_envs, run.seed, run.randomize = settings.num_envs, settings.seed, False
+    run.device = settings.device
     run.randomize_identified, run.identified = None, settings.identified or run.identified
     return run

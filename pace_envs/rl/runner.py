@@ -67,7 +67,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         """
         if not Path(path).is_file():
             raise ValueError(f"The checkpoint {path} does not exist.")
-        content = read_checkpoint(path, map_location)
+        content = read_checkpoint(path, map_location or str(self.device))  # wherever it was trained
         try:
             if self.alg.load(content, load_cfg, strict):
                 self.current_learning_iteration = int(content["iter"])

@@ -11,7 +11,7 @@ if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
 from pace_optim.run.training_replay import replay_in_training  # noqa: E402
 from pace_optim.terminal.cli import make_parser  # noqa: E402
-from pace_optim.terminal.options import add_common_options, take_common_options  # noqa: E402
+from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options  # noqa: E402
 
 
 def main() -> None:
@@ -23,6 +23,7 @@ def main() -> None:
     )
     parser.add_argument("--checkpoint", metavar="FILE", help="model_<n>.pt, or a run for its last one")
     add_common_options(parser, run=True)
+    add_device_option(parser)
     parser.add_argument("--num_envs", type=int, default=256, help="robots that are judged (default 256)")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long (default 20)")
     parser.add_argument("--seed", type=int, default=0)
@@ -46,6 +47,7 @@ def main() -> None:
     if args["checkpoint"] is None:
         raise ValueError("--checkpoint is missing: name a model_<n>.pt or a training's folder, or a fit with --replay.")
     args["command"] = tuple(args["command"]) if args["command"] else None
+    args["device"] = args["device"] or "cpu"
     result = play(PlaySettings(**args))
     if result is not None:
         print(result)
