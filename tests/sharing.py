@@ -1,0 +1,40 @@
+"""What tests/test_several_processes.py starts once per rank: a few generations of a search, shared by gloo."""
+
+import os
+import sys
+from dataclasses import replace
+
+import torch
+
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.refine import beginning
+from pace_optim.optimizers.search import search
+from pace_optim.problem.problem import load_problem
+from pace_optim.problem.processes import join
+from pace_optim.terminal.cli import run_cli
+
+GENERATIONS = 3
+
+
+def main() -> None:
+    """Search, and print all scores; the rank named by LOSE ends without a word after the first generation."""
+    torch.set_num_threads(1)
+    processes, _ = join("cpu")
+    problem = load_problem("Pace-TestBench-v0")
+    evaluator = problem.training_evaluator()
+    where = beginning(evaluator.dataset, 0.1)
+    optimizer = CMAESOptimizer(problem.space, 9, problem.env_cfg.sim2real.cmaes, processes=processes)
+
+    def after_generation(_: CMAESOptimizer) -> None:
+        if os.environ.get("LOSE") == str(processes.rank):
+            os._exit(9)
+        if optimizer.generation == GENERATIONS:
+            optimizer.stop("enough")
+
+    evaluator.dataset = replace(evaluator.dataset, train=where)
+    search(optimizer, evaluator.rollout(optimizer.num_shown), after_generation)
+    print([scores.tolist() for scores in optimizer.history])
+
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))

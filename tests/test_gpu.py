@@ -1,0 +1,69 @@
+"""The environments on a GPU; left out where there is none."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs.simulation import SimulationCfg, make_simulation
+
+NO_GPU = "torch finds no CUDA here"
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
+
+
+def _env(task: str, device: str, graphs: bool = True, num_envs: int = 8) -> ManagerBasedRLEnv:
+    cfg = load_env_cfg(task)
+    cfg.scene.num_envs, cfg.seed, cfg.sim.device, cfg.sim.graphs = num_envs, 0, device, graphs
+    return ManagerBasedRLEnv(cfg)
+
+
+@pytest.fixture(autouse=True)
+def _needs_warp(request: pytest.FixtureRequest) -> None:
+    if request.node.get_closest_marker("skipif"):
+        pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed: pip install 'pace-mujoco[gpu]'")
+
+
+def test_a_missing_gpu_or_package_is_told_in_one_sentence():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    with pytest.raises(ValueError, match=r"MuJoCo Warp, which is not installed|torch finds no CUDA"):
+        make_simulation(SimulationCfg(device="cuda:0"), None, 1)  # type: ignore[arg-type]
+
+
+@on_gpu
+@pytest.mark.parametrize("task", ["Pace-AnymalD-v0", "Pace-AnymalD-Velocity-v0"])
+def test_both_devices_and_both_ways_move_the_same(task: str):
+    cpu, graphs, plain = _env(task, "cpu"), _env(task, "cuda:0"), _env(task, "cuda:0", graphs=False)
+    for env in (cpu, graphs, plain):
+        env.reset(seed=1)
+    for env in (graphs, plain):
+        env.sim.qpos.copy_(cpu.sim.qpos)
+        env.sim.qvel.copy_(cpu.sim.qvel)
+    generator = torch.Generator().manual_seed(0)
+    for k in range(20):  # on its feet, rounding grows with every contact
+        if k % 10 == 0:
+            action = 0.3 * torch.randn(8, cpu.action_manager.total_action_dim, generator=generator)
+        for env in (cpu, graphs, plain):
+            env.simulate(action.to(env.device))
+    reference = cpu.sim.qpos.float()
+    assert torch.allclose(graphs.sim.qpos.cpu(), reference, rtol=0.0, atol=2e-5)
+    assert torch.allclose(plain.sim.qpos.cpu(), reference, rtol=0.0, atol=2e-5)
+    assert graphs._drive_graphs is not None and graphs._drive_graphs.num_graphs
+
+
+@on_gpu
+def test_reset_environments_forget_their_delayed_commands_in_graphs_too():
+    env, plain = _env("Pace-AnymalD-v0", "cuda:0"), _env("Pace-AnymalD-v0", "cuda:0", graphs=False)
+    for each in (env, plain):
+        for drive in each.scene["robot"].actuators.values():
+            drive.update_time_lags(2.5)
+        each.reset(seed=0)
+    for k in range(60):
+        if k in (20, 41):
+            for each in (env, plain):
+                each.reset(env_ids=torch.tensor([1, 5], device=each.device))
+        action = torch.full((8, 12), 0.01 * k, device="cuda:0")
+        env.simulate(action)
+        plain.simulate(action)
+        assert torch.equal(env.sim.qpos, plain.sim.qpos), k
