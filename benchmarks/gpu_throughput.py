@@ -3,7 +3,7 @@
     python benchmarks/gpu_throughput.py [--task Pace-AnymalD-v0] [--num_envs 512 4096 16384 65536] [--steps 200]
 
 The environment steps on random targets and its torques are kept; then both start from the same state again and
-again, in turns: ``env.simulate`` (action, drives, physics, sensors' fields), and the physics alone with those torques copied in.
+again, in turns: ``env.simulate`` (action, drives, physics), and the physics alone with those torques copied in.
 For walking tasks ``env.step`` is timed, too: rewards, ends, resets, commands, observations.
 """
 
