@@ -109,6 +109,8 @@ def test_a_joint_without_position_commands_keeps_its_place_and_has_no_position_l
         ({"des_time": 50.0 + np.arange(100.0)}, ["des_time", "do not meet"]),
         ({"des_time": NOON + np.arange(100.0)}, ["des_time is Unix time", "one clock"]),
         ({"des_dof_vell": POS}, ["did you mean 'des_dof_vel'"]),
+        ({"time": np.arange(100.0)}, ["steps by 1", "1 Hz in seconds", "1 kHz in milliseconds"]),
+        ({"dof_pos": POS * 1e160}, ["dof_pos is", "e+159", "knee"]),
         ({"time_origin": "yesterday"}, ["time_origin", "'yesterday'"]),
         ({"time_origin": [1.0, 2.0]}, ["time_origin is [1.0, 2.0]"]),
         ({"time_origin": 3.0, "time": NOON + fields_of()["time"]}, ["time_origin", "Unix time already"]),
@@ -180,3 +182,11 @@ def test_the_start_may_be_a_fact_beside_a_file_that_begins_at_zero(tmp_path):
     path.with_suffix(".json").write_text(json.dumps({"time_origin": "2025-11-24T16:00:00Z"}))
     assert load_recording(path).start_stamp == NOON
     assert load_recording(path).joint_names == JOINTS
+
+
+def test_a_timer_that_runs_late_is_put_on_the_grid():
+    time = 0.0502 * np.arange(200)
+    conformed = conform(recording(time, dof_pos=position(0.3 * time)))
+    assert conformed.sample_stride == 20
+    inner = np.s_[2:-2]  # cubics have no neighbours at the ends
+    assert np.abs(conformed.dof_pos - position(0.3 * conformed.time))[inner].max() < 5e-4

@@ -12,6 +12,8 @@ from .facts import drive_of, joint_names_of, load_of
 from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, SERIES, closest, listed
 from .stamps import seconds_of
 
+_HUGE = 1e6
+"""No joint turns so far or so fast [rad], [rad/s]."""
 MIN_SAMPLES = 20
 """Fewer samples than this are not a recording."""
 
@@ -203,6 +205,13 @@ def _torque_enable(value: Any, num_samples: int, source: str) -> np.ndarray:
 
 def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], source: str) -> None:
     finite = np.isfinite(array)
+    if key.endswith(("dof_pos", "dof_vel")) and np.any(huge := finite & (np.abs(array) > _HUGE)):
+        sample, joint = np.argwhere(huge)[0]
+        name = joint_names[joint] if joint_names else joint
+        raise ValueError(
+            f"{source}: {key} is {array[sample, joint]:.3g} at sample {sample}, joint {name}; expected rad (or rad/s), "
+            f"below {_HUGE:g}. Correct the value, or cut the file there."
+        )
     if finite.all():
         return
     if array.ndim == 2 and key != "dof_pos":
@@ -260,10 +269,15 @@ def _check_time(key: str, time: np.ndarray, source: str) -> None:
     if not len(step):
         return
     median = float(np.median(step))
+    if 0.5 <= median < 1.5 and key == "time":
+        raise ValueError(
+            f"{source}: time steps by {median:g}: that is {1 / median:.3g} Hz in seconds, too slow for joints (20 Hz "
+            "at least), or 1 kHz in milliseconds. Record faster, or divide time by 1000 if it is in milliseconds."
+        )
     for threshold, unit, factor in (
         (5e5, "nanoseconds", 1e9),
         (500.0, "microseconds", 1e6),
-        (0.5, "milliseconds", 1e3),
+        (1.5, "milliseconds", 1e3),
     ):
         if median >= threshold and key == "time":
             raise ValueError(
