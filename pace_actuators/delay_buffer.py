@@ -6,7 +6,12 @@ from typing import Literal
 
 import torch
 
+from pace_actuators.memory import check_memory
+
 Interpolation = Literal["linear", "hold"]
+
+_LARGE = 1e7
+"""Samples from where on it is looked whether there is memory for them."""
 
 
 class DelayBuffer:
@@ -50,6 +55,12 @@ class DelayBuffer:
             raise ValueError(f"max_delay is {max_delay}, expected a finite number of steps >= 0.")
         if interpolation not in ("linear", "hold"):
             raise ValueError(f"Unknown delay interpolation {interpolation!r}. Available: 'linear', 'hold'.")
+        if max_delay * num_envs > _LARGE and torch.device(device).type == "cpu":
+            check_memory(
+                8.0 * max_delay * num_envs,
+                f"max_delay = {max_delay:g} steps in {num_envs} environments",
+                "Lower max_delay in the drive's configuration, or take fewer environments.",
+            )
         self.max_delay = float(max_delay)
         self.interpolation = interpolation
         self.parts = parts

@@ -15,6 +15,7 @@ import torch
 from mujoco import batch
 
 from pace_actuators.effects import Effect
+from pace_actuators.memory import check_memory
 
 EnvIds = Sequence[int] | torch.Tensor | np.ndarray | slice | None
 
@@ -297,6 +298,11 @@ class Simulation:
 
     def _start(self) -> None:
         """Make the copies of the model and their data."""
+        check_memory(
+            self.num_envs * bytes_per_env(self.model),
+            f"num_envs = {self.num_envs}: that many simulations of this model",
+            "Take fewer environments.",
+        )
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(_ignore_warning)
         threads = self.cfg.num_threads or available_processors()
@@ -325,6 +331,11 @@ class Simulation:
             return spec.compile()
         except ValueError as error:
             raise ValueError(f"MuJoCo cannot compile the model: {error}") from None
+
+
+def bytes_per_env(model: mujoco.MjModel) -> int:
+    """Memory that one more environment takes, with its drive and terms [bytes]; measured on the robots here."""
+    return 4000 + 400 * model.nv
 
 
 def _ignore_warning(message: str) -> None:

@@ -23,6 +23,7 @@ from pace_optim.optimizers.search import RefiningPays, agree_to_stop, search
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.problem.processes import Processes
+from pace_optim.problem.try_out import check_size, try_out
 from pace_optim.report import write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
@@ -198,15 +199,10 @@ def _load(settings: FitSettings, env_cfg: Any) -> Problem:
         )
     if not bool((problem.space.upper > problem.space.lower).any()):
         raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
-    _try_out(problem)
+    try_out(problem)
+    if settings.optimizer == "cmaes":  # the others choose how much they simulate at once
+        check_size(problem, settings.num_envs)
     return problem
-
-
-def _try_out(problem: Problem) -> None:
-    """Write one candidate to one simulation of each recording: what cannot be applied fails before anything is kept."""
-    rollout = problem.evaluator().rollout(1)
-    rollout.start(problem.space.to_physical(problem.space.start[None]))
-    rollout.env.close()
 
 
 @dataclass(kw_only=True, eq=False)
@@ -343,6 +339,7 @@ class _Fit:
         if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
             probe(optimizer)
         self.processes.agree((self.settings, optimizer.history, optimizer.line_generation))
+        self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
         self._write_mean(optimizer)

@@ -33,6 +33,7 @@ def record(effect: str, joints: str, duration: float, seed: int, folder: Path) -
             effect_joints=joints,
             noise=NOISE,
             output=folder / f"{motion}.npz",
+            overwrite=True,
         )
         for motions in MOTIONS.values()
         for motion in motions

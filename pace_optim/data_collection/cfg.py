@@ -63,6 +63,8 @@ class CollectionCfg:
     """Whether to draw nothing."""
     positions_only: bool = False
     """Whether to leave ``dof_vel`` out of the recording."""
+    overwrite: bool = False
+    """Whether files that exist are replaced; otherwise they are refused, for they may be measurements."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -90,6 +90,7 @@ def make_collection_parser() -> Parser:
     encoder.add_argument("--noise", type=float, default=0.0, metavar="RAD", help="standard deviation (default 0)")
     encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
     files = parser.add_argument_group("files")
+    files.add_argument("--overwrite", action="store_true", help="replace files that exist")
     files.add_argument("--positions_only", action="store_true", help="leave dof_vel out: half the size")
     files.add_argument(
         "--export_command", type=Path, metavar="FILE.csv", help="write time and targets alone, to play on a robot"

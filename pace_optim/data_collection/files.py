@@ -32,7 +32,7 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
         names: Names of the trajectories; with several, each adds its own to the stem of its files.
 
     Raises:
-        ValueError: If a suffix is wrong, a path is taken by a folder, or two files have the same name.
+        ValueError: If a suffix is wrong, a path is taken, or two files have the same name.
     """
     _check("--output", cfg.output, SUFFIXES)
     _check("--export_command", cfg.export_command, (".csv",))
@@ -55,6 +55,14 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     paths = [path for file in files for path in (file.recording, file.command, file.plot) if path]
     if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
+    csv = [file.recording for file in files if file.recording is not None and file.recording.suffix.lower() == ".csv"]
+    facts = [path.with_suffix(".json") for path in csv]
+    truth = [truth_file(cfg, robot_name)] if cfg.effects else []
+    if not cfg.overwrite and (there := [str(path) for path in (*paths, *facts, *truth) if path.exists()]):
+        raise ValueError(
+            f"{', '.join(there)} {'exist' if len(there) > 1 else 'exists'}, and may be a measurement. Choose another "
+            "--output, or replace what is there with --overwrite."
+        )
     return files
 
 

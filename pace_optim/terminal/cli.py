@@ -11,6 +11,7 @@ if __name__ == "__main__":
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import os
 import re
@@ -18,6 +19,10 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
+from pace_optim.terminal.faults import is_of_input, own_code, sentence
+from pace_optim.terminal.screen import one_line, safe_streams
+
+FAULT = 1
 USER_ERROR = 2
 INTERRUPTED = 130
 _CONSOLE = "pace "
@@ -27,22 +32,43 @@ _CONSOLE = "pace "
 def run_cli(main: Callable[[], int | None]) -> int:
     """Run a command; return its exit code.
 
-    What a user can mend (ValueError, KeyError, OSError) is printed to stderr as one line, ``error: ...``, and exits
-    with 2; an interruption exits with 130. With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
+    What a user can mend (ValueError, KeyError, OSError, too little memory, code of the user's own) is printed to
+    stderr as one line, ``error: ...``, and exits with 2; a fault of the program exits with 1, an interruption with 130.
+    With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
     """
+    with safe_streams():
+        return _run(main)
+
+
+def _run(main: Callable[[], int | None]) -> int:
     try:
-        return main() or 0
+        status = main() or 0
+        sys.stdout.flush()
+        return status
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 0
-    except (ValueError, KeyError, OSError) as error:
+    except Exception as error:
         if os.environ.get("PACE_TRACEBACK"):
             raise
-        print(f"error: {as_called(_one_line(error))}", file=sys.stderr)
-        return USER_ERROR
+        _drop_output(unless_it_can=True)
+        print(f"error: {one_line(as_called(sentence(error)))}", file=sys.stderr)
+        return USER_ERROR if is_of_input(error) or own_code(error) else FAULT
+
+
+def _drop_output(*, unless_it_can: bool = False) -> None:
+    """Write what is left of the output nowhere: the interpreter would try, and complain, when it ends."""
+    try:
+        if unless_it_can:
+            sys.stdout.flush()
+            return
+    except (OSError, ValueError):
+        pass
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def command(verb: str) -> str:
@@ -71,7 +97,7 @@ class Parser(argparse.ArgumentParser):
                 ):
                     match = next(k for k in known if k.replace("-", "_") == close[0])
                     message += f"; did you mean {match} instead of {option}?"
-        print(f"error: {message.rstrip('.')}. See {self.prog} --help.", file=sys.stderr)
+        print(f"error: {one_line(message).rstrip('.')}. See {self.prog} --help.", file=sys.stderr)
         raise SystemExit(USER_ERROR)
 
 
@@ -91,13 +117,3 @@ def make_parser(description: str, *, example: str) -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-
-
-def _one_line(error: BaseException) -> str:
-    if isinstance(error, KeyError) and error.args:
-        text = str(error.args[0])  # str(KeyError) is a repr
-    elif isinstance(error, OSError) and error.strerror:
-        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    else:
-        text = str(error) or type(error).__name__
-    return " ".join(text.split())
