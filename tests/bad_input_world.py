@@ -89,8 +89,16 @@ def run(name: str, *words: str) -> int:
     return 0
 
 
-def build(folder: Path) -> Path:
+SLOW = ("diagnose", "train", "play", "replay")
+"""Scripts, and commands, that are left out where time is short."""
+
+
+def build(folder: Path, *, quick: bool = False) -> Path:
     """Make the files in a folder, through the command lines; a fit, a diagnosis and a training are as small as can be.
+
+    Args:
+        folder: Where.
+        quick: Leave out what the commands in ``SLOW`` need.
 
     Returns:
         The folder.
@@ -113,26 +121,34 @@ def build(folder: Path) -> Path:
                 output,
                 "--no_plot",
             )
-        _must("data_collection", "--task", "Pace-Go2-v0", "--duration", "0.3", "--output", "go2.npz", "--no_plot")
+        if not quick:
+            _must("data_collection", "--task", "Pace-Go2-v0", "--duration", "0.3", "--output", "go2.npz", "--no_plot")
         small = ("--num_envs", "8", "--max_iteration", "2", "--optimizer", "cmaes", "--log_dir", "made")
         for target, words in (
             (RUN, ("--task", TASK, "--data", "a.npz")),
             (OTHER, ("--task", TASK, "--data", "a.npz", "--effects", "payload@shared")),
             (GO2, ("--task", "Pace-Go2-v0", "--data", "go2.npz")),
         ):
+            if quick and target == GO2:
+                continue
             _must("fit", *words, *small)
             _move("made", target)
         _must("compare", RUN)
-        words = ("--effects", "stribeck_friction", "--only", "--max_effects", "1", "--no_refit")
-        _must("diagnose", RUN, *words)
-        _must("train", "--task", WALK, "--num_envs", "2", "--max_iterations", "1", "--log_dir", "made",
-              "--identified", f"{GO2}/result.json")  # fmt: skip
-        _move("made", TRAINING)
+        if not quick:
+            _diagnose_and_train()
         for report in Path().rglob("report.html"):
             report.unlink()  # they are large, and nothing reads them
         for events in [*Path().rglob("events.out.*"), *Path(TRAINING).rglob("policy*")]:
             events.unlink()
     return folder
+
+
+def _diagnose_and_train() -> None:
+    words = ("--effects", "stribeck_friction", "--only", "--max_effects", "1", "--no_refit")
+    _must("diagnose", RUN, *words)
+    _must("train", "--task", WALK, "--num_envs", "2", "--max_iterations", "1", "--log_dir", "made",
+          "--identified", f"{GO2}/result.json")  # fmt: skip
+    _move("made", TRAINING)
 
 
 def _must(name: str, *words: str) -> None:
