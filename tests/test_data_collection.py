@@ -36,7 +36,7 @@ def script(name: str, *args: str) -> int:
 
 
 def record(folder: Path, *args: str, name: str = "r.npz"):
-    assert script("data_collection", *args, "--output", str(folder / name)) == 0
+    assert script("data_collection", *args, "--output", str(folder / name), "--overwrite") == 0
     return load_recording(folder / name)
 
 
