@@ -7,9 +7,9 @@ from diagnoses import joint_alone
 from pace_actuators.effects import EffectCfg, EffectParameter, available_effects, get_effect
 from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.search.one_round import beyond_bounds, with_likes
-from pace_optim.diagnosis.verdict.verdict import labels
 
 OFFSET, PAYLOAD, GAIN = (get_effect(name) for name in ("torque_offset", "payload", "torque_gain"))
 ALL = [get_effect(name) for name in available_effects()]

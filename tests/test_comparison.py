@@ -11,12 +11,12 @@ from pace_optim.comparison.hysteresis import hysteresis
 from pace_optim.comparison.joint import compare_joint, share_above
 from pace_optim.comparison.load_torque import load_torques
 from pace_optim.comparison.motion import motion_of
-from pace_optim.comparison.noise import NoiseFloor, lattice_step, noise_floor, with_repetitions
 from pace_optim.comparison.places import worst_places
 from pace_optim.comparison.regions import best_region, evidence, lay_out
 from pace_optim.comparison.tracks import Track
 from pace_optim.comparison.whiteness import whiteness
 from pace_optim.recording import Load
+from pace_optim.recording.noise import NoiseFloor, lattice_step, noise_floor, with_repetitions
 
 DT = 0.0025
 TIME = np.arange(8000) * DT

@@ -21,8 +21,9 @@ from pace_optim.diagnosis.diagnose import search_effects
 from pace_optim.diagnosis.fitting.processes import spread
 from pace_optim.diagnosis.judging.acceptance import BlockErrors, block_errors, check_long_enough, judge
 from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.telling.next_experiment import rivals_of
-from pace_optim.diagnosis.verdict.verdict import explained_joints, labels, ranking, verdict
+from pace_optim.diagnosis.verdict.verdict import explained_joints, ranking, verdict
 from pace_optim.terminal.atomic import write_json
 
 ROOT = Path(__file__).parents[1]

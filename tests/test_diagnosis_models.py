@@ -11,12 +11,12 @@ from pace_optim.diagnosis.candidates.screening import Probe
 from pace_optim.diagnosis.judging import some_joints
 from pace_optim.diagnosis.judging.acceptance import BlockErrors
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
 from pace_optim.diagnosis.search import pooling as sharing
 from pace_optim.diagnosis.search import pruning
 from pace_optim.diagnosis.search.one_round import _ranked
 from pace_optim.diagnosis.search.search import Outcome
-from pace_optim.diagnosis.verdict.verdict import labels
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

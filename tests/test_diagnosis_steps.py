@@ -14,6 +14,7 @@ from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
 from pace_optim.diagnosis.judging import some_joints
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search import merge_effects as one_for_several
 from pace_optim.diagnosis.search import one_round, search
@@ -22,7 +23,7 @@ from pace_optim.diagnosis.search.search import Outcome
 from pace_optim.diagnosis.telling import next_experiment
 from pace_optim.diagnosis.telling.next_experiment import distances, menu, next_experiments, rivals_of
 from pace_optim.diagnosis.verdict.proxy_effects import stand_ins
-from pace_optim.diagnosis.verdict.verdict import explained_joints, labels, verdict
+from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))

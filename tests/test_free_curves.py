@@ -18,11 +18,12 @@ from pace_optim.diagnosis.diagnose import summary_of
 from pace_optim.diagnosis.judging.acceptance import BlockErrors
 from pace_optim.diagnosis.judging.validation import validation_errors
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.search import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
-from pace_optim.diagnosis.verdict.verdict import labels, verdict
+from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
 

@@ -18,6 +18,33 @@ DOWNSTREAM = {
 }
 """Folder -> what none of its files may import."""
 
+FLOORS = {
+    "pace_optim": (
+        ["terminal", "recording", "excitation"],
+        ["robot_logs", "plant", "export"],
+        ["problem"],
+        ["optimizers", "single_joint_model"],
+        ["uncertainty"],
+        ["run", "experiment_design"],
+        ["report", "data_collection"],
+        ["comparison"],
+        ["fit"],
+        ["diagnosis"],
+        ["commands"],
+    ),
+    "pace_optim/diagnosis": (
+        ["model", "settings"],
+        ["fitting"],
+        ["candidates"],
+        ["judging"],
+        ["beginning", "search"],
+        ["verdict"],
+        ["telling"],
+        ["diagnose"],
+    ),
+}
+"""Package -> its rooms, from the ground up: a room imports from below and from beside, never from above."""
+
 ACTUATORS_MAY_IMPORT = {*sys.stdlib_module_names, "torch", "pace_actuators"}
 ADAPTERS = {"pace_actuators/mjlab.py": "mjlab", "pace_actuators/isaaclab.py": "isaaclab"}
 """The two files that may import one framework more."""
@@ -62,6 +89,37 @@ def test_no_file_imports_what_lies_downstream(path):
     assert not against, (
         f"{path} imports {sorted(against)}, against pace_actuators <- pace_envs <- pace_optim <- scripts"
     )
+
+
+def imported_modules(source: str) -> set[str]:
+    """Full names of what a file imports absolutely, of modules and of what it takes from them."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_every_room_has_its_floor(package):
+    rooms = {path.stem for path in (ROOT / package).iterdir() if path.is_dir() or path.suffix == ".py"}
+    assert rooms - {"__init__", "__pycache__", "py"} == {room for floor in FLOORS[package] for room in floor}
+
+
+@pytest.mark.parametrize(
+    ("package", "path"), [(package, path) for package in FLOORS for path in files_of(package)], ids=str
+)
+def test_no_room_imports_from_a_floor_above(package, path):
+    height = {room: i for i, floor in enumerate(FLOORS[package]) for room in floor}
+    own = Path(path).relative_to(package).parts[0].removesuffix(".py")
+    if own == "__init__":
+        return
+    prefix = package.replace("/", ".") + "."
+    for module in imported_modules((ROOT / path).read_text(encoding="utf-8")):
+        room = module.removeprefix(prefix).split(".")[0] if module.startswith(prefix) else own
+        assert height.get(room, 0) <= height[own], f"{path} imports {module}, from a floor above its own"
 
 
 @pytest.mark.parametrize("path", files_of("pace_actuators"))

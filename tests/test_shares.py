@@ -10,9 +10,9 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import Findings, summary_of
 from pace_optim.diagnosis.judging import some_joints
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.verdict.contributions import shares
-from pace_optim.diagnosis.verdict.verdict import labels
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

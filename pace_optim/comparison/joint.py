@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
 from pace_optim.report.trajectory_errors import rms
 
 from .dimensions import Dimension, dimensions_of
 from .frequency import band_edges, band_power, narrowest_band, response
 from .hysteresis import hysteresis
 from .motion import motion_of
-from .noise import NoiseFloor, noise_floor, with_repetitions
 from .places import Place, joint_sentence, places_of
 from .regions import lay_out
 from .tracks import Track

@@ -19,6 +19,7 @@ from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.fitting.denormals import flushed_denormals
 from pace_optim.diagnosis.fitting.reference_update import OwnMotion
 from pace_optim.diagnosis.judging.acceptance import check_long_enough
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.pooling import share
 from pace_optim.diagnosis.search.search import Outcome, add_effects
@@ -29,7 +30,7 @@ from pace_optim.diagnosis.verdict.contributions import DOMINANT, shares
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in, stand_ins, varying
 from pace_optim.diagnosis.verdict.sizes import sizes
-from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, labels, likes, ranking, verdict
+from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, likes, ranking, verdict
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem
 from pace_optim.report import check_folder, report_text

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pace_optim.comparison.noise import noise_floor
 from pace_optim.problem.problem import Problem
+from pace_optim.recording.noise import noise_floor
 from pace_optim.terminal.cli import command
 
 FAR_ABOVE_NOISE = 10.0

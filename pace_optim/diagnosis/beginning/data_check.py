@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from pace_optim.comparison.noise import lattice_step, noise_floor
 from pace_optim.diagnosis.beginning.base_fit import whole_vector
 from pace_optim.diagnosis.judging.validation import validation_errors
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
+from pace_optim.recording.noise import lattice_step, noise_floor
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_model.problem import TwinProblem
 

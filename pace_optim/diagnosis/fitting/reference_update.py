@@ -11,8 +11,8 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
-from pace_optim.diagnosis.verdict.verdict import labels
 from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.path import ReferencePath

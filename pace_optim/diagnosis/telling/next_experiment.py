@@ -10,9 +10,9 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.search import Outcome
-from pace_optim.diagnosis.verdict.verdict import labels
 from pace_optim.excitation import make_excitation
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording

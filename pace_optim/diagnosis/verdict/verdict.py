@@ -9,10 +9,9 @@ from typing import Any
 
 import torch
 
-from pace_actuators.effects import Effect, EffectCfg
+from pace_actuators.effects import Effect
 from pace_optim.diagnosis.judging.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.search.search import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import (
     EXPLAINED,
@@ -76,31 +75,6 @@ def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
     square = torch.where(others, outcome.base_errors.square, errors.square)
     outcome.final = replace(outcome.final, model=model, x=x)
     outcome.final_errors = replace(errors, square=square)
-
-
-def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
-    """The effects found as ``fit.py --effects`` takes them.
-
-    Args:
-        model: The model that has them.
-        joint_names: Its joints.
-        order: Which comes first; none keeps the model's order.
-    """
-    result = []
-    for effect in order or model.effects:
-        has = model.has[model.effects.index(effect)]
-        own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
-        if not own:
-            continue
-        everywhere = len(own) == len(joint_names)
-        cfg = EffectCfg(
-            effect=effect.name,
-            joint_names_expr=".*" if effect.shared or everywhere else own,
-            shared=effect.shared or effect in model.shared,
-            wide=bool(model.is_wide(effect).any()),
-        )
-        result.append(cfg.label)
-    return result
 
 
 def likes(outcome: Outcome) -> dict[str, list[str]]:
