@@ -101,6 +101,7 @@ def searched(monkeypatch, *joints, follow=stays, say=lambda _: None):
         lower=-bounds,
         upper=bounds,
         log=torch.zeros(len(BASE), dtype=torch.bool),
+        slides=torch.zeros(n, dtype=torch.bool),
     )
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING]
@@ -378,6 +379,7 @@ def test_joints_take_over_a_trimmed_fit_where_it_is_better_on_validation_recordi
             lower=-bounds,
             upper=bounds,
             log=torch.zeros(bounds.shape[1], dtype=torch.bool),
+            slides=torch.zeros(2, dtype=torch.bool),
         )
         jacobian, error = (torch.full(shape, value) for shape in ((bounds.shape[1], 3, 1, 2), (3, 1, 2)))
         return Fitted(model=model, x=value * bounds, score=score, jacobian=jacobian, error=error)

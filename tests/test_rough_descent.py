@@ -54,6 +54,7 @@ def fitted(monkeypatch):
             lower=-bounds,
             upper=bounds,
             log=torch.zeros(len(BASE), dtype=torch.bool),
+            slides=torch.zeros(1, dtype=torch.bool),
         )
         start = Fitted.start(model, 0 * bounds)
         result = fit_side_by_side(None, [start], 25, rough=rough)[0]
