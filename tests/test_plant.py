@@ -355,6 +355,16 @@ def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(tmp_pa
     assert load_recording(path).dof_vel is None
 
 
+def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(tmp_path):
+    truths = []
+    for motion in ("steps", "multisine"):
+        options = ("--task", BENCH, "--duration", "2", "--no_plot", "--excitation", motion, "--seed", "3")
+        path = tmp_path / f"{motion}.npz"
+        assert collect(*options, "--effect", "stribeck_friction", "--noise", "1e-4", "--output", str(path)) == 0
+        truths.append(json.loads((tmp_path / f"{motion}.truth.json").read_text()))
+    assert truths[0] == truths[1]
+
+
 def test_data_collection_with_a_battery_writes_every_recording(tmp_path):
     options = ("--task", BENCH, "--duration", "0.5", "--no_plot", "--excitation", "battery")
     assert collect(*options, "--effect", "torque_gain", "--output", str(tmp_path / "b.npz")) == 0

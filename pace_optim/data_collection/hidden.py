@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
-from pace_optim.excitation import Trajectory
+from pace_optim.excitation import Trajectory, make_excitation
 from pace_optim.plant import (
     BaseTruth,
     PlantCfg,
@@ -18,17 +18,22 @@ from pace_optim.plant import (
     draw_visible,
     effect_named,
     joints_of,
+    motion_change,
     plant_robot,
     session_of,
     simulate_motions,
+    simulate_truths,
 )
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording.data import Drive, Load
 
 from .cfg import CollectionCfg
 from .simulate import Simulated
 
 _VISIBLE = 3e-4
 """Smallest change of the motion that an effect is drawn for, where there is less noise [rad]."""
+_REFERENCE = 6.0
+"""Length of the chirp by which sizes are drawn [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +57,9 @@ def simulate_hidden(
     delay_mode: Literal["command", "effort"],
 ) -> Hidden:
     """Draw the effects by the request's seed and let the plant follow the trajectories, one after another.
+
+    Sizes are drawn so that the robot's own chirp shows them, whatever motion is recorded: recordings that are made one
+    by one with the same seed are of one robot.
 
     Args:
         cfg: What is asked for.
@@ -80,9 +88,10 @@ def simulate_hidden(
         counts_per_turn=None if cfg.encoder_bits is None else 2**cfg.encoder_bits,
         seed=cfg.seed,
     )
+    chirp = make_excitation("chirp", robot.pace, control_dt=robot.control_dt, duration=_REFERENCE)
     drawn = draw_visible(
         robot,
-        runs,
+        session_of(chirp, Drive(), Load()),
         cfg.effects,
         np.random.default_rng([cfg.seed, 3]),
         cfg=plant,
@@ -93,7 +102,8 @@ def simulate_hidden(
     motions = simulate_motions(robot, runs, [drawn.truth], plant)[0]
     simulated = [Simulated(recording=m.recording, position=m.position, torque=m.torque[:-1]) for m in motions]
     lines = tuple(_in_words(name, drawn.truth, joints, len(robot.joint_names)) for name in cfg.effects)
-    change = f"they change the motion by {drawn.size:.2g} rad (RMS)"
+    plain = simulate_truths(robot, runs, [start], plant)[0]
+    change = f"they change the motion by {motion_change([m.recording for m in motions], plain, joints):.2g} rad (RMS)"
     return Hidden(simulated=simulated, truth=drawn.truth, lines=(*lines, change))
 
 
