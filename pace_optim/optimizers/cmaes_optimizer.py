@@ -321,7 +321,7 @@ class CMAESOptimizer:
             return
         for g, strategy in enumerate(self.strategies):
             if not strategy.stop_reason:
-                strategy.tell(self._asked[g], scores[:, g], self._shown[g])
+                strategy.tell(scores[:, g], self._shown[g])
 
     def _ready_for_consensus(self) -> bool:
         """Whether all trees know their shared parameters well, or time is running out."""

@@ -8,17 +8,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from pace_optim.optimizers.convergence import Criterion, SearchState
+from pace_optim.optimizers.unit_box import into_unit_box
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # cma warns of optional packages at import
     import cma
+    from cma.boundary_handler import BoundTransform
 
+_MAXSTD = 2.0 / 3.0
+"""Largest standard deviation: pycma's own where it knows the bounds."""
 DIVERGED_SCORE = 1e6
 """The score of a simulation that is not finite [rad²]."""
 
 
 class TreeStrategy:
-    """pycma's strategy with its own random numbers, its best candidate and its reasons to stop."""
+    """pycma's strategy with its own random numbers, its best candidate and its reasons to stop.
+
+    pycma brings candidates into their bounds one by one, which takes longer than their simulation on a GPU. So its
+    strategy is told of no bounds here, and a generation is brought into them at once: the candidates are the same.
+    """
 
     def __init__(
         self,
@@ -48,7 +56,7 @@ class TreeStrategy:
         self.stop_reason: str | None = None
         generator = np.random.default_rng(seed)
         options = {
-            "bounds": [-1.0, 1.0],
+            "maxstd": _MAXSTD,
             "popsize": population_size,
             "randn": lambda *shape: generator.standard_normal(shape),
             "seed": np.nan,
@@ -60,12 +68,13 @@ class TreeStrategy:
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self._strategy = cma.CMAEvolutionStrategy(list(start), sigma, options)
+            unbounded = BoundTransform([-1.0, 1.0]).inverse(list(start))
+            self._strategy = cma.CMAEvolutionStrategy(unbounded, sigma, options)
 
     @property
     def mean(self) -> np.ndarray:
         """Mean of the search distribution, normalised, inside the bounds."""
-        return np.asarray(self._strategy.result.xfavorite)
+        return into_unit_box(self._strategy.mean)
 
     @property
     def spread(self) -> np.ndarray:
@@ -74,17 +83,17 @@ class TreeStrategy:
 
     def ask(self) -> np.ndarray:
         """Candidates of the next generation, normalised, (population_size, len(entries))."""
-        return np.asarray(self._strategy.ask())
+        self._asked = self._strategy.ask()
+        return into_unit_box(np.asarray(self._asked))
 
-    def tell(self, x: np.ndarray, scores: np.ndarray, shown: np.ndarray) -> None:
-        """Take the scores of a generation.
+    def tell(self, scores: np.ndarray, shown: np.ndarray) -> None:
+        """Take the scores of the generation that was asked for last.
 
         Args:
-            x: What :meth:`ask` gave.
             scores: [rad²], (population_size,).
-            shown: What was simulated, where it differs from ``x``.
+            shown: What was simulated, where it differs from what :meth:`ask` gave, (population_size, len(entries)).
         """
-        self._strategy.tell(list(x), scores)
+        self._strategy.tell(self._asked, scores)
         i = int(scores.argmin())
         if scores[i] < self.best_score:
             self.best_score, self.best_x = float(scores[i]), shown[i].copy()

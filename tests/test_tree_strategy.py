@@ -1,0 +1,55 @@
+"""One strategy of the search: candidates inside their bounds, a generation at once."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from pace_optim.optimizers.tree_strategy import TreeStrategy
+from pace_optim.optimizers.unit_box import into_unit_box
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import cma
+    from cma.boundary_handler import BoundTransform
+
+
+def test_a_generation_comes_into_its_bounds_as_pycma_brings_each_candidate():
+    x = np.random.default_rng(0).normal(scale=3.0, size=(500, 4))
+    x[:9, 0] = [-1.05, -1.0, -0.95, 0.0, 0.95, 1.0, 1.05, 2.1, -2.1]
+    box = BoundTransform([-1.0, 1.0])
+    assert np.array_equal(into_unit_box(x), [box.repair(row) for row in x])
+
+
+@pytest.mark.parametrize(("size", "population", "generations"), [(5, 12, 400), (13, 64, 60)])
+def test_the_search_is_to_the_last_digit_that_of_pycma_with_bounds(size, population, generations):
+    start, target = np.full(size, 0.1), np.linspace(-1.1, 1.05, size)
+    start[0], start[-1] = 0.99, -1.0
+    generator = np.random.default_rng(3)
+    reference = cma.CMAEvolutionStrategy(
+        list(start),
+        0.5,
+        {
+            "bounds": [-1.0, 1.0],
+            "popsize": population,
+            "randn": lambda *shape: generator.standard_normal(shape),
+            "seed": np.nan,
+            "verbose": -9,
+            "tolfun": 1e-13,
+            "tolfunhist": 1e-14,
+            "tolx": 1e-10,
+            "maxiter": np.inf,
+        },
+    )
+    own = TreeStrategy(range(size), start=start, sigma=0.5, population_size=population, seed=3, criteria=[])
+    for _ in range(generations):
+        x, expected = own.ask(), reference.ask()
+        assert np.array_equal(x, expected)
+        scores = ((x - target) ** 2 @ np.logspace(0, 3, size)) + 1e-6
+        own.tell(scores, x)
+        reference.tell(expected, scores)
+        assert np.array_equal(own.mean, reference.result.xfavorite)
+        assert np.array_equal(own.spread, reference.stds)
+        assert own.stop_reason == next((f"cma: {name}" for name in reference.stop()), None)
+        if own.stop_reason:
+            break
