@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import socket
 import subprocess
@@ -11,10 +12,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from problems import BENCH, record
 
+from pace_optim.fit import fit
 from pace_optim.problem.processes import Processes
+from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
 
 HERE = Path(__file__).parent
+FIT = str(HERE.parent / "scripts" / "fit.py")
+SEARCH, TRAINING = (str(HERE / name) for name in ("sharing.py", "sharing_training.py"))
 
 
 def test_shares_are_disjoint_and_complete_whatever_their_number():
@@ -30,7 +37,7 @@ def test_one_process_alone_keeps_its_scores():
     assert Processes().agree("x") == "x"
 
 
-def _start(count: int, **environ: str) -> list[subprocess.Popen[str]]:
+def _start(count: int, *command: str, **environ: str) -> list[subprocess.Popen[str]]:
     """One process per rank, as torchrun would start them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -39,7 +46,7 @@ def _start(count: int, **environ: str) -> list[subprocess.Popen[str]]:
     common = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": paths}
     return [
         subprocess.Popen(
-            [sys.executable, str(HERE / "sharing.py")],
+            [sys.executable, *command],
             env={**os.environ, **common, **environ, "OMP_NUM_THREADS": "1", "RANK": str(rank), "LOCAL_RANK": str(rank)},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -49,21 +56,55 @@ def _start(count: int, **environ: str) -> list[subprocess.Popen[str]]:
     ]
 
 
+def _texts(processes: list[subprocess.Popen[str]]) -> list[str]:
+    """What each has printed; all of them have ended well."""
+    texts = [process.communicate(timeout=200)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), texts
+    return texts
+
+
 @pytest.mark.slow
 def test_two_processes_score_what_one_scores():
     """Exactly: each candidate is simulated by one process."""
-    processes = [*_start(1), *_start(2)]
-    texts = [process.communicate(timeout=200)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0, 0], texts
+    processes = [*_start(1, SEARCH), *_start(2, SEARCH)]
+    texts = _texts(processes)
     alone, first, second = (ast.literal_eval(text.strip().splitlines()[-1]) for text in texts)
     assert alone == first == second
 
 
 @pytest.mark.slow
 def test_a_lost_process_ends_the_others_with_one_line():
-    stays, lost = _start(2, LOSE="1")
+    stays, lost = _start(2, SEARCH, LOSE="1")
     text = stays.communicate(timeout=200)[0]
     lost.communicate(timeout=200)
     assert stays.returncode == 2, text
     line = text.strip().splitlines()[-1]
     assert line.startswith("error: A process that shares this job was lost") and "--resume" in line
+
+
+@pytest.mark.slow
+def test_a_shared_fit_that_is_resumed_ends_as_one_that_nobody_shared(tmp_path):
+    save_recording(tmp_path / "bench.npz", record(name="bench", noise=1e-4))
+    common = {"task": BENCH, "data": [str(tmp_path / "bench.npz")], "num_envs": 9, "optimizer": "cmaes"}
+    alone, _ = fit(FitSettings(**common, max_iteration=4, log_dir=str(tmp_path / "alone")))
+    options = ["--task", BENCH, "--data", common["data"][0], "--num_envs", "9", "--optimizer", "cmaes"]
+    writer, other = _texts(_start(2, FIT, *options, "--max_iteration", "2", "--log_dir", str(tmp_path / "shared")))
+    run = writer.strip().splitlines()[-1].removeprefix("run: ")
+    assert "run:" not in other and [str(p) for p in (tmp_path / "shared").glob("*/*")] == [run]
+    _texts(_start(2, FIT, "--resume", run, "--max_iteration", "4"))
+    result = json.loads((Path(run) / "result.json").read_text())
+    assert result["generations"] == 4 and result["parameters"] == alone.parameters
+
+
+@pytest.mark.slow
+def test_a_training_is_shared_ends_with_a_lost_process_and_goes_on(tmp_path):
+    stays, lost = _start(2, TRAINING, "train", str(tmp_path), LOSE="1")
+    text = stays.communicate(timeout=200)[0]
+    lost.communicate(timeout=200)
+    line = text.strip().splitlines()[-1]
+    assert stays.returncode == 2 and line.startswith("error: A process that shares this job was lost"), text
+    (run,) = tmp_path.glob("*/*")
+    texts = [text.strip().splitlines() for text in _texts(_start(2, TRAINING, "resume", str(run)))]
+    assert [lines[-1] for lines in texts] == [f"run: {run}", "run: None"]
+    assert len({lines[-2] for lines in texts}) == 1  # both have the same policy
+    assert {p.name for p in run.glob("model_*.pt")} == {"model_0.pt", "model_1.pt"}

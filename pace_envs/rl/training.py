@@ -9,9 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
 from pace_envs.identified import set_identified_step, set_step, use_identified
+from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
 from pace_envs.rl.export import export_policy
@@ -149,8 +151,11 @@ def _learn(cfg: VelocityEnvCfg, folder: Path | None, checkpoint: Path | None) ->
             f"{checkpoint} is of iteration {runner.current_learning_iteration - 1}, and the training ends after "
             f"{cfg.runner.max_iterations} iterations. Raise --max_iterations."
         )
-    runner.learn(left, init_at_random_ep_len=True)
+    with told_of_lost_processes():
+        runner.learn(left, init_at_random_ep_len=True)
     if folder is not None:
         export_policy(runner, folder / "exported")
+    if runner.is_distributed:
+        dist.destroy_process_group()
     env.close()
     return folder

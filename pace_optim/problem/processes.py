@@ -11,6 +11,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from pace_envs.lost_process import told_of_lost_processes
+
 _LOST_AFTER = timedelta(minutes=10)
 
 
@@ -57,11 +59,6 @@ class Processes:
         _together(lambda: dist.broadcast_object_list(held, src=0))
         return held[0]
 
-    def leave(self) -> None:
-        """End the sharing."""
-        if self.count > 1 and dist.is_initialized():
-            dist.destroy_process_group()
-
 
 def join(device: str = "cpu") -> tuple[Processes, str]:
     """Find the other processes of a ``torchrun``, and this one's device.
@@ -89,11 +86,5 @@ def own_device(device: str) -> str:
 
 
 def _together(action: Callable[[], object]) -> None:
-    try:
+    with told_of_lost_processes():
         action()
-    except (RuntimeError, dist.DistBackendError) as error:
-        first = str(error).splitlines()[0]
-        raise ValueError(
-            f"A process that shares this job was lost ({first}). Its own message says why; --resume goes on from the "
-            "last checkpoint."
-        ) from None
