@@ -110,7 +110,10 @@ class DelayBuffer:
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
         """Forget the history of all or some environments."""
-        self._stale[slice(None) if env_ids is None else env_ids] = True
+        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+            self._stale |= env_ids  # nobody has to count them
+        else:
+            self._stale[slice(None) if env_ids is None else env_ids] = True
         self._any_stale = True
 
     def compute(self, data: torch.Tensor) -> torch.Tensor:

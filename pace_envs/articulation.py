@@ -141,6 +141,11 @@ class Articulation:
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put all or some environments' robots back to their initial state and clear their drives."""
+        self.reset_state(env_ids)
+        self.reset_drives(env_ids if env_ids is None else self._sim.rows(env_ids))
+
+    def reset_state(self, env_ids: EnvIds = None) -> None:
+        """Put all or some environments' robots back to their initial state, and their targets."""
         rows = self._sim.rows(env_ids)
         if self._layout.root is not None:
             self.write_root_state_to_sim(self._initial_root, env_ids)
@@ -153,8 +158,18 @@ class Articulation:
         for target in (self.data.joint_vel_target, self.data.joint_effort_target):
             if target is not None:
                 target[rows] = 0.0
+
+    def reset_drives(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        """Let all or some environments' drives forget: indices, or (num_envs,) bool."""
         for actuator in self.actuators.values():
-            actuator.reset(env_ids if env_ids is None else rows)
+            actuator.reset(env_ids)
+
+    @property
+    def targets(self) -> list[torch.Tensor]:
+        """The targets that are set, (num_envs, num_joints) each."""
+        data = self.data
+        every = (data.joint_pos_target, data.joint_vel_target, data.joint_effort_target)
+        return [target for target in every if target is not None]
 
     def write_joint_state_to_sim(
         self,

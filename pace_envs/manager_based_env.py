@@ -88,6 +88,8 @@ class ManagerBasedEnv(gym.Env):
                 )
         self._constants: dict[tuple[float, ...], torch.Tensor] = {}
         self.extras: dict[str, Any] = {}
+        self.masks_resets = False
+        """Whether environments are reset where a mask says so, without anybody waiting for the GPU to count them."""
         self.common_step_counter = 0
         self._renderer: Any = None
         self._drive_graphs: StepGraphs | None = None

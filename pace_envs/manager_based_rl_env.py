@@ -58,6 +58,8 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         super().__init__(cfg, render_mode)
         self.final_observations = False
         """Whether steps compute ``extras["final_obs"]``."""
+        self._log: dict[str, torch.Tensor] = {}
+        self.masks_resets = self.device.type != "cpu" and self.takes_masks
 
     @property
     def max_episode_length_s(self) -> float:
@@ -68,6 +70,21 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     def max_episode_length(self) -> int:
         """Longest episode [steps]."""
         return math.ceil(self.max_episode_length_s / self.step_dt - 1e-6)
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether all terms can be reset without being told which environments: those of this package can."""
+        loops = any(robot.closed_loops is not None for robot in self.scene.articulations.values())
+        managers = (
+            self.action_manager,
+            self.command_manager,
+            self.curriculum_manager,
+            self.event_manager,
+            self.observation_manager,
+            self.reward_manager,
+            self.termination_manager,
+        )
+        return not loops and all(manager.takes_masks for manager in managers)
 
     def load_managers(self) -> None:
         """Build the managers."""
@@ -96,16 +113,39 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         done = self.termination_manager.compute()
         reward = self.reward_manager.compute(self.step_dt)
         terminated, truncated = self.termination_manager.terminated, self.termination_manager.time_outs
-        env_ids = done.nonzero()[:, 0]
-        if len(env_ids):
-            if self.final_observations:
-                self.extras |= {"final_obs": self.observation_manager.compute(), "_final_obs": done.clone()}
+        if self.masks_resets:
+            self._keep_final_observations(done)
+            self._reset_where(done)
+        elif len(env_ids := done.nonzero()[:, 0]):
+            self._keep_final_observations(done)
             self._reset_idx(env_ids)
             self.sim.forward(env_ids)
             self.scene.update()
         self.command_manager.compute(self.step_dt)
         self.event_manager.apply("interval", dt=self.step_dt)
         return self.observation_manager.compute(), reward, terminated, truncated, self.extras
+
+    def _keep_final_observations(self, done: torch.Tensor) -> None:
+        if self.final_observations:
+            self.extras |= {"final_obs": self.observation_manager.compute(), "_final_obs": done.clone()}
+
+    def _reset_where(self, done: torch.Tensor) -> None:
+        """:meth:`_reset_idx` of environments that are not counted, (num_envs,) bool.
+
+        The log holds what the last episodes that ended have left, of this step or of one before.
+        """
+        log: dict[str, torch.Tensor] = self.curriculum_manager.compute_where(done)
+        log |= self.reward_manager.reset_where(done) | self.termination_manager.reset_where(done)
+        with self.scene.only_where(done):
+            self.scene.reset_where(done)
+            self.event_manager.apply("reset")
+        self.sim.forward(done)
+        self.action_manager.reset(done)
+        self.event_manager.reset_where(done)
+        log |= self.command_manager.reset_where(done)
+        self.episode_length_buf.masked_fill_(done, 0)
+        self._log = _kept_where_none(log, self._log, done.any())
+        self.extras["log"] = dict(self._log)
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         self.curriculum_manager.compute(env_ids)
@@ -115,3 +155,14 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         log |= self.command_manager.reset(env_ids)
         self.episode_length_buf[env_ids] = 0
         self.extras["log"] = log
+
+
+def _kept_where_none(
+    now: dict[str, torch.Tensor], before: dict[str, torch.Tensor], some: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Numbers to log, those of before where no episode has ended."""
+    if not now:
+        return {}
+    new = torch.stack([value.float() for value in now.values()])
+    old = torch.stack([before.get(name, torch.zeros_like(value)) for name, value in zip(now, new, strict=True)])
+    return dict(zip(now, torch.where(some, new, old), strict=True))

@@ -1,9 +1,11 @@
 """The scene: a robot and, where it walks, the ground and what feels it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import mujoco
+import torch
 
 from pace_actuators import match_names
 from pace_envs.articulation import Articulation, load_robot_spec
@@ -81,6 +83,28 @@ class InteractiveScene:
         rows = self.sim.rows(env_ids)
         for sensor in self.sensors.values():
             sensor.reset(rows)
+
+    @contextmanager
+    def only_where(self, mask: torch.Tensor) -> Iterator[None]:
+        """Let what is done to the state meanwhile count for some environments alone, (num_envs,) bool.
+
+        The others get back their state and targets. So a few can be reset without being counted.
+        """
+        parts = [*self.sim.state, *(each for robot in self.articulations.values() for each in robot.targets)]
+        before = [part.clone() for part in parts]
+        yield
+        for part, old in zip(parts, before, strict=True):
+            torch.where(mask.view(-1, *[1] * (part.ndim - 1)), part, old, out=part)
+        self.update()
+
+    def reset_where(self, mask: torch.Tensor) -> None:
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool; inside of :meth:`only_where`."""
+        self.sim.reset(slice(None))
+        for articulation in self.articulations.values():
+            articulation.reset_state(slice(None))
+            articulation.reset_drives(mask)
+        for sensor in self.sensors.values():
+            sensor.reset(mask)
 
     def write_data_to_sim(self) -> None:
         """Run the drives and apply their torques."""

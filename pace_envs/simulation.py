@@ -27,6 +27,7 @@ _INTEGRATORS = {
 }
 
 
+_STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
 _EXPLICIT = 0.5
 """Part of its speed that a rotor may lose to viscous friction in a step of an explicit integrator."""
 
@@ -224,6 +225,11 @@ class Simulation:
     def constants_changed(self) -> None:
         """Note that model fields were written: what derives from them is computed before the next step."""
         self._constants_changed = True
+
+    @property
+    def state(self) -> list[torch.Tensor]:
+        """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
+        return [self.bind(field) for field in _STATE]
 
     def step(self) -> None:
         """Advance every simulation by one physics step."""

@@ -79,6 +79,11 @@ class WarpSimulation(Simulation):
         for field in (self.qvel, self.qfrc_applied, *self._cleared):
             field[rows] = 0.0
 
+    @property
+    def state(self) -> list[torch.Tensor]:
+        """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
+        return [self.qpos, self.qvel, self.qfrc_applied, *self._cleared]
+
     def rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
         """What selects environments; indices that are on the device already are trusted, so that nobody waits."""
         if env_ids is None or isinstance(env_ids, slice):

@@ -67,3 +67,22 @@ def test_reset_environments_forget_their_delayed_commands_in_graphs_too():
         env.simulate(action)
         plain.simulate(action)
         assert torch.equal(env.sim.qpos, plain.sim.qpos), k
+
+
+@on_gpu
+def test_a_step_of_walking_robots_waits_for_nothing():
+    env = _env("Pace-AnymalD-Velocity-v0", "cuda:0", num_envs=64)
+    assert env.masks_resets
+    env.reset(seed=0)
+    env.episode_length_buf.copy_(torch.arange(64, device="cuda:0") + env.max_episode_length - 40)
+    action = 0.5 * torch.randn(64, 12, device="cuda:0")
+    for _ in range(3):  # graphs are captured
+        env.step(action)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(30):
+            obs, reward, _, _, extras = env.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert bool(obs["policy"].isfinite().all()) and bool(reward.isfinite().all())
+    assert float(extras["log"]["Episode_Termination/time_out"]) >= 0.0 and bool((env.episode_length_buf < 40).any())

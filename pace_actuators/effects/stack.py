@@ -145,8 +145,11 @@ class EffectStack:
             for effect in self.effects:
                 effect.reset_state(slice(None))
             return
-        chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self.state.time.device)
-        chosen[env_ids] = True
+        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+            chosen = env_ids
+        else:
+            chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self.state.time.device)
+            chosen[env_ids] = True
         for effect in self.effects:
             own = chosen[effect.rows]
             if own.is_cuda or bool(own.any()):  # a GPU is not waited for

@@ -4,7 +4,7 @@ from pace_envs.managers.action_manager import ActionManager, ActionTerm, ActionT
 from pace_envs.managers.command_manager import CommandManager, CommandTerm, CommandTermCfg
 from pace_envs.managers.curriculum_manager import CurriculumManager, CurriculumTermCfg
 from pace_envs.managers.event_manager import EventManager, EventTermCfg
-from pace_envs.managers.manager_base import ManagerTermBase, ManagerTermBaseCfg, SceneEntityCfg, Term
+from pace_envs.managers.manager_base import ManagerTermBase, ManagerTermBaseCfg, SceneEntityCfg, Term, state_only
 from pace_envs.managers.observation_manager import (
     ObservationGroupCfg,
     ObservationManager,
@@ -37,4 +37,5 @@ __all__ = [
     "TerminationManager",
     "TerminationTermCfg",
     "UniformNoiseCfg",
+    "state_only",
 ]

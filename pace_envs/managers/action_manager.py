@@ -70,6 +70,11 @@ class ActionManager:
         """Names of the terms."""
         return list(self._terms)
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether :meth:`reset` takes environments that are not counted, (num_envs,) bool, too."""
+        return all(type(term).reset is ActionTerm.reset for term in self._terms.values())
+
     def get_term(self, name: str) -> ActionTerm:
         """The term of that name."""
         return self._terms[name]
@@ -98,7 +103,7 @@ class ActionManager:
             term.apply_actions()
 
     def reset(self, env_ids: torch.Tensor) -> None:
-        """Zero the actions of some environments."""
+        """Zero the actions of some environments: indices, or (num_envs,) bool."""
         self.action[env_ids] = 0.0
         self.prev_action[env_ids] = 0.0
         for term in self._terms.values():

@@ -49,8 +49,30 @@ class CommandTerm:
         """Let time pass and draw where it has run out."""
         self._update_metrics()
         self.time_left -= dt
-        self._resample((self.time_left <= 0.0).nonzero()[:, 0])
+        due = self.time_left <= 0.0
+        if self._env.masks_resets:
+            self._resample_where(due)
+        else:
+            self._resample(due.nonzero()[:, 0])
         self._update_command()
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether the term draws by :meth:`_resample_command_where`."""
+        return False
+
+    def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool."""
+        self._resample_where(done)
+        return {}
+
+    def _resample_where(self, mask: torch.Tensor) -> None:
+        drawn = self._env.uniform(tuple(self.time_left.shape), *self.cfg.resampling_time_range)
+        torch.where(mask, drawn, self.time_left, out=self.time_left)
+        self._resample_command_where(mask)
+
+    def _resample_command_where(self, mask: torch.Tensor) -> None:
+        raise NotImplementedError
 
     def _resample(self, env_ids: torch.Tensor) -> None:
         if len(env_ids):
@@ -95,6 +117,18 @@ class CommandManager:
         """Let time pass."""
         for term in self._terms.values():
             term.compute(dt)
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether all terms do."""
+        return all(term.takes_masks for term in self._terms.values())
+
+    def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool."""
+        log: dict[str, torch.Tensor] = {}
+        for name, term in self._terms.items():
+            log |= {f"Metrics/{name}/{metric}": value for metric, value in term.reset_where(done).items()}
+        return log
 
     def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
         """Draw new commands for some environments; returns the terms' metrics as ``Metrics/<term>/<metric>``."""

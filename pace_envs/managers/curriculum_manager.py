@@ -24,6 +24,7 @@ class CurriculumManager:
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
+        self._env = env
         self._terms: list[Term[CurriculumTermCfg]] = [
             Term(name, term, env, num_args=2) for name, term in term_items(cfg).items()
         ]
@@ -38,6 +39,15 @@ class CurriculumManager:
         """Let the terms judge the episodes of these environments."""
         for term in self._terms:
             self._state[term.name] = term(env_ids)
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether all terms have a ``where(env, done, **params)`` beside what they do with indices."""
+        return all(hasattr(term.func, "where") and not term.keeps_state for term in self._terms)
+
+    def compute_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """:meth:`compute` and :meth:`reset` of environments that are not counted, (num_envs,) bool."""
+        return {f"Curriculum/{term.name}": term.func.where(self._env, done, **term.params) for term in self._terms}  # type: ignore[attr-defined]
 
     def reset(self, env_ids: torch.Tensor) -> dict[str, float]:
         """Reset class terms; returns what the terms said last, as ``Curriculum/<term>``."""

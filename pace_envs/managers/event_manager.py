@@ -60,6 +60,9 @@ class EventManager:
         if mode == "interval":
             for term, time_left in zip(self._terms[mode], self._time_left, strict=True):
                 time_left -= dt or 0.0
+                if self._env.masks_resets and term.changes_state_only:
+                    self._apply_where(term, time_left, time_left <= 0.0)
+                    continue
                 due = (time_left <= 0.0).nonzero()[:, 0]
                 if len(due):
                     self._draw_time(term, time_left, due)
@@ -69,6 +72,17 @@ class EventManager:
         for term in self._terms[mode]:
             term(ids)
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether :meth:`reset_where` does what :meth:`apply` and :meth:`reset` do at a reset."""
+        every = [term for terms in self._terms.values() for term in terms]
+        return all(t.changes_state_only for t in self._terms["reset"]) and not any(t.keeps_state for t in every)
+
+    def reset_where(self, done: torch.Tensor) -> None:
+        """Start the intervals of environments anew that are not counted, (num_envs,) bool."""
+        for term, time_left in zip(self._terms["interval"], self._time_left, strict=True):
+            self._draw_time_where(term, time_left, done)
+
     def reset(self, env_ids: torch.Tensor) -> None:
         """Reset class terms, and start the intervals of these environments anew."""
         for terms in self._terms.values():
@@ -76,6 +90,15 @@ class EventManager:
                 term.reset(env_ids)
         for term, time_left in zip(self._terms["interval"], self._time_left, strict=True):
             self._draw_time(term, time_left, env_ids)
+
+    def _apply_where(self, term: Term[EventTermCfg], time_left: torch.Tensor, due: torch.Tensor) -> None:
+        self._draw_time_where(term, time_left, due)
+        with self._env.scene.only_where(due):
+            term(torch.arange(self._env.num_envs, device=self._env.device))
+
+    def _draw_time_where(self, term: Term[EventTermCfg], time_left: torch.Tensor, mask: torch.Tensor) -> None:
+        drawn = self._env.uniform(tuple(time_left.shape), *(term.cfg.interval_range_s or (0.0, 0.0)))
+        torch.where(mask, drawn, time_left, out=time_left)
 
     def _draw_time(self, term: Term[EventTermCfg], time_left: torch.Tensor, env_ids: torch.Tensor) -> None:
         low, high = term.cfg.interval_range_s or (0.0, 0.0)

@@ -90,6 +90,16 @@ def as_number(value: torch.Tensor) -> Number:
     return value.item() if value.device.type == "cpu" else value
 
 
+def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
+    """Marks an event that changes positions, speeds and targets alone, and treats every environment by itself.
+
+    On a GPU it may be run on all environments; those that are not meant get theirs back, and nobody has to wait for
+    the GPU to count them (:meth:`pace_envs.scene.InteractiveScene.only_where`).
+    """
+    func.changes_state_only = True  # type: ignore[attr-defined]
+    return func
+
+
 CfgT = TypeVar("CfgT", bound=ManagerTermBaseCfg)
 
 
@@ -120,6 +130,16 @@ class Term(Generic[CfgT]):
     def __call__(self, *args: Any) -> Any:
         """Call the term's function: ``func(env, *args, **params)``."""
         return self.func(self._env, *args, **self.params)
+
+    @property
+    def changes_state_only(self) -> bool:
+        """Whether it is an event that :func:`state_only` marks."""
+        return getattr(self.func, "changes_state_only", False)
+
+    @property
+    def keeps_state(self) -> bool:
+        """Whether a reset concerns it."""
+        return isinstance(self.func, ManagerTermBase) and type(self.func).reset is not ManagerTermBase.reset
 
     def reset(self, env_ids: torch.Tensor) -> None:
         """Reset the state of a class term."""

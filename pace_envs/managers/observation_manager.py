@@ -66,6 +66,11 @@ class ObservationManager:
         """Names of the terms by group."""
         return {name: [term.name for term in terms] for name, (_, terms) in self._groups.items()}
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether no term has anything to reset."""
+        return not any(term.keeps_state for _, terms in self._groups.values() for term in terms)
+
     def group_terms(self, name: str) -> dict[str, tuple[ObservationTermCfg, int]]:
         """Configuration and size of the terms of a group, in order."""
         return {term.name: (term.cfg, term().shape[1]) for term in self._groups[name][1]}

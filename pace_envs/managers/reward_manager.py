@@ -28,7 +28,8 @@ class RewardManager:
         """Resolve the terms."""
         self._terms: list[Term[RewardTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
         self._reward = torch.zeros(env.num_envs, dtype=env.dtype, device=env.device)
-        self._sums = {term.name: torch.zeros_like(self._reward) for term in self._terms}
+        self._totals = torch.zeros(len(self._terms), env.num_envs, dtype=env.dtype, device=env.device)
+        self._sums = {term.name: total for term, total in zip(self._terms, self._totals, strict=True)}
         self._max_episode_length_s = getattr(env, "max_episode_length_s", 1.0)
 
     @property
@@ -40,6 +41,11 @@ class RewardManager:
     def episode_sums(self) -> dict[str, torch.Tensor]:
         """What each term has earned in the present episodes, weighted, (num_envs,)."""
         return self._sums
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether :meth:`reset_where` does what :meth:`reset` does."""
+        return not any(term.keeps_state for term in self._terms)
 
     def get_term_cfg(self, name: str) -> RewardTermCfg:
         """The configuration of a term; its weight can be changed."""
@@ -57,6 +63,12 @@ class RewardManager:
                 self._reward += value
                 self._sums[term.name] += value
         return self._reward.clone()
+
+    def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool; not a number where there is none."""
+        mean = torch.where(done, self._totals, 0.0).sum(dim=1) / (done.sum() * self._max_episode_length_s)
+        self._totals.masked_fill_(done, 0.0)
+        return {f"Episode_Reward/{name}": value for name, value in zip(self._sums, mean, strict=True)}
 
     def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Clear the sums of some environments; returns each term's mean per second of a full episode."""

@@ -58,6 +58,18 @@ class TerminationManager:
                 self.terminated |= value
         return self.dones
 
+    @property
+    def takes_masks(self) -> bool:
+        """Whether :meth:`reset_where` does what :meth:`reset` does."""
+        return not any(term.keeps_state for term in self._terms)
+
+    def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool."""
+        if not self._last:
+            return {}
+        counts = (torch.stack(list(self._last.values())) & done).sum(dim=1)
+        return {f"Episode_Termination/{name}": count for name, count in zip(self._last, counts, strict=True)}
+
     def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Reset class terms; returns how many of these environments each term ended."""
         log = {f"Episode_Termination/{name}": as_number(last[env_ids].sum()) for name, last in self._last.items()}

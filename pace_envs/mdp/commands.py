@@ -14,18 +14,14 @@ if TYPE_CHECKING:
 
 
 class UniformVelocityCommand(CommandTerm):
-    """Velocity of the base in its own frame: forward [m/s], left [m/s], yaw rate [rad/s].
-
-    Attributes:
-        scale: Part of the ranges that is drawn from, 0 to 1; a curriculum can change it.
-    """
+    """Velocity of the base in its own frame: forward [m/s], left [m/s], yaw rate [rad/s]."""
 
     cfg: UniformVelocityCommandCfg
 
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedEnv):
         """Start with zero commands."""
         super().__init__(cfg, env)
-        self.scale = 1.0
+        self._scale = torch.ones((), dtype=env.dtype, device=env.device)
         self._command = torch.zeros(env.num_envs, 3, dtype=env.dtype, device=env.device)
         ranges = env.sim.tensor([cfg.lin_vel_x, cfg.lin_vel_y, cfg.ang_vel_z])
         self._low, self._high = ranges[:, 0], ranges[:, 1]
@@ -43,6 +39,32 @@ class UniformVelocityCommand(CommandTerm):
         self._errors[env_ids] = 0.0
         return {"error_vel_xy": planar / steps, "error_vel_yaw": yaw / steps} if steps else {}
 
+    @property
+    def scale(self) -> float:
+        """Part of the ranges that is drawn from, 0 to 1; a curriculum can change it."""
+        return float(self._scale)
+
+    @scale.setter
+    def scale(self, value: float) -> None:
+        self._scale.fill_(value)
+
+    @property
+    def scale_tensor(self) -> torch.Tensor:
+        """:attr:`scale` where the tensors are, without dimensions: nobody waits for it."""
+        return self._scale
+
+    @property
+    def takes_masks(self) -> bool:
+        """It does."""
+        return True
+
+    def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Draw new commands; returns the mean errors of the episodes that ended [m/s], [rad/s]."""
+        super().reset_where(done)
+        total = torch.where(done[:, None], self._errors, 0.0).sum(dim=0)
+        self._errors.masked_fill_(done[:, None], 0.0)
+        return {"error_vel_xy": total[0] / total[2], "error_vel_yaw": total[1] / total[2]}
+
     def _update_metrics(self) -> None:
         data = self._env.scene["robot"].data
         if data.root_ang_vel_b is None:
@@ -52,9 +74,15 @@ class UniformVelocityCommand(CommandTerm):
         self._errors += torch.stack([planar, yaw, torch.ones_like(yaw)], dim=1)
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
-        drawn = self._env.uniform((len(env_ids), 3), self._low, self._high) * self.scale
-        standing = self._env.uniform((len(env_ids), 1)) < self.cfg.rel_standing_envs
-        self._command[env_ids] = drawn.masked_fill(standing, 0.0)
+        self._command[env_ids] = self._drawn(len(env_ids))
+
+    def _resample_command_where(self, mask: torch.Tensor) -> None:
+        torch.where(mask[:, None], self._drawn(len(mask)), self._command, out=self._command)
+
+    def _drawn(self, count: int) -> torch.Tensor:
+        drawn = self._env.uniform((count, 3), self._low, self._high) * self._scale
+        standing = self._env.uniform((count, 1)) < self.cfg.rel_standing_envs
+        return drawn.masked_fill(standing, 0.0)
 
 
 @dataclass(kw_only=True)

@@ -32,6 +32,7 @@ class command_range_by_tracking(ManagerTermBase):
         self._window = max(env.num_envs // 4, 1)
         self._earned = torch.zeros((), dtype=env.dtype, device=env.device)
         self._episodes = 0
+        self._ended = torch.zeros((), dtype=env.dtype, device=env.device)
 
     def __call__(  # type: ignore[override]
         self,
@@ -53,3 +54,25 @@ class command_range_by_tracking(ManagerTermBase):
             self._earned.zero_()
             self._episodes = 0
         return self._command.scale
+
+    def where(
+        self,
+        env: ManagerBasedRLEnv,
+        done: torch.Tensor,
+        command_name: str,
+        reward_name: str,
+        start: float = 0.5,
+        growth: float = 0.1,
+        threshold: float = 0.7,
+    ) -> torch.Tensor:
+        """The same of environments that are not counted, (num_envs,) bool: nobody waits for the GPU."""
+        full = env.reward_manager.get_term_cfg(reward_name).weight * env.max_episode_length_s
+        scale = self._command.scale_tensor
+        self._earned += torch.where(done, env.reward_manager.episode_sums[reward_name], 0.0).sum() / full
+        self._ended += done.sum()
+        enough = self._ended >= self._window
+        good = enough & (self._earned > threshold * self._ended)
+        scale.copy_(torch.where(good, (scale + growth).clamp(max=1.0), scale))
+        self._earned.masked_fill_(enough, 0.0)
+        self._ended.masked_fill_(enough, 0.0)
+        return scale.clone()

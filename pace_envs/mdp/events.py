@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.managers import SceneEntityCfg
+from pace_envs.managers import SceneEntityCfg, state_only
 from pace_envs.quaternions import from_euler, multiply
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ _ROBOT = SceneEntityCfg()
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
+@state_only
 def reset_joints_by_offset(
     env: ManagerBasedEnv,
     env_ids: torch.Tensor,
@@ -34,6 +35,7 @@ def reset_joints_by_offset(
     asset.write_joint_state_to_sim(position, velocity, ids, env_ids)
 
 
+@state_only
 def reset_root_state_uniform(
     env: ManagerBasedEnv,
     env_ids: torch.Tensor,
@@ -54,6 +56,7 @@ def reset_root_state_uniform(
     asset.write_root_state_to_sim(state, env_ids)
 
 
+@state_only
 def push_by_setting_velocity(
     env: ManagerBasedEnv,
     env_ids: torch.Tensor,

@@ -13,6 +13,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from pace_envs.mdp import UniformVelocityCommand
+from pace_envs.rl.episode_log import DeferredEpisodes
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.simulation import available_processors
 
@@ -34,7 +35,12 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         self, env: RslRlVecEnvWrapper, train_cfg: dict, log_dir: str | None = None, learning_threads: int | None = None
     ):
         """Build the networks; ``learning_threads`` defaults to the number of processors, up to 8."""
+        on_gpu = env.device.type == "cuda"
+        if on_gpu:  # rsl-rl would wait for the GPU at every step; an episode that diverges ends by itself
+            train_cfg = {"check_for_nan": False, **train_cfg}
         super().__init__(env, train_cfg, log_dir, device=str(env.device))
+        if on_gpu:
+            DeferredEpisodes(self.logger)
         self.logger.git_status_repos.clear()  # no copy of somebody's uncommitted work in every run
         self.learning_threads = learning_threads or min(available_processors(), _MOST_THREADS)
         self.alg.update = _with_threads(self.alg.update, self.learning_threads)
