@@ -2,7 +2,9 @@
 
 What a file names is never imported by itself. A record, as it stands in a run's ``settings.json`` and ``result.json``,
 holds where each file of the code lies and its SHA-256; the code is run from the very bytes that were compared, so that
-neither another file of that name in the present folder nor a stale byte code can take its place.
+neither another file of that name in the present folder nor a stale byte code can take its place. It must have been
+named on this machine before (:mod:`pace_actuators.trusted_code`): a folder from elsewhere can bring both code and its
+digest along.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
+
+from pace_actuators.trusted_code import is_trusted, trust
 
 CodeRecord = Mapping[str, Mapping[str, str]]
 """``{module: {"file": path, "sha256": digest}}``, each file of a user's code."""
@@ -61,7 +65,9 @@ def import_named(module: str) -> ModuleType:
     for finder in recorded:  # what the user names comes before what records name
         sys.meta_path.remove(finder)
     try:
-        return _import_file(Path(module).resolve()) if is_path(module) else _import_name(module)
+        found = _import_file(Path(module).resolve()) if is_path(module) else _import_name(module)
+        trust(entry["sha256"] for entry in code_of([module]).values())
+        return found
     except (ImportError, SyntaxError, OSError) as error:
         raise ValueError(
             f"the module {module!r} cannot be imported ({_one_line(error)}). Correct its name, put its folder on "
@@ -225,6 +231,11 @@ def _verified(entry: Mapping[str, str], where: str, hint: str) -> bytes:
         raise ValueError(
             f"{file} has changed since {where} was made with it, so it is not imported by itself. Put it back, or name "
             f"it: {hint}."
+        )
+    if not is_trusted(entry["sha256"]):
+        raise ValueError(
+            f"{where} names code, {file}, that nobody has named on this machine yet, so it is not imported by itself. "
+            f"If you trust it, name it: {hint}."
         )
     return content
 

@@ -62,7 +62,7 @@ class JointLayout:
         unknown = [name for name in order if name not in single]
         if unknown or len(set(order)) != len(order):
             wrong = f"names unknown joints: {', '.join(unknown)}" if unknown else "names a joint twice"
-            raise ValueError(f"joint_order {wrong}. Joints of the model: {', '.join(single)}.")
+            raise ValueError(f"joint_order {wrong}. Joints of the model {path}: {', '.join(single)}.")
         ids = [single[name] for name in order]
         passive = {name: j for name, j in single.items() if name not in order}
         return cls(

@@ -18,6 +18,7 @@ from pace_actuators.own_code import (
     loaded_module,
     split_reference,
 )
+from pace_actuators.trusted_code import trust
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.registration import load_env_cfg, registered_by
 
@@ -79,11 +80,13 @@ class EnvironmentRecord:
         """
         module = None if is_model_file(task) else split_reference(task)[0] or registered_by(task)
         files = model_files(Path(cfg.scene.robot.mjcf_path).resolve())
+        code = code_of([*([module] if module else []), *effects])
+        trust(entry["sha256"] for entry in code.values())  # it runs here already
         return cls(
             task=task,
             module=module,
             folder=folder or str(Path.cwd()),
-            code=code_of([*([module] if module else []), *effects]),
+            code=code,
             files={str(file): file_digest(file) for file in files},
         )
 
@@ -157,7 +160,8 @@ def file_digest(path: str | Path) -> str:
     """SHA-256 of a file, or of all files of a folder, to tell whether they have changed."""
     path, digest = Path(path), hashlib.sha256()
     if not path.is_dir():
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        with path.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
     for file in sorted(each for each in path.rglob("*") if each.is_file()):
         digest.update(f"{file.relative_to(path)}\0{file_digest(file)}\0".encode())
     return digest.hexdigest()

@@ -24,7 +24,7 @@ from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.problem.processes import Processes
 from pace_optim.problem.try_out import check_size, try_out
-from pace_optim.report import write_report
+from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
 from pace_optim.run.inputs import (
@@ -38,6 +38,7 @@ from pace_optim.run.open import Run, problem_of
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
+from pace_optim.run.tensors import read_bounds
 from pace_optim.terminal.progress import ProgressLine
 from pace_optim.uncertainty.assessment import assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
@@ -88,14 +89,9 @@ def fit(
     problem = _load(settings, env_cfg)
     settings = with_absolute_paths(settings, env_cfg)
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
+    digests, inputs = recording_digests(settings), input_digests(settings, record)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
-    folder.write_start(
-        settings.to_dict(),
-        recording_digests(settings),
-        problem,
-        inputs=input_digests(settings, record),
-        environment=record.to_dict(),
-    )
+    folder.write_start(settings.to_dict(), digests, problem, inputs=inputs, environment=record.to_dict())
     on_start(folder.path)
     run = _Fit(settings, problem, folder, progress or ProgressLine(), record, processes)
     return run.run(assess_interrupted)
@@ -125,6 +121,9 @@ def resume(
     settings, _ = FitSettings.load(Path(path) / "settings.json")
     folder = RunFolder(Path(path))
     checkpoint = folder.read_checkpoint()
+    read_bounds(folder.path)
+    if (folder.path / "result.json").exists():  # of a fit that had ended: its report is made of more
+        check_folder(folder.path)
     before = Run.open(folder.path, task)
     check_unchanged(before)
     settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
@@ -294,9 +293,13 @@ class _Fit:
                     return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
             self.descents = [Descent(x=start) for start in starts]
             self._write_checkpoint()
-        self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
-        if self.settings.optimizer == "least_squares" and len(self.descents) == 1:
-            self._try_other_starts(self.descents[0])
+        found, *others = self.descents
+        if self.settings.optimizer == "least_squares" and others:  # resumed while it tried other starts
+            self._try_other_starts(found, others)
+        else:
+            self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
+            if self.settings.optimizer == "least_squares" and len(self.descents) == 1:
+                self._try_other_starts(self.descents[0])
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
 
     def _refine_from(self, x: torch.Tensor) -> Outcome:
@@ -304,21 +307,26 @@ class _Fit:
         self.descents = least_squares(self.evaluator, self.colouring, [x], _NEAR, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
 
-    def _try_other_starts(self, found: Descent) -> None:
-        """Where the only start ended far above the noise, refine a few others: it may be a wrong valley."""
+    def _try_other_starts(self, found: Descent, begun: Sequence[Descent] = ()) -> None:
+        """Where the only start ended far above the noise, refine a few others: it may be a wrong valley.
+
+        Args:
+            found: Where it ended.
+            begun: The others, as far as an interrupted run had come.
+        """
         rmse = (found.score / len(self.problem.joint_names)) ** 0.5
         times = times_noise(self.problem, rmse)
         if times is None or times < FAR_ABOVE_NOISE:
             return
         space = self.problem.space
         vectors = [*other_valleys(space, found.x), *scattered(space, _SCATTERED, self.settings.seed)]
-        starts = [Descent(x=x) for x in vectors]
-        self.progress.say(f"{times:.3g} times the noise: trying {len(starts)} other starts")
+        starts = list(begun) or [Descent(x=x) for x in vectors]
+        self.progress.say(f"{times:.3g} times the noise: trying {len(vectors)} other starts")
         others = refine(
             self.evaluator, self.colouring, starts, lambda descents: self._after_iteration([found, *descents])
         )
         self.descents = sorted([found, *others], key=lambda d: d.score)
-        self._searched = len(starts) if self.descents[0] is found else 0
+        self._searched = len(vectors) if self.descents[0] is found else 0
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
@@ -337,7 +345,8 @@ class _Fit:
             agree_to_stop(optimizer, self.processes)
 
         if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
-            probe(optimizer)
+            with self.searcher.again():
+                probe(optimizer)
         self.processes.agree((self.settings, optimizer.history, optimizer.line_generation))
         self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)

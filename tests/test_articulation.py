@@ -138,7 +138,7 @@ def test_without_any_drive_the_model_falls(build):
 
 @pytest.mark.parametrize(
     ("order", "message"),
-    [(("a", "x"), "joint_order names unknown joints: x. Joints of the model: a, b, c"), (("a", "a"), "joint twice")],
+    [(("a", "x"), "joint_order names unknown joints: x. Joints of the model .*: a, b, c"), (("a", "a"), "joint twice")],
 )
 def test_an_impossible_joint_order_is_refused(build, order, message):
     with pytest.raises(ValueError, match=message):

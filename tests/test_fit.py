@@ -247,7 +247,7 @@ def interrupt_after(monkeypatch, method, count):
 
 
 def same_result(resumed, whole):
-    same = ("parameters", "score", "stop_reasons", "generations", "std", "rmse", "warnings")
+    same = ("parameters", "score", "stop_reasons", "generations", "std", "rmse", "warnings", "simulated_steps")
     return all(getattr(resumed, name) == getattr(whole, name) for name in same)
 
 
@@ -296,6 +296,30 @@ def test_interrupted_twice_resumes_to_the_same_result(recordings, tmp_path, no_r
         resume(folder, progress=Silent())
     resumed, _ = resume(folder, progress=Silent())
     assert same_result(resumed, whole)
+
+
+def test_interrupted_while_it_tries_other_starts_resumes_to_the_same_result(
+    recordings, tmp_path, no_report, monkeypatch
+):
+    options = {"optimizer": "least_squares"}
+    whole, whole_folder = run(tmp_path, recordings["wrong"], **options)
+    original, calls = fit_module._Fit._after_iteration, []
+
+    def interrupted(self, descents):
+        original(self, descents)
+        calls.extend([1] * (len(descents) > 1))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit_module._Fit, "_after_iteration", interrupted)
+        _, folder = run(tmp_path, recordings["wrong"], **options)
+    assert len(calls) == 2
+    resumed, _ = resume(folder, progress=Silent())
+    assert same_result(resumed, whole)
+    histories = [json.loads((f / "history.json").read_text()) for f in (folder, whole_folder)]
+    assert histories[0]["refine_best"] == histories[1]["refine_best"]
+    assert histories[0]["refine_steps"] == histories[1]["refine_steps"]
 
 
 def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp_path, no_report, monkeypatch):

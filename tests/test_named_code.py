@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from command_lines import run_script
 from problems import BENCH, record
 
 from pace_actuators.effects import get_effect
-from pace_actuators.own_code import code_of, import_named, import_recorded
+from pace_actuators.own_code import code_of, digest_of, import_named, import_recorded
 from pace_envs.rl.runner import read_checkpoint
 from pace_optim.fit import fit
 from pace_optim.recording import save_recording
@@ -144,6 +145,42 @@ def test_recorded_code_is_run_from_the_bytes_that_were_compared(package, monkeyp
     (package / "trees" / "leaf.py").write_text("raise SystemExit('executed')")
     with pytest.raises(ValueError, match=r"leaf\.py has changed since result\.json"):
         import_recorded("trees.oak", record, "result.json", "--task …")
+
+
+def test_a_folder_that_brings_code_and_its_digest_along_runs_none_of_it(run, tmp_path):
+    """A forged run: its record fits its module, and nobody has named that module on this machine."""
+    forged = tmp_path / "downloaded" / "run"
+    shutil.copytree(run, forged)
+    module = forged.parent / "helper.py"
+    module.write_text(f"open({str(tmp_path / 'executed')!r}, 'w')\n")
+    record = {"helper": {"file": str(module), "sha256": digest_of(module.read_bytes())}}
+    for name, part in (("settings.json", "settings"), ("result.json", None)):
+        content = json.loads((forged / name).read_text())
+        (content if part is None else content[part])["effects"] = ["helper:Drag"]
+        environment = {"task": BENCH, "module": "helper", "folder": str(forged.parent), "code": record, "files": {}}
+        content["environment"] = environment
+        (forged / name).write_text(json.dumps(content))
+    for words in (("fit", "--resume", forged), ("diagnose", forged), ("export", forged, "--format", "json")):
+        done = run_script(*words, cwd=forged.parent)
+        assert done.returncode == 2 and "helper.py, that nobody has named on this machine yet" in done.stderr, done
+    assert not (tmp_path / "executed").exists()
+
+
+def test_code_that_was_named_once_is_known_from_then_on(package, monkeypatch):
+    monkeypatch.chdir(package)
+    monkeypatch.setenv("XDG_STATE_HOME", str(package / "state"))
+    code = {"trees": package / "trees" / "__init__.py", "trees.leaf": package / "trees" / "leaf.py"}
+    record = {name: {"file": str(file), "sha256": digest_of(file.read_bytes())} for name, file in code.items()}
+    with pytest.raises(ValueError, match=r"nobody has named on this machine yet.*--import trees"):
+        import_recorded("trees.leaf", record, "result.json", "--import trees.leaf")
+    import_named("trees.leaf")
+    forget()
+    assert import_recorded("trees.leaf", record, "result.json", "--import trees.leaf").COLOUR == "green"
+    forget()
+    (package / "state" / "pace" / "named_code.txt").unlink()
+    (package / "state" / "pace").rmdir()
+    (package / "state" / "pace").write_text("in the way: nothing can be kept")
+    import_named("trees.leaf")
 
 
 def test_code_without_a_record_is_not_imported(package, monkeypatch):

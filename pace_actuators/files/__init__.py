@@ -5,6 +5,7 @@ from pace_actuators.files.schema import checked, refuse
 from pace_actuators.files.writing import (
     json_text,
     remove_leftovers,
+    replacing,
     write_atomically,
     write_json,
     write_tensors,
@@ -20,6 +21,7 @@ __all__ = [
     "read_tensors",
     "refuse",
     "remove_leftovers",
+    "replacing",
     "write_atomically",
     "write_json",
     "write_tensors",

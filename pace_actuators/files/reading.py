@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -61,10 +62,12 @@ def read_tensors(path: str | Path, cure: str) -> Any:
     """
     path = file_at(path, cure)
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of foreign pickles: what is wrong is said below
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         if "Unsupported" in str(error) or "weights_only" in str(error).lower():
-            reason = "it holds other things than tensors, numbers, text, lists and dicts, or is no file of torch.save"
+            reason = "it holds Python objects beside tensors, numbers, text, lists and dicts, or is none of torch.save"
         else:
             reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise ValueError(f"{path} cannot be read ({reason}). {cure}") from None

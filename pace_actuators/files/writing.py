@@ -30,6 +30,26 @@ def write_atomically(path: Path, write: Writer) -> None:
         pass
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file's path beside a file's, for what writes by path; it takes the file's place at the end.
+
+    Its suffix is the file's, which some libraries go by.
+
+    Raises:
+        OSError: If it cannot be written; its ``filename`` is the path.
+    """
+    remove_leftovers(path.parent)
+    temporary = path.with_name(f".{path.stem[:40]}.0.{os.getpid()}.tmp{path.suffix}")
+    try:
+        with naming(path):
+            yield temporary
+            os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
 def write_together(files: Mapping[Path, bytes]) -> None:
     """Write files that belong together: all of them, or none if one cannot be written.
 
@@ -106,7 +126,7 @@ def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files of processes of this machine that were killed while they wrote."""
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
-            found = re.fullmatch(r"\..+\.(\d+)\.tmp", entry.name)
+            found = re.fullmatch(r"\..+\.(\d+)\.tmp(\.\w+)?", entry.name)
             if found and not _is_alive(int(found[1])):
                 with contextlib.suppress(OSError):
                     os.unlink(entry.path)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import write_together
 from pace_envs.mdp import JointPositionAction
 from pace_envs.rl.runner import PaceOnPolicyRunner
 
@@ -19,21 +21,23 @@ def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
     """
     import onnx  # heavy, and only needed here
 
-    folder.mkdir(parents=True, exist_ok=True)
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # it misses torchvision, which nobody needs here
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of both exporters' own deprecations
-            runner.export_policy_to_jit(str(folder))
-            runner.export_policy_to_onnx(str(folder))
-        onnx.save_model(onnx.load_model(folder / "policy.onnx"), folder / "policy.onnx")  # the weights inside
-        (folder / "policy.onnx.data").unlink(missing_ok=True)
-    finally:
-        log.setLevel(level)
-    text = json.dumps(_describe(runner), indent=2)
-    (folder / "policy.json").write_text(text + "\n", encoding="utf-8")
+    with tempfile.TemporaryDirectory() as made:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of both exporters' own deprecations
+                runner.export_policy_to_jit(made)
+                runner.export_policy_to_onnx(made)
+        finally:
+            log.setLevel(level)
+        policy = Path(made, "policy.pt").read_bytes()
+        network = onnx.load_model(Path(made, "policy.onnx")).SerializeToString()  # the weights inside
+    text = json.dumps(_describe(runner), indent=2) + "\n"
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {"policy.pt": policy, "policy.onnx": network, "policy.json": text.encode()}
+    write_together({folder / name: content for name, content in files.items()})
 
 
 def _describe(runner: PaceOnPolicyRunner) -> dict[str, Any]:

@@ -71,7 +71,11 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
         check_video_path(settings.video)
     path = find_checkpoint(settings.checkpoint)
     run = _run_settings(path, settings)
-    cfg = load_cfg(run, edit)
+    try:
+        cfg = load_cfg(run, edit)
+    except ValueError as error:
+        own = path.parent / SETTINGS_FILE
+        raise ValueError(f"{own}: {error}" if own.is_file() else str(error)) from None
     play_cfg(cfg)
     if settings.command is not None:
         fix_command(cfg, settings.command)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import checked, read_json, refuse, write_json
 from pace_envs.task_source import EnvironmentRecord
 
 SETTINGS_FILE = "settings.json"
+_CURE = "Train anew, or put it back."
 IDENTIFIED_FILE = "identified.json"
 """Copy of the fit's result that a training took its drives from."""
 
@@ -66,10 +66,7 @@ class RunSettings:
             folder: The training's.
             environment: Where the task comes from (:class:`pace_envs.task_source.EnvironmentRecord`).
         """
-        part = folder / f".{SETTINGS_FILE}.part"
-        content = {"version": 1, **asdict(self), "environment": dict(environment)}
-        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        os.replace(part, folder / SETTINGS_FILE)
+        write_json(folder / SETTINGS_FILE, {"version": 1, **asdict(self), "environment": dict(environment)})
 
     @classmethod
     def read(cls, folder: Path, task: str | None = None) -> RunSettings:
@@ -85,19 +82,19 @@ class RunSettings:
         path = folder / SETTINGS_FILE
         if not path.is_file():
             raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-            # not in older runs
-            added: dict[str, Any] = dict.fromkeys(("identified", "randomize_identified", "physics_dt", "start_from"))
-            added["device"] = "cpu"
-            settings = cls(**{field.name: (added | data)[field.name] for field in fields(cls)})
-            record = EnvironmentRecord.read(data.get("environment"), settings.task)
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}).") from None
-        settings.task = record.use(str(path), task)
-        if settings.identified is not None and (folder / IDENTIFIED_FILE).is_file():
-            settings.identified = str(folder / IDENTIFIED_FILE)
-        return settings
+        content = checked(cls, read_json(path, _CURE), path, _CURE)
+        record = _record(path, content.task)
+        content.task = record.use(str(path), task)
+        if content.identified is not None and (folder / IDENTIFIED_FILE).is_file():
+            content.identified = str(folder / IDENTIFIED_FILE)
+        return content
+
+
+def _record(path: Path, task: str) -> EnvironmentRecord:
+    try:
+        return EnvironmentRecord.read(read_json(path, _CURE).get("environment"), task)
+    except (TypeError, AttributeError) as error:
+        refuse(path, str(error), _CURE)
 
 
 def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import os
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
+from pace_actuators.files import read_tensors, replacing
+from pace_actuators.files.reading import tensors_in
 from pace_envs.mdp import UniformVelocityCommand
 from pace_envs.rl.episode_log import DeferredEpisodes
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.simulation import available_processors
 
+_CURE = "Name a model_<iteration>.pt that scripts/train.py wrote."
 _MOST_THREADS = 8  # for networks this small
 
 
@@ -59,9 +61,8 @@ class PaceOnPolicyRunner(OnPolicyRunner):
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save networks, optimizer and the curriculum's state, whole or not at all."""
-        part = Path(path).with_name(f".{Path(path).name}.part")
-        super().save(str(part), {**(infos or {}), "env": self._env_state()})
-        os.replace(part, path)
+        with replacing(Path(path)) as part:
+            super().save(str(part), {**(infos or {}), "env": self._env_state()})
 
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
@@ -73,18 +74,21 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         """
         if not Path(path).is_file():
             raise ValueError(f"The checkpoint {path} does not exist.")
-        content = read_checkpoint(path, map_location or str(self.device))  # wherever it was trained
+        content = read_checkpoint(path)  # wherever it was trained
+        before = [dict(group) for group in self.alg.optimizer.param_groups]
         try:
             if self.alg.load(content, load_cfg, strict):
                 self.current_learning_iteration = int(content["iter"])
-            infos = content["infos"]
-        except (RuntimeError, KeyError, AttributeError, TypeError, ValueError) as error:
+            infos = content["infos"] or {}
+            scales = dict(infos.get("env", {}).get("command_scale", {}))
+            _check_optimizer(self.alg.optimizer, before)
+            if self.env.unwrapped.curriculum_manager.active_terms:
+                for name, scale in scales.items():
+                    self._velocity_commands()[name].scale = _finite(scale, f"command_scale/{name}")
+        except (RuntimeError, KeyError, IndexError, AttributeError, TypeError, ValueError) as error:
             first = (str(error) or type(error).__name__).splitlines()[0]
             raise ValueError(f"{path} is no checkpoint of this task's networks ({first}). Check --task.") from None
         self.current_learning_iteration += 1
-        if self.env.unwrapped.curriculum_manager.active_terms:
-            for name, scale in (infos or {}).get("env", {}).get("command_scale", {}).items():
-                self._velocity_commands()[name].scale = scale
         return infos
 
     def _env_state(self) -> dict[str, Any]:
@@ -96,26 +100,47 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         return {name: term for name, term in terms.items() if isinstance(term, UniformVelocityCommand)}
 
 
-def read_checkpoint(path: str | Path, map_location: str | None = None) -> dict[str, Any]:
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """The content of a checkpoint: numbers and tensors, and nothing that would run code to be read.
 
     Raises:
         ValueError: If the file is damaged or holds anything else.
     """
     try:
-        content = torch.load(path, weights_only=True, map_location=map_location)
-    except (pickle.UnpicklingError, BadZipFile, RuntimeError, EOFError, KeyError, ValueError, TypeError) as error:
-        foreign = isinstance(error, pickle.UnpicklingError) and "weights_only" in str(error).lower()
-        what = "holds objects of Python beside numbers, which are not loaded" if foreign else "is damaged, or none"
-        raise ValueError(
-            f"The checkpoint {path} {what}. Name a model_<iteration>.pt that scripts/train.py wrote."
-        ) from None
+        content = read_tensors(path, _CURE)
+    except ValueError as error:
+        raise ValueError(f"The checkpoint {error}") from None
     if not isinstance(content, dict):
         raise ValueError(
-            f"The checkpoint {path} holds a {type(content).__name__}, expected that of a training. Name a "
-            "model_<iteration>.pt that scripts/train.py wrote."
+            f"The checkpoint {path} holds a {type(content).__name__}, expected that of a training. {_CURE}"
         )
+    for key, tensor in tensors_in(content):
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise ValueError(f"The checkpoint {path}: {key} holds values that are no numbers. {_CURE}")
     return content
+
+
+def _finite(value: Any, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{what} is {value!r:.40}")
+    return value
+
+
+def _check_optimizer(optimizer: torch.optim.Optimizer, before: list[dict[str, Any]]) -> None:
+    """See whether what was loaded can be gone on with: the optimizer itself looks when it steps."""
+    for group, own in zip(optimizer.param_groups, before, strict=True):
+        for key, value in own.items():
+            found = group[key]
+            if key == "params":
+                continue
+            if type(found) is not type(value) or (isinstance(found, float) and not 0.0 <= found < math.inf):
+                raise ValueError(f"the optimizer's {key} is {found!r:.40}")
+        for parameter in group["params"]:
+            for key, value in optimizer.state.get(parameter, {}).items():
+                if isinstance(value, torch.Tensor) and value.shape not in ((), parameter.shape):
+                    raise ValueError(f"the optimizer's {key} has the shape {tuple(value.shape)}")
+                if not isinstance(value, torch.Tensor) or value.isnan().any():
+                    raise ValueError(f"the optimizer's {key} is no number")
 
 
 def _with_threads(update: Callable[[], dict], threads: int) -> Callable[[], dict]:

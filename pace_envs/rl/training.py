@@ -17,7 +17,14 @@ from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
 from pace_envs.rl.export import export_policy
-from pace_envs.rl.run_folder import IDENTIFIED_FILE, RunSettings, find_checkpoint, latest_checkpoint, new_run_folder
+from pace_envs.rl.run_folder import (
+    IDENTIFIED_FILE,
+    SETTINGS_FILE,
+    RunSettings,
+    find_checkpoint,
+    latest_checkpoint,
+    new_run_folder,
+)
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.task_source import EnvironmentRecord
@@ -102,13 +109,15 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
     """
     cfg = load_cfg(settings, edit)
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)
-    if process_number():
-        return _learn(cfg, None, start)
-    folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
-    settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
-    if settings.identified is not None:
-        shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
-    return _learn(cfg, folder, start)
+
+    def begin() -> Path:
+        folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
+        settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
+        if settings.identified is not None:
+            shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
+        return folder
+
+    return _learn(cfg, begin, start)
 
 
 def resume(
@@ -130,17 +139,23 @@ def resume(
     if device is not None:
         settings = replace(settings, device=device)
     checkpoint = latest_checkpoint(folder)
-    cfg = load_cfg(settings, edit)
-    if process_number():
-        return _learn(cfg, None, checkpoint)
-    settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
-    return _learn(cfg, folder, checkpoint)
+    try:
+        cfg = load_cfg(settings, edit)
+    except ValueError as error:  # from what the folder says
+        raise ValueError(f"{folder / SETTINGS_FILE}: {error}") from None
+
+    def begin() -> Path:
+        settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
+        return folder
+
+    return _learn(cfg, begin, checkpoint)
 
 
-def _learn(cfg: VelocityEnvCfg, folder: Path | None, checkpoint: Path | None) -> Path | None:
+def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | None) -> Path | None:
+    """Learn; ``begin`` makes the folder, once a checkpoint is known to be sound."""
     torch.manual_seed(cfg.runner.seed)
     env = make_env(cfg)
-    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict(), None if folder is None else str(folder))
+    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
     if checkpoint is not None:
         runner.load(str(checkpoint))
         torch.manual_seed(cfg.runner.seed + runner.current_learning_iteration)
@@ -151,6 +166,8 @@ def _learn(cfg: VelocityEnvCfg, folder: Path | None, checkpoint: Path | None) ->
             f"{checkpoint} is of iteration {runner.current_learning_iteration - 1}, and the training ends after "
             f"{cfg.runner.max_iterations} iterations. Raise --max_iterations."
         )
+    folder = None if process_number() else begin()
+    runner.logger.log_dir = None if folder is None else str(folder)
     with told_of_lost_processes():
         runner.learn(left, init_at_random_ep_len=True)
     if folder is not None:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pace_actuators.files import replacing
+
 _ENCODE = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart")
 
 
@@ -28,10 +30,9 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
     if not frames:
         raise ValueError(f"There are no pictures to write to {path}.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        _write_gif(path, frames, fps)
-    else:
-        _write_mp4(path, frames, fps)
+    write = _write_gif if path.suffix == ".gif" else _write_mp4
+    with replacing(path) as part:
+        write(part, frames, fps)
 
 
 def check_video_path(path: str | Path) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from pace_actuators.files import write_atomically
 from pace_envs.from_model.writing import configuration_text
 from pace_optim.terminal.cli import make_parser
 
@@ -21,7 +22,7 @@ def main() -> None:
         raise ValueError(f"{args.output} exists and may hold your edits. Choose another --output, or delete it.")
     text, task, cfg = configuration_text(args.model, args.output)
     args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.write_text(text, encoding="utf-8")
+    write_atomically(args.output, lambda file: file.write(text.encode()))
     for note in cfg.sim2real.notes:
         print(f"note: {note}")
     print(f"{len(cfg.sim2real.joint_order)} joints, task {args.output}:{task}")

@@ -48,7 +48,11 @@ def main() -> None:
     if args.plot_trajectory or both:
         if args.mean_name:
             path = find_mean(run, args.mean_name)
-            content, of = replay(run, read_mean(path), args.task), path.stem
+            mean, of = read_mean(path), path.stem
+            try:
+                content = replay(run, mean, args.task)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
         else:
             content, of = read_trajectory(run), "best"
         drawn = plot_trajectories(content, title=f"{title} · {of}", make_figure=plt.figure)

@@ -163,7 +163,8 @@ def least_squares(
     descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
     for descent in descents:
         if descent.lost_jacobian:
-            _find_jacobian(descent, evaluator, colouring, where)
+            with evaluator.again():
+                _find_jacobian(descent, evaluator, colouring, where)
     while running := [d for d in descents if d.stop_reason is None]:
         batches, steps = [], []
         for descent in running:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -58,11 +59,21 @@ class Evaluator:
         self._rollouts: dict[int, Rollout] = {}
         self.simulations = 0
         """Candidates simulated so far by :meth:`residuals`."""
+        self._again = 0
 
     @property
     def simulated_steps(self) -> int:
         """Control steps simulated so far, over all environments."""
-        return sum(rollout.simulated_steps for rollout in self._rollouts.values())
+        return sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again
+
+    @contextlib.contextmanager
+    def again(self) -> Iterator[None]:
+        """What is simulated in the block was counted before: a run that goes on finds again what it had not kept."""
+        before = self.simulated_steps
+        try:
+            yield
+        finally:
+            self._again += self.simulated_steps - before
 
     def rollout(self, num_candidates: int) -> Rollout:
         """The rollout of that many candidates."""

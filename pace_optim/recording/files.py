@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 from collections.abc import Sequence
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.terminal.atomic import write_atomically
+from pace_actuators.files import read_tensors, write_atomically
+from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
@@ -110,19 +110,11 @@ def _facts_of(recording: Recording) -> dict[str, Any]:
 
 
 def _read_pt(path: Path) -> dict[str, Any]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged or foreign file
-        if isinstance(error, pickle.UnpicklingError) and "load key" not in str(error):
-            problem = "holds Python objects other than tensors, numbers, text, lists and dicts"
-            cure = "Save tensors: torch.save({'time': t, 'dof_pos': q, 'des_dof_pos': q_des}, path)."
-        else:
-            problem, cure = f"cannot be read ({_first_line(error)})", "Copy or record it again."
-        raise ValueError(f"{path}: {problem}; expected a dict saved by torch.save. {cure}") from error
+    cure = "Save a dict of tensors: torch.save({'time': t, 'dof_pos': q, 'des_dof_pos': q_des}, path)."
+    content = read_tensors(path, cure)
     if not isinstance(content, dict):
         raise ValueError(
-            f"{path}: holds a {type(content).__name__}; expected a dict with time, dof_pos and des_dof_pos. "
-            "Save such a dict with torch.save."
+            f"{path}: holds a {type(content).__name__}; expected a dict with time, dof_pos and des_dof_pos. {cure}"
         )
     return {str(key): _without_tensor(value) for key, value in content.items()}
 
@@ -139,17 +131,8 @@ def _without_tensor(value: Any) -> Any:
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            fields = {key: content[key] for key in content.files}
-        if foreign := [key for key, value in fields.items() if not isinstance(value, np.ndarray)]:
-            raise ValueError(f"{foreign[0]} is no array")
-    except Exception as error:  # zip, value and end-of-file errors alike
-        if "Object arrays" in str(error):
-            problem, cure = "holds Python objects", "Store text as unicode arrays and dicts as JSON text."
-        else:
-            problem, cure = f"cannot be read ({_first_line(error)})", "Copy or record it again."
-        raise ValueError(f"{path}: {problem}; expected arrays saved by numpy.savez. {cure}") from error
+    cure = "Save arrays with numpy.savez, text as unicode arrays and dicts as JSON text."
+    fields = read_arrays(path, cure)
     return {
         key: array.item() if array.dtype.kind == "U" and array.ndim == 0 else array for key, array in fields.items()
     }
@@ -162,7 +145,7 @@ def add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
         return fields
     try:
         facts = json.loads(facts_path.read_text(encoding="utf-8-sig"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{facts_path}: is not JSON ({error}). Correct it, or move it away from {path.name}."
         ) from error
@@ -189,7 +172,3 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, dict) or isinstance(other, dict):
         return one == other
     return np.array_equal(np.asarray(one), np.asarray(other))
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__} {error}".splitlines()[0].strip().rstrip(".")

@@ -56,7 +56,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
     return render(run, sections).encode()
 
 
-def check_folder(folder: str | Path, *, anew: str) -> None:
+def check_folder(folder: str | Path, *, anew: str = "") -> None:
     """Read all that the report of a run is made of, so that what is damaged is told before the work.
 
     Args:
@@ -77,13 +77,8 @@ def make_sections(run: RunData) -> list[Section]:
     """
     sections = []
     for make, name in SECTIONS.items():
-        try:
+        with run.blaming(name):
             section = make(run)
-        except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
-            if name is None or str(run.folder) in str(error):
-                raise
-            what = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise ValueError(f"{run.folder / name} is damaged ({what}). Remove it, or make it anew.") from error
         if section is not None:
             sections.append(section)
     return sections

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,21 @@ class RunData:
     def worst_first(self) -> list[RecordingData]:
         """The recordings, those with the largest error first."""
         return sorted(self.recordings, key=lambda each: -float(np.nan_to_num(each.error).std()))
+
+    @contextlib.contextmanager
+    def blaming(self, name: str | None) -> Iterator[None]:
+        """Let what fails in the block be told as damage of a file; ``None``: of none.
+
+        Raises:
+            ValueError: What failed; the message names the file.
+        """
+        try:
+            yield
+        except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
+            if name is None or str(self.folder) in str(error):
+                raise
+            what = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise ValueError(f"{self.folder / name} is damaged ({what}). Remove it, or make it anew.") from error
 
     def read_json(self, name: str) -> Any | None:
         """Another file of the folder, ``None`` if it is not there; for sections about later steps."""

@@ -140,9 +140,10 @@ def _header(path: Path) -> list[str]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             line = file.readline(1 << 20)
-    except (UnicodeDecodeError, OSError):
+        cells = next(csv.reader([line], delimiter=max(",;\t", key=line.count)), [])
+    except (UnicodeDecodeError, OSError, csv.Error):
         return []
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=max(",;\t", key=line.count)), [])]
+    return [cell.strip() for cell in cells]
 
 
 def _is_own_csv(path: Path) -> bool:

@@ -54,7 +54,7 @@ def check_unchanged(run: Run) -> None:
         path = Path(name)
         if name in moved:  # what it says is compared, once it is loaded
             continue
-        if digest is None and path.exists():
+        if digest is None and path.is_file():
             raise ValueError(
                 f"{name} was not there when the run was started, and would be read now. Move it away, or start a new "
                 "fit."
@@ -86,4 +86,4 @@ def _absolute(names: list[str]) -> list[str]:
 
 
 def _digest_if_there(path: Path) -> str | None:
-    return file_digest(path) if path.exists() else None
+    return file_digest(path) if path.is_file() or path.is_dir() else None

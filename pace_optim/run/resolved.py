@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import effect_cfgs
+from pace_actuators.files import replacing
 from pace_optim.problem.problem import Problem
 
 _PACKAGES = ("pace-mujoco", "mujoco", "torch", "numpy", "scipy", "cma")
@@ -98,12 +99,10 @@ def first_difference(before: Any, after: Any, path: str = "") -> str | None:
 def write_model(problem: Problem, path: Path) -> None:
     """The compiled model in MuJoCo's own format (``mujoco.MjModel.from_binary_path`` reads it), whole or not at all."""
     env = problem.make_env(1)
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        mujoco.mj_saveModel(env.sim.model, str(part), None)
-        part.replace(path)
+        with replacing(path) as part:
+            mujoco.mj_saveModel(env.sim.model, str(part), None)
     finally:
-        part.unlink(missing_ok=True)
         env.close()
 
 

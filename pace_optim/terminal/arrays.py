@@ -9,6 +9,7 @@ from typing import IO
 import numpy as np
 
 from pace_actuators.files import file_at
+from pace_actuators.memory import check_memory
 
 
 def read_arrays(path: str | Path, cure: str) -> dict[str, np.ndarray]:
@@ -26,6 +27,8 @@ def read_arrays(path: str | Path, cure: str) -> dict[str, np.ndarray]:
     key = ""
     try:
         with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+            check_memory(unpacked, "unpacking it", "It is larger than it looks.")
             for member in archive.infolist():
                 key = member.filename.removesuffix(".npy")
                 with archive.open(member) as file:
@@ -38,6 +41,7 @@ def read_arrays(path: str | Path, cure: str) -> dict[str, np.ndarray]:
     except Exception as error:  # numpy, zip and end-of-file errors of many kinds
         where = f"{path}: {key} cannot be read" if key else f"{path} cannot be read"
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
+        reason = "it holds Python objects" if reason.startswith("Object arrays") else reason
         raise ValueError(f"{where} ({reason}). {cure}") from None
 
 

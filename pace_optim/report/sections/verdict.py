@@ -27,6 +27,11 @@ _SHOWN = 4
 
 def verdict_first(run: RunData) -> str:
     """For the top of the page: the verdict, sizes, likes, and a link to the run that has what was missing."""
+    with run.blaming("diagnosis.json"):
+        return _in_short(run)
+
+
+def _in_short(run: RunData) -> str:
     content = run.read_json("diagnosis.json")
     if not content:
         return ""
