@@ -10,6 +10,7 @@ import pytest
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.pages import effect_page
+from pace_optim.plant import EFFECTS
 
 ROOT = Path(__file__).parents[1]
 LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*?\b(?:src|href)=[\"']?(https?:)?//[^\s\"'>]+")
@@ -46,6 +47,8 @@ def test_the_site_has_a_page_for_each_effect_and_the_reference(site):
     for name in available_effects():
         if get_effect(name).__module__.startswith("pace_actuators."):
             assert name in (site / "effects" / f"{name}.html").read_text("utf-8")
+    gallery = (site / "effects" / "index.html").read_text("utf-8")
+    assert gallery.count("images/effects/") == len(drawn_effects())
     reference = (site / "reference.html").read_text("utf-8")
     for name in ("PaceDCMotor", "ManagerBasedRLEnv", "Recording", "write_report"):
         assert f">{name}<" in reference or f"{name}</" in reference, f"the reference has no {name}"
@@ -55,3 +58,14 @@ def test_an_effect_s_page_says_what_it_is():
     page = effect_page(get_effect("stribeck_friction"), "../images/effects/stribeck_friction.png")
     for words in ("# stribeck_friction", "F_s exp", "rad/s", "--effects stribeck_friction", "stribeck_friction.png"):
         assert words in page
+
+
+def drawn_effects() -> list[str]:
+    """Effects of a name and a law that the independent simulator can hide in a recording."""
+    return [name for name in available_effects() if name in EFFECTS and not get_effect(name).free_form]
+
+
+def test_every_effect_that_can_be_recorded_has_a_picture():
+    """``python docs/site/effect_pictures.py`` draws those that are missing."""
+    pictures = {path.stem for path in (ROOT / "docs" / "images" / "effects").glob("*.png")}
+    assert len(drawn_effects()) > 25 and pictures == set(drawn_effects())

@@ -14,10 +14,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from PIL import Image
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_optim.fit import fit
-from pace_optim.plant import Case, write_case
+from pace_optim.plant import EFFECTS, Case, write_case
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.settings import FitSettings
 
@@ -49,13 +50,16 @@ def draw(name: str, folder: Path) -> Path:
     _over_time(axes[0], time, measured, error)
     _scatter(axes[1], speed, error, "speed [rad/s]")
     _scatter(axes[2], measured, error, "position [rad]")
-    figure.suptitle(
-        f"{name}: error of the base model, {np.sqrt(np.mean(error**2)):.2g} mrad RMS", fontsize=10, color=INK
-    )
+    rms = np.sqrt(np.mean(error**2))
+    text = f"{rms:.0f}" if rms >= 10 else f"{rms:.2g}"
+    figure.suptitle(f"{name}: error of the base model, {text} mrad RMS", fontsize=10, color=INK)
     PICTURES.mkdir(parents=True, exist_ok=True)
     path = PICTURES / f"{name}.png"
     figure.savefig(path, dpi=80, metadata={"Software": None})
     plt.close(figure)
+    with Image.open(path) as picture:  # 24 colours are enough, and a third of the size
+        small = picture.convert("RGB").quantize(24)
+    small.save(path, optimize=True)
     return path
 
 
@@ -90,7 +94,7 @@ def _scatter(axis: plt.Axes, x: np.ndarray, error: np.ndarray, label: str) -> No
 
 def main(names: list[str]) -> None:
     """Draw these, or all that have none yet."""
-    known = [n for n in available_effects() if not get_effect(n).free_form]
+    known = [n for n in available_effects() if n in EFFECTS and not get_effect(n).free_form]
     plt.rcParams.update({"font.size": 8, "axes.edgecolor": "#9aa0a6", "axes.spines.top": False})
     with tempfile.TemporaryDirectory() as folder:
         for name in names or [n for n in known if not (PICTURES / f"{n}.png").is_file()]:

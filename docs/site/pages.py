@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
+from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
 from pace_actuators.effects import available_effects, get_effect
@@ -30,7 +30,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, ELSEWHERE.get(name, name), content=path.read_text("utf-8")))
     for name, text in {**effect_pages(), "reference.md": reference()}.items():
-        files.append(File.generated(config, name, content=text))
+        made = File.generated(config, name, content=text)
+        if name.startswith("effects/") and name != "effects/index.md":
+            made.inclusion = InclusionLevel.NOT_IN_NAV  # the gallery leads there
+        files.append(made)
     return files
 
 
@@ -64,7 +67,9 @@ def effect_pages() -> dict[str, str]:
         "a pendulum, recorded by an independent simulator that has the effect. Find the picture "
         "that looks like yours.\n"
     )
-    pages["effects/index.md"] = head + "\n".join(rows)
+    others = [f"[{effect.name}]({effect.name}.md)" for effect in known if not _picture(effect)]
+    tail = f"\n## Without a picture\n\n{', '.join(others)}\n" if others else ""
+    pages["effects/index.md"] = head + "\n".join(rows) + tail
     return pages
 
 
