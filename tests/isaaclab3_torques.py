@@ -1,6 +1,8 @@
 """Run in a process of its own: our Isaac Lab adapter in the actuator collection of Isaac Lab 3.0's wheel.
 
-    python tests/isaaclab3_torques.py <unpacked wheel> <result.json> <output.npz> [<configuration.py>]
+    python tests/isaaclab3_torques.py <unpacked wheel> <output.npz> <result.json> <configuration.py>
+
+The result's drive, and the configuration that ``export --format isaaclab`` writes.
 
 The collection, its control bridge and its Warp kernels are the wheel's; the articulation that they act on is a fake.
 """
@@ -121,23 +123,12 @@ def written(robot, name) -> np.ndarray:
     return robot.written[name].numpy()[:, [ORDER.index(joint) for joint in JOINTS]]
 
 
-def main(wheel: str, result: str, output: str, configuration: str | None = None) -> None:
-    load_isaaclab(Path(wheel))
-    warnings.simplefilter("error", DeprecationWarning)
-    from isaaclab.actuators import DCMotorCfg, DelayedPDActuatorCfg
+def adapter(cfgs, data) -> dict:
+    """Our drive in Isaac Lab."""
     from isaaclab.sim.schemas.schemas_actuators import validate_newton_native_actuator_cfgs
     from isaaclab.utils import configclass
 
-    from pace_actuators import PaceDCMotorCfg
-    from pace_actuators.isaaclab import DriveFrictionMixin, PaceDCMotorActuatorCfg, encoder_pos_rel
-
-    data = sequence()
-    if configuration is None:
-        cfgs = {"legs": PaceDCMotorActuatorCfg.from_result(result, physics_dt=DT)}
-    else:
-        space: dict = {}
-        exec(Path(configuration).read_text(), space)
-        cfgs = space["ACTUATORS"]
+    from pace_actuators.isaaclab import DriveFrictionMixin, encoder_pos_rel
 
     @configclass
     class SceneCfg:  # Isaac Lab copies configurations that lie in others
@@ -145,23 +136,38 @@ def main(wheel: str, result: str, output: str, configuration: str | None = None)
 
     copied = SceneCfg()
     copied.validate()
-    cfgs = copied.actuators
-    robot = build(cfgs, DriveFrictionMixin)
-    limit, armature, viscous = (
-        written(robot, name) for name in ("effort_limit", "armature", "joint_viscous_friction_coeff")
-    )
-    friction = written(robot, "joint_friction_coeff")
-    out = {"armature": armature, "viscous": viscous, "friction_at_rest": friction, "limit": limit}
+    robot = build(copied.actuators, DriveFrictionMixin)
+    names = {"limit": "effort_limit", "armature": "armature", "viscous": "joint_viscous_friction_coeff"}
+    out: dict = {name: written(robot, field) for name, field in names.items()}
+    out["friction_at_rest"] = written(robot, "joint_friction_coeff")
     out["torque"] = efforts(robot, data)
     out["friction"] = written(robot, "joint_friction_coeff")
     env = types.SimpleNamespace(scene={"robot": robot})
     shown = encoder_pos_rel(env).numpy()[:, [ORDER.index(joint) for joint in JOINTS]]
     out["shown"] = shown - data["position"][-1]
     try:
-        validate_newton_native_actuator_cfgs(cfgs)
+        validate_newton_native_actuator_cfgs(copied.actuators)
         out["native"] = ""
     except ValueError as error:
         out["native"] = str(error)
+    return out
+
+
+def main(wheel: str, output: str, result: str, configuration: str) -> None:
+    load_isaaclab(Path(wheel))
+    warnings.simplefilter("error", DeprecationWarning)
+    from isaaclab.actuators import DCMotorCfg, DelayedPDActuatorCfg
+
+    from pace_actuators import PaceDCMotorCfg
+    from pace_actuators.isaaclab import DriveFrictionMixin, PaceDCMotorActuatorCfg
+
+    data, space = sequence(), {}
+    exec(Path(configuration).read_text(), space)
+    found = {
+        "command": adapter({"legs": PaceDCMotorActuatorCfg.from_result(result, physics_dt=DT)}, data),
+        "effort": adapter(space["ACTUATORS"], data),
+    }
+    out: dict = {f"{mode}_{name}": value for mode, values in found.items() for name, value in values.items()}
     motor = PaceDCMotorCfg(joint_names_expr=".*", physics_dt=DT, effects=("load_dependent_friction",))
     loaded = build({"legs": PaceDCMotorActuatorCfg(motor=motor)}, DriveFrictionMixin)
     loaded.write_data_to_sim()

@@ -1,6 +1,6 @@
 """Run in a process of its own: our Isaac Lab adapter under the actuator base classes of Isaac Lab's wheel.
 
-    python tests/isaaclab_torques.py <unpacked wheel> <result.json> <output.npz>
+    python tests/isaaclab_torques.py <unpacked wheel> <output.npz> <result.json> <configuration.py>
 
 Isaac Sim is not needed for those; ``omni`` and what else they import of it are empty modules.
 """
@@ -106,30 +106,37 @@ class FakeArticulation:
         self.friction = (joint_friction_coeff, joint_dynamic_friction_coeff, joint_viscous_friction_coeff, joint_ids)
 
 
-def main(wheel: str, result: str, output: str) -> None:
+def adapter(cfg, data) -> dict[str, np.ndarray]:
+    """Our drive in Isaac Lab."""
+    from pace_actuators.isaaclab import DriveFrictionMixin
+
+    cfg.validate()
+    actuator = build(cfg.copy())
+    out = {"torque": efforts(actuator, data), "friction": actuator.motor.joint_friction.numpy().copy()}
+    out["armature"], out["viscous"] = actuator.armature.numpy(), actuator.viscous_friction.numpy()
+    assert actuator.stiffness is actuator.motor.stiffness
+    robot = type("Articulation", (DriveFrictionMixin, FakeArticulation), {})(actuator)
+    robot._apply_actuator_model()
+    return out | {"written_friction": robot.friction[0].numpy(), "applied": robot.applied}
+
+
+def main(wheel: str, output: str, result: str, configuration: str) -> None:
     load_isaaclab(Path(wheel))
     from isaaclab.actuators import DCMotorCfg, DelayedPDActuatorCfg
 
     from pace_actuators import PaceDCMotorCfg
     from pace_actuators.isaaclab import DriveFrictionMixin, PaceDCMotorActuatorCfg
 
-    data = sequence()
-    cfg = PaceDCMotorActuatorCfg.from_result(result, physics_dt=DT)
-    cfg.validate()
-    actuator = build(cfg.copy())
-    out = {"torque": efforts(actuator, data), "friction": actuator.motor.joint_friction.numpy().copy()}
-    out["armature"], out["viscous"] = actuator.armature.numpy(), actuator.viscous_friction.numpy()
-    assert actuator.stiffness is actuator.motor.stiffness
-
-    class Articulation(DriveFrictionMixin, FakeArticulation):
-        pass
-
-    robot = Articulation(actuator)
-    robot._apply_actuator_model()
-    out["written_friction"], out["applied"] = robot.friction[0].numpy(), robot.applied
+    data, space = sequence(), {}
+    exec(Path(configuration).read_text(), space)
+    found = {
+        "command": adapter(PaceDCMotorActuatorCfg.from_result(result, physics_dt=DT), data),
+        "effort": adapter(space["ACTUATORS"]["legs"], data),
+    }
+    out: dict = {f"{mode}_{name}": value for mode, values in found.items() for name, value in values.items()}
     motor = PaceDCMotorCfg(joint_names_expr=".*", physics_dt=DT, effects=("load_dependent_friction",))
     loaded = build(PaceDCMotorActuatorCfg(motor=motor))
-    Articulation(loaded)._apply_actuator_model()
+    type("Articulation", (DriveFrictionMixin, FakeArticulation), {})(loaded)._apply_actuator_model()
     out["load"] = loaded.motor.effects.state.load_effort.numpy()
 
     # against Isaac Lab's own actuators, with what they have too

@@ -1,6 +1,8 @@
 """Run by the Python of mjlab's own environment: our adapter in an entity of mjlab, stepped by hand.
 
-python tests/mjlab_torques.py <robot.xml> <result.json> <output.npz>
+    python tests/mjlab_torques.py <robot.xml> <output.npz> <result.json> <configuration.py> <native.py>
+
+The result's drive, the configuration that ``export --format mjlab`` writes, and that of ``mjlab_native``.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 class World:
     """One mjlab entity and its simulation, and mjlab's own position action on it."""
 
-    def __init__(self, robot: str, *actuators, expand: bool = True):
+    def __init__(self, robot: str, *actuators, expand: bool = True, change=lambda spec: None):
         from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
         from mjlab.envs.mdp.actions import JointPositionActionCfg
         from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
@@ -31,6 +33,7 @@ class World:
             for joint in made.joints:
                 if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                     made.delete(joint)
+            change(made)
             return made
 
         self.entity = EntityCfg(spec_fn=spec, articulation=EntityArticulationInfoCfg(actuators=actuators)).build()
@@ -79,28 +82,56 @@ class World:
         return np.asarray(getattr(self.sim.model, field)[:])[:, columns]
 
 
-def main(robot: str, result: str, output: str) -> None:
+def page(path: str) -> dict:
+    """Names of an exported page."""
+    space: dict = {}
+    exec(Path(path).read_text(), space)
+    return space
+
+
+def joints_of(world: World) -> dict[str, np.ndarray]:
+    """What the model's joints hold."""
+    fields = {"friction": "frictionloss", "armature": "armature", "viscous": "damping", "solref": "solref"}
+    found = {name: world.dofs(f"dof_{field}") for name, field in fields.items()}
+    return found | {"bias": world.entity.data.encoder_bias.numpy()[:, np.argsort(world.order)]}
+
+
+def adapter(robot: str, cfgs, data) -> dict[str, np.ndarray]:
+    """Our drive in mjlab."""
+    world = World(robot, *cfgs)
+    out = {"torque": world.run(data)} | joints_of(world)
+    out["spurious"] = World(robot, *cfgs).run(data, spurious=True)
+    world.sim.forward()
+    columns = [int(world.model.joint(name).dofadr[0]) for name in JOINTS]
+    return out | {"applied": np.asarray(world.sim.data.qfrc_actuator[:])[:, columns]}
+
+
+def native(robot: str, space: dict, data) -> dict[str, np.ndarray]:
+    """mjlab's own drive, with the values that were identified."""
+    world = World(robot, *space["ARTICULATION"].actuators, change=space["stiffen_friction"])
+    for event in space["EVENTS"].values():
+        event.params["asset_cfg"].resolve(world.scene)
+        event.func(world, None, **event.params)
+    return {"torque": world.run(data)} | joints_of(world)
+
+
+def main(robot: str, output: str, result: str, configuration: str, native_page: str) -> None:
     from mjlab.actuator import DcMotorActuatorCfg
 
     from pace_actuators import PaceDCMotorCfg
     from pace_actuators.mjlab import PaceDCMotorActuatorCfg, drive_friction_event
 
     data = sequence()
-    world = World(robot, PaceDCMotorActuatorCfg.from_result(result))
-    out = {
-        "torque": world.run(data),
-        "friction": world.dofs("dof_frictionloss"),
-        "armature": world.dofs("dof_armature"),
+    drives = (PaceDCMotorActuatorCfg.from_result(result),)
+    found = {
+        "command": adapter(robot, drives, data),
+        "effort": adapter(robot, page(configuration)["ARTICULATION"].actuators, data),
+        "native": native(robot, page(native_page), data),
     }
-    out["viscous"], out["solref"] = world.dofs("dof_damping"), world.dofs("dof_solref")
-    out["bias"] = world.entity.data.encoder_bias.numpy()[:, np.argsort(world.order)]
-    out["spurious"] = World(robot, PaceDCMotorActuatorCfg.from_result(result)).run(data, spurious=True)
-    world.sim.forward()
-    columns = [int(world.model.joint(name).dofadr[0]) for name in JOINTS]
-    out["applied"] = np.asarray(world.sim.data.qfrc_actuator[:])[:, columns]
+    out: dict = {f"{which}_{name}": value for which, values in found.items() for name, value in values.items()}
     assert drive_friction_event().func.model_fields == ("dof_frictionloss", "dof_damping")
     try:
-        World(robot, PaceDCMotorActuatorCfg.from_result(result), expand=False).run(data)
+        World(robot, *drives, expand=False).run(data)
         out["unexpanded"] = ""
     except ValueError as error:
         out["unexpanded"] = str(error)

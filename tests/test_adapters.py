@@ -61,10 +61,28 @@ def in_training(result) -> dict[str, np.ndarray]:
     return torques(ManagerBasedRLEnv(cfg))
 
 
-@pytest.fixture(scope="module", params=MODES)
-def reference(request, tmp_path_factory):
-    result = write_result(tmp_path_factory.mktemp(request.param) / "result.json", request.param)
-    return result, in_identification(result)
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    """A result of each mode, and its torques in the identification."""
+    folder = tmp_path_factory.mktemp("results")
+    results = {mode: write_result(folder / f"{mode}.json", mode) for mode in MODES}
+    return {mode: (result, in_identification(result)) for mode, result in results.items()}
+
+
+@pytest.fixture(params=MODES)
+def reference(request, references):
+    return references[request.param]
+
+
+def elsewhere(python, script, references, folder, *args, fmt, pages=()) -> dict[str, dict[str, np.ndarray]]:
+    """What another simulator found, by mode: one as it takes the result, the other as ``export`` writes it."""
+    export(references["effort"][0], fmt).write(folder / "cfg.py")
+    run(python, script, *args, folder / "out.npz", references["command"][0], folder / "cfg.py", *pages)
+    found = np.load(folder / "out.npz")
+    split = {name: name.partition("_") for name in found}
+    kinds = {kind for kind, _, rest in split.values() if f"{kind}_torque" in found and rest}
+    result = {kind: {rest: found[name] for name, (first, _, rest) in split.items() if first == kind} for kind in kinds}
+    return result | {"": {name: found[name] for name, (first, _, _) in split.items() if first not in kinds}}
 
 
 def assert_same(found, reference) -> None:
@@ -108,83 +126,104 @@ def test_the_training_environment_gives_the_torque_of_the_identification(referen
         assert_same(in_training(result), expected)
 
 
-def test_isaac_lab_gives_the_torque_of_the_identification(reference, tmp_path):
+def test_isaac_lab_gives_the_torque_of_the_identification(references, tmp_path):
     """Under the actuator classes of Isaac Lab's wheel, called as its articulation calls them; PhysX is not here."""
-    result, expected = reference
-    run(sys.executable, "isaaclab_torques.py", isaaclab_wheel(), result, tmp_path / "out.npz")
-    found = np.load(tmp_path / "out.npz")
-    assert_same(found, expected)
-    scale = np.abs(found["theirs_delayed"]).max()
-    assert np.abs(found["ours_delayed"] - found["theirs_delayed"]).max() < 1e-5 * scale
-    assert np.abs(found["ours_biased"] - found["theirs_biased"]).max() < 1e-5 * scale
-    assert "motor" in str(found["refused"])
-    assert (found["load"] == -2.0).all() and int(found["applied"]) == 1
-    assert np.allclose(found["written_friction"], found["friction"])
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_isaac_lab_3_gives_the_torque_of_the_identification(reference, tmp_path):
-    """In the actuator collection of Isaac Lab 3.0's wheel, through its own control bridge and kernels; one of the two
-    as ``export --format isaaclab`` writes it."""
-    result, expected = reference
-    exported = []
-    if IdentifiedDrives.load(result).delay_mode == "effort":
-        export(result, "isaaclab").write(tmp_path / "cfg.py")
-        exported = [tmp_path / "cfg.py"]
-    run(others_python(), "isaaclab3_torques.py", isaaclab_wheel("3.0.0"), result, tmp_path / "out.npz", *exported)
-    found = np.load(tmp_path / "out.npz")
-    assert_same(found, expected)
+    found = elsewhere(sys.executable, "isaaclab_torques.py", references, tmp_path, isaaclab_wheel(), fmt="isaaclab")
+    for mode in MODES:
+        assert_same(found[mode], references[mode][1])
+        assert int(found[mode]["applied"]) == 1
+        assert np.allclose(found[mode]["written_friction"], found[mode]["friction"])
+    plain = found[""]
     for name in ("delayed", "biased"):
-        theirs = found[f"theirs_{name}"]
-        assert np.abs(found[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
-    drive = PaceDCMotorCfg.from_result(result, physics_dt=DT)
-    at_rest = PaceDCMotor(drive, JOINTS, slice(None), 1).joint_friction.numpy()
-    assert np.allclose(found["friction_at_rest"], at_rest) and (found["limit"] > 200).all()  # the asset's own is 10
-    bias = [IdentifiedDrives.load(result).parameters["encoder_bias"][joint] for joint in JOINTS]
-    assert np.allclose(found["shown"], -np.array(bias), atol=1e-5) and (found["load"] == -2.0).all()
-    assert "use_newton_actuators" in str(found["native"])  # Newton's own path refuses it in words
-    assert str(found["refused"]).count("motor") == 2 and "armature" in str(found["refused"])
+        theirs = plain[f"theirs_{name}"]
+        assert np.abs(plain[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
+    assert "motor" in str(plain["refused"]) and (plain["load"] == -2.0).all()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_mjlab_gives_the_torque_of_the_identification(reference, tmp_path):
-    """In an entity and a simulation of mjlab, through its own position action."""
-    result, expected = reference
-    run(others_python(), "mjlab_torques.py", ROOT / "assets/anymal_d/anymal_d.xml", result, tmp_path / "out.npz")
-    found = np.load(tmp_path / "out.npz")
-    assert_same(found, expected)
-    bias = np.array([IdentifiedDrives.load(result).parameters["encoder_bias"][joint] for joint in JOINTS])
-    assert np.allclose(found["bias"], -bias, atol=1e-6)  # mjlab's encoder shows q + bias
-    assert np.array_equal(found["spurious"], found["torque"])  # calls without a physics step leave no trace
-    assert np.abs(found["ours"] - found["theirs"]).max() < 1e-5 * np.abs(found["theirs"]).max()
-    assert np.allclose(found["solref"], [2 * DT, 1.0])
-    assert np.allclose(found["applied"], found["torque"][-1], rtol=1e-5, atol=1e-4)  # what the joints get, unclipped
-    assert "drive_friction_event" in str(found["unexpanded"]) and "motor" in str(found["refused"])
+def test_isaac_lab_3_gives_the_torque_of_the_identification(references, tmp_path):
+    """In the actuator collection of Isaac Lab 3.0's wheel, through its own control bridge and kernels."""
+    wheel = isaaclab_wheel("3.0.0")
+    found = elsewhere(others_python(), "isaaclab3_torques.py", references, tmp_path, wheel, fmt="isaaclab")
+    for mode in MODES:
+        assert_same(found[mode], references[mode][1])
+        drives = IdentifiedDrives.load(references[mode][0])
+        motor = PaceDCMotorCfg.from_result(drives.path, physics_dt=DT)
+        at_rest = PaceDCMotor(motor, JOINTS, slice(None), 1).joint_friction.numpy()
+        assert np.allclose(found[mode]["friction_at_rest"], at_rest)
+        assert (found[mode]["limit"] > 200).all()  # the asset's own is 10
+        bias = list(drives.values("encoder_bias", JOINTS).values())
+        assert np.allclose(found[mode]["shown"], -np.array(bias), atol=1e-5)
+        assert "use_newton_actuators" in str(found[mode]["native"])  # Newton's own path refuses it in words
+    plain = found[""]
+    for name in ("delayed", "biased"):
+        theirs = plain[f"theirs_{name}"]
+        assert np.abs(plain[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
+    assert (plain["load"] == -2.0).all()
+    assert str(plain["refused"]).count("motor") == 2 and "armature" in str(plain["refused"])
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_newtons_actuators_give_the_drives_torque(tmp_path):
-    """Of the exported page, built in Python and authored in USD: delay in whole steps, bias and clamps included."""
-    result = write_result(tmp_path / "result.json", delay=3.0)
+def test_mjlab_gives_the_torque_of_the_identification(references, whole_steps, tmp_path):
+    """In an entity and a simulation of mjlab, through its own position action; by our drive, and by mjlab's own."""
+    robot = ROOT / "assets/anymal_d/anymal_d.xml"
+    exported = export(whole_steps, "mjlab_native")
+    exported.write(tmp_path / "native.py")
+    assert "pace" not in exported.text.split('"""', 2)[2]  # none of our code
+    pages = [tmp_path / "native.py"]
+    found = elsewhere(others_python(), "mjlab_torques.py", references, tmp_path, robot, fmt="mjlab", pages=pages)
+    for mode in MODES:
+        assert_same(found[mode], references[mode][1])
+        assert np.array_equal(found[mode]["spurious"], found[mode]["torque"])  # calls without a step leave no trace
+        applied = found[mode]["torque"][-1]  # what the joints get, unclipped
+        assert np.allclose(found[mode]["applied"], applied, rtol=1e-5, atol=1e-4)
+    for kind, result in (*((mode, references[mode][0]) for mode in MODES), ("native", whole_steps)):
+        bias = list(IdentifiedDrives.load(result).values("encoder_bias", JOINTS).values())
+        assert np.allclose(found[kind]["bias"], -np.array(bias), atol=1e-6)  # mjlab's encoder shows q + bias
+        assert np.allclose(found[kind]["solref"], [2 * DT, 1.0])
+    plain, native = found[""], found["native"]
+    assert np.abs(plain["ours"] - plain["theirs"]).max() < 1e-5 * np.abs(plain["theirs"]).max()
+    assert "drive_friction_event" in str(plain["unexpanded"]) and "motor" in str(plain["refused"])
+    assert_plain(native["torque"], whole_steps)
+    drives = IdentifiedDrives.load(whole_steps)
+    for name, parameter in (("armature", "armature"), ("friction", "friction"), ("viscous", "viscous_friction")):
+        assert np.allclose(native[name], list(drives.values(parameter, JOINTS).values())), name
+
+
+@pytest.fixture
+def whole_steps(tmp_path):
+    """A drive that other programs' own classes hold: whole steps of delay, bias, and the effects that are gains."""
+    result = write_result(tmp_path / "whole_steps.json", delay=3.0)
     content = json.loads(result.read_text())
-    content["effects"] = ["torque_gain"]  # Newton has no others: the export says so
+    content["effects"] = ["torque_gain"]  # they have no others: the exports say so
     result.write_text(json.dumps(content))
-    exported = export(result, "newton")
-    exported.write(tmp_path / "drives.py")
-    run(others_python(), "newton_torques.py", tmp_path / "drives.py", tmp_path / "out.npz")
-    found, drives = np.load(tmp_path / "out.npz"), IdentifiedDrives.load(result)
+    return result
+
+
+def assert_plain(torque, result) -> None:
+    """The drive's torque, to 1e-5 of its root mean square.
+
+    Driven faster than its line reaches, a motor with a torque gain brakes with another limit there.
+    """
     expected = alone(PaceDCMotorCfg.from_result(result, physics_dt=DT), sequence())
     scale = np.sqrt(np.square(expected).mean(axis=(0, 1)))
-    # driven faster than its line reaches, a motor with a torque gain brakes with another limit there
-    within = np.abs(sequence()["velocity"]) < GAINS["velocity_limit"] * (
-        1 + GAINS["effort_limit"] / GAINS["saturation_effort"]
-    )
+    ratio = GAINS["effort_limit"] / GAINS["saturation_effort"]
+    within = np.abs(sequence()["velocity"]) < GAINS["velocity_limit"] * (1 + ratio)
     assert within.mean() > 0.99
+    assert (np.abs(torque - expected) * within < 1e-5 * scale).all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_newtons_actuators_give_the_drives_torque(whole_steps, tmp_path):
+    """Of the exported page, built in Python and authored in USD: delay in whole steps, bias and clamps included."""
+    export(whole_steps, "newton").write(tmp_path / "drives.py")
+    run(others_python(), "newton_torques.py", tmp_path / "drives.py", tmp_path / "out.npz")
+    found, drives = np.load(tmp_path / "out.npz"), IdentifiedDrives.load(whole_steps)
     for name in ("torque", "usd_torque"):
-        assert (np.abs(found[name] - expected) * within < 1e-5 * scale).all(), name
+        assert_plain(found[name], whole_steps)
     for name, parameter in (("armature", "armature"), ("friction", "friction"), ("damping", "viscous_friction")):
         value = list(drives.values(parameter, JOINTS).values())
         assert np.allclose(found[name], value) and np.allclose(found[f"usd_{name}"], value), name

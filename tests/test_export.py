@@ -1,8 +1,6 @@
 """What is exported holds what was identified."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import mujoco
@@ -10,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from command_lines import run_script
-from other_simulators import isaaclab_wheel, others_python
 from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
 
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
@@ -121,42 +118,6 @@ def test_the_json_is_plain_and_complete(result):
     for name in content["parameters"]:
         assert set(content["parameters"][name]) == set(JOINTS)
     assert content["parameters"]["armature"]["LF_HAA"] == drives.parameters["armature"]["LF_HAA"]
-
-
-def test_the_isaac_lab_configuration_runs_there(result, tmp_path):
-    code = (
-        "import sys; sys.path.insert(0, 'tests')\n"
-        "from pathlib import Path\n"
-        "from isaaclab_torques import load_isaaclab, build\n"
-        f"load_isaaclab(Path({str(isaaclab_wheel())!r}))\n"
-        f"space = {{}}; exec(Path({str(tmp_path / 'cfg.py')!r}).read_text(), space)\n"
-        "actuator = build(space['ACTUATORS']['legs'])\n"
-        "print(actuator.armature[0, 1].item(), actuator.motor.time_lags[0].item())\n"
-    )
-    export(result, "isaaclab").write(tmp_path / "cfg.py")
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    armature, delay = map(float, done.stdout.split())
-    assert armature == pytest.approx(0.055) and delay == pytest.approx(3.4)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_mjlab_configuration_runs_there(result, tmp_path):
-    code = (
-        "import sys; sys.path[:0] = ['.', 'tests']\n"
-        "from pathlib import Path\n"
-        "from mjlab_torques import World\n"
-        f"space = {{}}; exec(Path({str(tmp_path / 'cfg.py')!r}).read_text(), space)\n"
-        "world = World('assets/anymal_d/anymal_d.xml', *space['ARTICULATION'].actuators)\n"
-        "world.entity.reset()\n"
-        "print('result', world.dofs('dof_armature')[0, 1], -world.entity.data.encoder_bias[0, 0].item())\n"
-    )
-    export(result, "mjlab").write(tmp_path / "cfg.py")
-    done = subprocess.run([others_python(), "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    armature, bias = map(float, done.stdout.split("result")[1].split())
-    assert armature == pytest.approx(0.055) and bias == pytest.approx(0.08)
 
 
 @pytest.mark.parametrize("fmt", FORMATS)

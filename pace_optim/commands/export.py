@@ -11,7 +11,7 @@ def main() -> None:
     """Parse the command line, write, say what the format cannot hold."""
     parser = make_parser(
         "Write an identified robot for other programs: an MJCF with its drives as actuators, configurations of its "
-        "drives for this project (cfg), mjlab, Isaac Lab and Newton, or plain JSON.",
+        "drives for this project (cfg), mjlab (mjlab_native: its own classes alone), Isaac Lab and Newton, or JSON.",
         example="scripts/export.py logs/pace/anymal_d/<run>/result.json --format mjcf --output anymal_d.xml",
     )
     parser.add_argument("result", metavar="FILE", help="result.json of a fit, or its run's folder")

@@ -10,6 +10,7 @@ from pathlib import Path
 from pace_actuators import IdentifiedDrives
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf
+from pace_optim.export.mjlab_native import mjlab_native_python
 from pace_optim.export.newton import newton_python
 from pace_optim.terminal.atomic import write_atomically
 
@@ -53,6 +54,7 @@ def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
 FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
     "mjcf": mjcf,
     "mjlab": mjlab_python,
+    "mjlab_native": mjlab_native_python,
     "isaaclab": isaaclab_python,
     "newton": newton_python,
     "cfg": cfg_python,

@@ -1,0 +1,104 @@
+"""Identified drives as mjlab's own actuators, for those who want no code of this project there."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+
+from pace_actuators import IdentifiedDrives
+from pace_optim.export import mjlab_native_template
+from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
+
+_START = "# --- the page starts here\n"
+
+
+def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
+    """A page that needs mjlab alone: an actuator per joint, with mjlab's delay fields; friction; encoder bias.
+
+    Raises:
+        ValueError: If the environment of the identification is not available.
+    """
+    plain, notes = plain_drives(drives)
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
+    classes = sorted({_class(drive) for drive in plain.values()})
+    rows = [f"    {_class(drive)}({_fields(drives, joint, drive)})," for joint, drive in plain.items()]
+    bias = [f"    {joint!r}: {-drive.encoder_bias:.10g}," for joint, drive in plain.items() if drive.encoder_bias]
+    body = [
+        f'"""Drives identified with {drives.task}, for mjlab 1.6 alone: {drives.path.parent.name}.',
+        "",
+        *notes,
+        '"""',
+        "",
+        f"from mjlab.actuator import {', '.join(classes)}",
+        "from mjlab.entity import EntityArticulationInfoCfg",
+        "from mjlab.envs.mdp import dr",
+        "from mjlab.managers.event_manager import EventTermCfg",
+        "from mjlab.managers.scene_entity_config import SceneEntityCfg",
+        "",
+        f"PHYSICS_DT = {drives.at.physics_dt!r}",
+        '"""Set MujocoCfg(timestep=PHYSICS_DT): delays count these steps [s]."""',
+        "",
+        *["ACTUATORS = (", *rows, ")"],
+        "ARTICULATION = EntityArticulationInfoCfg(actuators=ACTUATORS)",
+        '"""For EntityCfg(articulation=ARTICULATION)."""',
+        "",
+        *["ENCODER_BIAS = {", *bias, "}"],
+        '"""mjlab\'s encoder shows q + these [rad]."""',
+    ]
+    functions = inspect.getsource(mjlab_native_template).split(_START)[1]
+    return "\n".join(body) + "\n" + functions, notes
+
+
+def _class(drive: PlainDrive) -> str:
+    if drive.has_line:
+        return "DcMotorActuatorCfg"
+    if drive.run_dt:
+        return "IdealPdActuatorCfg"
+    return "BuiltinPositionActuatorCfg" if drive.stiffness else "BuiltinVelocityActuatorCfg"
+
+
+def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> str:
+    values: dict[str, float] = {"stiffness": drive.stiffness} if drive.stiffness or drive.run_dt else {}
+    values["damping"] = drive.damping
+    if math.isfinite(drive.effort_limit):
+        values["effort_limit"] = drive.effort_limit
+    if drive.has_line:
+        values |= {"stiffness": drive.stiffness, "saturation_effort": drive.saturation_effort}
+        values["velocity_limit"] = drive.velocity_limit
+    names = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "viscous_damping"}
+    for parameter, name in names.items():
+        if not is_undetermined(drives, parameter, joint):
+            values[name] = drives.values(parameter, [joint])[joint]
+    steps = round(drive.delay_s / drives.at.physics_dt)
+    text = [f"target_names_expr=({_expression(joint)!r},)", *(f"{name}={value:.10g}" for name, value in values.items())]
+    return ", ".join([*text, *([f"delay_min_lag={steps}", f"delay_max_lag={steps}"] if steps else [])])
+
+
+def _expression(joint: str) -> str:
+    """The joint's name as the regular expression that mjlab takes it for."""
+    return "".join(f"\\{letter}" if letter in r".^$*+?{}[]\|()" else letter for letter in joint)
+
+
+def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
+    dt, delay = drives.at.physics_dt, max((drive.delay_s for drive in plain.values()), default=0.0)
+    notes = []
+    if delay:
+        steps = delay / dt
+        lost = "" if abs(steps - round(steps)) < 1e-6 else f", {1e3 * round(steps) * dt:.3g} ms"
+        notes.append(f"delay of {1e3 * delay:.3g} ms: {round(steps)} whole steps of {1e3 * dt:g} ms{lost}.")
+    most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
+    notes.append(f"encoder bias (up to {most:.3g} rad): add EVENTS to the environment's events.")
+    notes.append("Coulomb friction is soft by default: call stiffen_friction(spec) in your spec_fn.")
+    rates = {drive.run_dt for drive in plain.values()}
+    if 0.0 in rates and any(drive.has_line for drive in plain.values()):
+        notes.append(
+            "the drive ran continuously (implicit): with a torque-speed line mjlab holds its torque over a step."
+        )
+    elif 0.0 in rates:
+        notes.append("the drive ran continuously (implicit): keep mjlab's integrator implicitfast.")
+    if max(rates, default=0.0) > dt * (1 + 1e-9):
+        notes.append(
+            f"the controller ran every {1e3 * max(rates):.3g} ms: mjlab's runs at each step of {1e3 * dt:g} ms."
+        )
+    return notes

@@ -1,0 +1,43 @@
+"""Text of the page that ``export --format mjlab_native`` writes: its head holds the values, the rest stands here.
+
+The page needs mjlab alone, so nothing of this project is imported.
+"""
+
+# mypy: allow-untyped-defs, allow-incomplete-defs
+
+from __future__ import annotations
+
+from typing import Any
+
+PHYSICS_DT: float = 0.0
+ACTUATORS: tuple[Any, ...] = ()
+ENCODER_BIAS: dict[str, float] = {}
+EventTermCfg: Any = dict
+SceneEntityCfg: Any = dict
+dr: Any = type("dr", (), {"encoder_bias": None})
+
+# --- the page starts here
+
+EVENTS = {
+    f"encoder_bias_{joint}": EventTermCfg(
+        func=dr.encoder_bias,
+        mode="startup",
+        params={"bias_range": (bias, bias), "asset_cfg": SceneEntityCfg("robot", joint_names=(joint,))},
+    )
+    for joint, bias in ENCODER_BIAS.items()
+}
+"""For the environment's events, in place of an encoder_bias of yours; the robot's name in the scene is robot."""
+
+
+def stiffen_friction(spec):
+    """Give the joints' Coulomb friction the solver parameters of the identification; MuJoCo's default is soft.
+
+    Args:
+        spec: The mujoco.MjSpec that your spec_fn returns; it is changed.
+    """
+    import re
+
+    for joint in spec.joints:
+        if any(re.fullmatch(name, joint.name) for actuator in ACTUATORS for name in actuator.target_names_expr):
+            joint.solref_friction = [2 * PHYSICS_DT, 1.0]
+            joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
