@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from functools import cache
@@ -13,6 +14,7 @@ from other_simulators import isaaclab_wheel, others_python
 from torque_sequence import write_result
 
 from pace_actuators.effects.__main__ import page as page_of_effects
+from pace_optim.export import export
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(bash|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -102,21 +104,30 @@ def test_the_code_for_isaac_lab_runs_there(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_code_for_mjlab_runs_there(tmp_path):
+    """Our drive, and what ``--format mjlab_native`` writes."""
     robot = str(ROOT / "assets" / "anymal_d" / "anymal_d.xml")
     built = (
         f"from mjlab_torques import World\nprint(World({robot!r}, *articulation.actuators).dofs('dof_armature')[0])\n"
     )
-    assert "0.055" in elsewhere(others_python(), block_for("mjlab") + built, tmp_path)
+    export(write_result(tmp_path / "result.json"), "mjlab_native").write(tmp_path / "drives.py")
+    shutil.copy(robot, tmp_path / "robot.xml")
+    native = (
+        block_for("mjlab\n") + "print('native', robot.build().compile().joint('LF_HFE').frictionloss, len(events))\n"
+    )
+    printed = elsewhere(others_python(), block_for("mjlab") + built + native, tmp_path)
+    assert "0.055" in printed and "native [0.32] 12" in printed
 
 
 def block_for(simulator: str) -> str:
-    (text,) = (text for _, text in blocks(ROOT / "docs" / "deploying.md") if text.startswith(f"# in {simulator}'s"))
+    """The code that is for a simulator's environment, or, where a line ends after its name, for it alone."""
+    start = f"# in {simulator}" if simulator.endswith("\n") else f"# in {simulator}'s"
+    (text,) = (text for _, text in blocks(ROOT / "docs" / "deploying.md") if text.startswith(start))
     return text
 
 
 def elsewhere(python: str | Path, code: str, folder: Path) -> str:
     write_result(folder / "result.json")
-    paths = {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    paths = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(folder)])}
     run = subprocess.run(
         [python, "-"], input=code, cwd=folder, env={**os.environ, **paths}, capture_output=True, text=True, check=False
     )
