@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
+from problems import BENCH, record
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.simulation import SimulationCfg, make_simulation
+from pace_optim.comparison import compare
+from pace_optim.fit import fit
+from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
 
 NO_GPU = "torch finds no CUDA here"
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
@@ -86,3 +93,14 @@ def test_a_step_of_walking_robots_waits_for_nothing():
         torch.cuda.set_sync_debug_mode("default")
     assert bool(obs["policy"].isfinite().all()) and bool(reward.isfinite().all())
     assert float(extras["log"]["Episode_Termination/time_out"]) >= 0.0 and bool((env.episode_length_buf < 40).any())
+
+
+@on_gpu
+def test_a_comparison_on_a_gpu_tells_the_same_error(tmp_path: Path):
+    save_recording(tmp_path / "bench.npz", record(name="bench", noise=1e-4))
+    settings = FitSettings(
+        task=BENCH, data=[str(tmp_path / "bench.npz")], optimizer="least_squares", log_dir=str(tmp_path / "runs")
+    )
+    _, run = fit(settings)
+    here, there = compare([run])["rmse"], compare([run], device="cuda:0")["rmse"]
+    assert there == pytest.approx(here, rel=1e-3)

@@ -6,7 +6,7 @@ import torch
 
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_log_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
 
 
 def main() -> None:
@@ -22,11 +22,18 @@ def main() -> None:
     add_log_options(parser)
     parser.add_argument("--physics_dt", type=float, metavar="S", help="simulate at this physics step instead")
     add_common_options(parser, run=True)
+    add_device_option(parser)
     options = take_common_options(vars(parser.parse_args()))
 
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     content = compare(
-        options["runs"], options["data"], options["physics_dt"], options["task"], options["columns"], options["strict"]
+        options["runs"],
+        options["data"],
+        options["physics_dt"],
+        options["task"],
+        options["columns"],
+        options["strict"],
+        options["device"] or "cpu",
     )
     print(comparison_text(content))
     print(f"report: {Path(content['run']) / 'report.html'}")

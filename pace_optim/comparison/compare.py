@@ -32,6 +32,7 @@ def compare(
     task: str | None = None,
     columns: str | None = None,
     strict: bool = False,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Say where each run's model fails, and put several side by side.
 
@@ -44,6 +45,7 @@ def compare(
         task: Another environment in place of the runs' own.
         columns: Column map of logs among ``data``; ``None``: guessed.
         strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
+        device: Where the runs are simulated; on a GPU they are simulated anew, in float32.
 
     Returns:
         The content of the last run's comparison.json.
@@ -56,7 +58,7 @@ def compare(
         raise ValueError(f"{repeated[0]} is named twice. Name each run once, the base model first.")
     for path in paths:
         check_folder(path, anew=FILE)
-    runs = [load_tracks(path, data, physics_dt, task, columns, strict) for path in paths]
+    runs = [load_tracks(path, data, physics_dt, task, columns, strict, device) for path in paths]
     check_alike(runs)
     contents = [compare_run(run) for run in runs]
     if len(runs) > 1:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,7 @@ def load_tracks(
     task: str | None = None,
     columns: str | None = None,
     strict: bool = False,
+    device: str = "cpu",
 ) -> RunTracks:
     """A run's best parameters on its own recordings, or on others.
 
@@ -83,12 +84,13 @@ def load_tracks(
         task: Another environment in place of the run's.
         columns: Column map of logs among ``data``; ``None``: guessed.
         strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
+        device: Where it is simulated; on a GPU in any case, in float32.
 
     Raises:
         ValueError: If the run or a recording cannot be used.
     """
     result = FitResult.load(folder)
-    simulate = bool(data) or physics_dt is not None or task is not None
+    simulate = bool(data) or physics_dt is not None or task is not None or device != "cpu"
     notes: list[str] = []
     problem: Problem | None = None
     try:
@@ -103,7 +105,7 @@ def load_tracks(
         message = str(error.args[0] if isinstance(error, KeyError) else error)
         notes.append(f"The run's recordings cannot be read again, so there is no load torque: {message}")
     if simulate and problem is not None:
-        evaluator = problem.evaluator()
+        evaluator = replace(problem, device=device).evaluator()
         physical = problem.space.from_dict(result.parameters)
         content = trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled))
     else:
