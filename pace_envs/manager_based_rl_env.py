@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 
+from pace_envs.indexing import zeros_like
 from pace_envs.manager_based_env import ManagerBasedEnv, ManagerBasedEnvCfg
+from pace_envs.manager_graph import ManagerGraph
 from pace_envs.managers import (
     CommandManager,
     CommandTermCfg,
@@ -58,8 +60,11 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         super().__init__(cfg, render_mode)
         self.final_observations = False
         """Whether steps compute ``extras["final_obs"]``."""
-        self._log: dict[str, torch.Tensor] = {}
+        self._log, self._log_names = torch.zeros(0, device=self.device), list[str]()
         self.masks_resets = self.device.type != "cpu" and self.takes_masks
+        self._manager_graph: ManagerGraph | None = None
+        if self.masks_resets and cfg.sim.graphs and self.can_be_captured:
+            self._manager_graph = ManagerGraph(lambda: self._after_physics(with_drives=False), self._generator)
 
     @property
     def max_episode_length_s(self) -> float:
@@ -86,6 +91,21 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         )
         return not loops and all(manager.takes_masks for manager in managers)
 
+    @property
+    def can_be_captured(self) -> bool:
+        """Whether all that follows the physics is this package's, and none of the drives' effects is asked then."""
+        managers = (
+            self.curriculum_manager,
+            self.event_manager,
+            self.observation_manager,
+            self.reward_manager,
+            self.termination_manager,
+        )
+        drives = [drive for robot in self.scene.articulations.values() for drive in robot.actuators.values()]
+        own = self.command_manager.is_own and all(term.is_own for manager in managers for term in manager.terms)
+        due = all(term.changes_state_only for term in self.event_manager.terms)
+        return self.takes_masks and own and due and all(drive.effects is None for drive in drives)
+
     def load_managers(self) -> None:
         """Build the managers."""
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
@@ -108,15 +128,15 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """
         self.extras = {}
         self.simulate(action)
+        if self.masks_resets:
+            return self._step_where()
         self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()
         reward = self.reward_manager.compute(self.step_dt)
         terminated, truncated = self.termination_manager.terminated, self.termination_manager.time_outs
-        if self.masks_resets:
-            self._keep_final_observations(done)
-            self._reset_where(done)
-        elif len(env_ids := done.nonzero()[:, 0]):
+        env_ids = done.nonzero()[:, 0]
+        if len(env_ids):
             self._keep_final_observations(done)
             self._reset_idx(env_ids)
             self.sim.forward(env_ids)
@@ -124,6 +144,49 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.command_manager.compute(self.step_dt)
         self.event_manager.apply("interval", dt=self.step_dt)
         return self.observation_manager.compute(), reward, terminated, truncated, self.extras
+
+    def _step_where(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """What follows the physics without anybody waiting for a GPU; from a CUDA graph where all terms allow it."""
+        if self._manager_graph is None or self.final_observations:
+            results = self._after_physics(with_drives=True)
+            if self._manager_graph is not None:
+                self._manager_graph.clear()
+        else:
+            results = self._manager_graph(self._graph_key())
+            self.scene.reset_drives_where(results["done"])  # they count in Python
+        if self._log_names:
+            self.extras["log"] = dict(zip(self._log_names, results["log"].clone(), strict=True))
+        obs = {name: results[f"obs/{name}"] for name in self.observation_manager.group_obs_dim}
+        return obs, results["reward"], results["terminated"], results["time_outs"], self.extras
+
+    def _after_physics(self, with_drives: bool) -> dict[str, torch.Tensor]:
+        """Steps (2) to (7), with environments that are done told by a mask."""
+        self.scene.update_sensors(self.step_dt)
+        self.episode_length_buf += 1
+        done = self.termination_manager.compute()
+        reward = self.reward_manager.compute(self.step_dt)
+        self._keep_final_observations(done)
+        self._reset_where(done)
+        if with_drives:
+            self.scene.reset_drives_where(done)
+        self.command_manager.compute(self.step_dt)
+        self.event_manager.apply("interval", dt=self.step_dt)
+        return {
+            "done": done,
+            "reward": reward,
+            "terminated": self.termination_manager.terminated,
+            "time_outs": self.termination_manager.time_outs,
+            "log": self._log,
+            **{f"obs/{name}": value for name, value in self.observation_manager.compute().items()},
+        }
+
+    def _graph_key(self) -> Hashable:
+        """All that :meth:`_after_physics` reads and that is no tensor's content."""
+        robots = self.scene.articulations.values()
+        read = [value for robot in robots for value in vars(robot.data).values()]
+        read += [drive.encoder_bias for robot in robots for drive in robot.actuators.values()]
+        places = tuple(value.data_ptr() if isinstance(value, torch.Tensor) else None for value in read)
+        return self.sim.version, places, self.reward_manager.constants, self.observation_manager.constants
 
     def _keep_final_observations(self, done: torch.Tensor) -> None:
         if self.final_observations:
@@ -144,8 +207,15 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.event_manager.reset_where(done)
         log |= self.command_manager.reset_where(done)
         self.episode_length_buf.masked_fill_(done, 0)
-        self._log = _kept_where_none(log, self._log, done.any())
-        self.extras["log"] = dict(self._log)
+        self._keep_log(log, done.any())
+
+    def _keep_log(self, log: dict[str, torch.Tensor], some: torch.Tensor) -> None:
+        """Take numbers to log, where an episode has ended."""
+        if not log:
+            return
+        if list(log) != self._log_names:
+            self._log_names, self._log = list(log), zeros_like(torch.stack([value.float() for value in log.values()]))
+        torch.where(some, torch.stack([value.float() for value in log.values()]), self._log, out=self._log)
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         self.curriculum_manager.compute(env_ids)
@@ -155,14 +225,3 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         log |= self.command_manager.reset(env_ids)
         self.episode_length_buf[env_ids] = 0
         self.extras["log"] = log
-
-
-def _kept_where_none(
-    now: dict[str, torch.Tensor], before: dict[str, torch.Tensor], some: torch.Tensor
-) -> dict[str, torch.Tensor]:
-    """Numbers to log, those of before where no episode has ended."""
-    if not now:
-        return {}
-    new = torch.stack([value.float() for value in now.values()])
-    old = torch.stack([before.get(name, torch.zeros_like(value)) for name, value in zip(now, new, strict=True)])
-    return dict(zip(now, torch.where(some, new, old), strict=True))

@@ -98,13 +98,20 @@ class InteractiveScene:
         self.update()
 
     def reset_where(self, mask: torch.Tensor) -> None:
-        """:meth:`reset` of environments that are not counted, (num_envs,) bool; inside of :meth:`only_where`."""
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool; inside of :meth:`only_where`.
+
+        The drives are left to :meth:`reset_drives_where`.
+        """
         self.sim.reset(slice(None))
         for articulation in self.articulations.values():
             articulation.reset_state(slice(None))
-            articulation.reset_drives(mask)
         for sensor in self.sensors.values():
             sensor.reset(mask)
+
+    def reset_drives_where(self, mask: torch.Tensor) -> None:
+        """Let the drives of environments forget that are not counted, (num_envs,) bool."""
+        for articulation in self.articulations.values():
+            articulation.reset_drives(mask)
 
     def write_data_to_sim(self) -> None:
         """Run the drives and apply their torques."""

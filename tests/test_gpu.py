@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from problems import BENCH, record
+from test_masked_resets import NUM_ENVS, without_chance
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.simulation import SimulationCfg, make_simulation
@@ -81,10 +82,10 @@ def test_a_step_of_walking_robots_waits_for_nothing():
     env = _env("Pace-AnymalD-Velocity-v0", "cuda:0", num_envs=64)
     assert env.masks_resets
     env.reset(seed=0)
-    env.episode_length_buf.copy_(torch.arange(64, device="cuda:0") + env.max_episode_length - 40)
     action = 0.5 * torch.randn(64, 12, device="cuda:0")
-    for _ in range(3):  # graphs are captured
+    for _ in range(40):  # graphs are captured
         env.step(action)
+    env.episode_length_buf.copy_(torch.arange(64, device="cuda:0") + env.max_episode_length - 40)
     torch.cuda.set_sync_debug_mode("error")
     try:
         for _ in range(30):
@@ -93,6 +94,43 @@ def test_a_step_of_walking_robots_waits_for_nothing():
         torch.cuda.set_sync_debug_mode("default")
     assert bool(obs["policy"].isfinite().all()) and bool(reward.isfinite().all())
     assert float(extras["log"]["Episode_Termination/time_out"]) >= 0.0 and bool((env.episode_length_buf < 40).any())
+
+
+@on_gpu
+def test_what_follows_the_physics_is_the_same_from_a_graph():
+    envs = []
+    for graphs in (True, False):
+        cfg = without_chance()
+        cfg.sim.device, cfg.sim.graphs = "cuda:0", graphs
+        env = ManagerBasedRLEnv(cfg)
+        env.reset(seed=1)
+        env.episode_length_buf.copy_(torch.arange(NUM_ENVS, device="cuda:0") % 7 + env.max_episode_length - 9)
+        envs.append(env)
+    action = 0.3 * torch.ones(NUM_ENVS, 12, device="cuda:0")
+    for k in range(25):  # on its feet, rounding grows with every contact; every few steps they start anew
+        graph, plain = (env.step(action) for env in envs)
+        assert torch.allclose(graph[0]["policy"], plain[0]["policy"], rtol=0.0, atol=1e-2), k
+        assert torch.allclose(graph[1], plain[1], rtol=0.0, atol=1e-2) and torch.equal(graph[3], plain[3]), k
+        for name, value in graph[4]["log"].items():
+            assert float(value) == pytest.approx(float(plain[4]["log"][name]), abs=2e-2), (k, name)
+    assert envs[0]._manager_graph is not None and envs[0]._manager_graph.is_captured
+    assert envs[1]._manager_graph is None and bool(graph[3].any() or (envs[0].episode_length_buf < 25).any())
+
+
+@on_gpu
+def test_draws_from_a_graph_are_new_every_step_and_repeat_with_the_seed():
+    env = _env("Pace-AnymalD-Velocity-v0", "cuda:0", num_envs=64)
+    action = torch.zeros(64, 12, device="cuda:0")
+    for _ in range(4):
+        env.step(action)
+    seen = []
+    for _ in range(2):
+        env.seed(7)
+        env.sim.qpos[:], env.sim.qvel[:] = env.sim.qpos[:1].clone(), 0.0
+        noise = [env.step(action)[0]["policy"][:, :3].std(dim=0) for _ in range(2)]
+        assert bool((noise[0] > 0.02).all()) and not torch.equal(*noise)
+        seen.append(env.uniform((8,)))
+    assert torch.equal(*seen)
 
 
 @on_gpu

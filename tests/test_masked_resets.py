@@ -51,7 +51,7 @@ def step_both(counted, masked, steps=45):
 
 def test_masks_reset_what_indices_reset_drives_sensors_and_logs_included():
     counted, masked = ManagerBasedRLEnv(without_chance()), ManagerBasedRLEnv(without_chance())
-    assert masked.takes_masks and not masked.masks_resets
+    assert masked.takes_masks and masked.can_be_captured and not masked.masks_resets
     masked.masks_resets = True
     assert step_both(counted, masked) >= NUM_ENVS
 
@@ -66,7 +66,7 @@ def test_terms_of_one_s_own_are_told_the_environments_unless_they_say_that_they_
     assert not counted.takes_masks
     cfg.events["shift"].func = state_only(shift)
     masked = ManagerBasedRLEnv(cfg)
-    assert masked.takes_masks
+    assert masked.takes_masks and not masked.can_be_captured
     masked.masks_resets = True
     assert step_both(counted, masked, steps=35)
 

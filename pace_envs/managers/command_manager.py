@@ -119,6 +119,11 @@ class CommandManager:
             term.compute(dt)
 
     @property
+    def is_own(self) -> bool:
+        """Whether all terms are this package's."""
+        return all(type(term).__module__.startswith("pace_envs.") for term in self._terms.values())
+
+    @property
     def takes_masks(self) -> bool:
         """Whether all terms do."""
         return all(term.takes_masks for term in self._terms.values())

@@ -41,6 +41,11 @@ class CurriculumManager:
             self._state[term.name] = term(env_ids)
 
     @property
+    def terms(self) -> list[Term[CurriculumTermCfg]]:
+        """The terms."""
+        return self._terms
+
+    @property
     def takes_masks(self) -> bool:
         """Whether all terms have a ``where(env, done, **params)`` beside what they do with indices."""
         return all(hasattr(term.func, "where") and not term.keeps_state for term in self._terms)

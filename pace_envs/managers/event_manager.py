@@ -73,6 +73,11 @@ class EventManager:
             term(ids)
 
     @property
+    def terms(self) -> list[Term[EventTermCfg]]:
+        """The events of resets and intervals."""
+        return [*self._terms["reset"], *self._terms["interval"]]
+
+    @property
     def takes_masks(self) -> bool:
         """Whether :meth:`reset_where` does what :meth:`apply` and :meth:`reset` do at a reset."""
         every = [term for terms in self._terms.values() for term in terms]

@@ -67,6 +67,16 @@ class ObservationManager:
         return {name: [term.name for term in terms] for name, (_, terms) in self._groups.items()}
 
     @property
+    def constants(self) -> tuple[bool, ...]:
+        """Flags that a captured step repeats: whether noise is added, by group."""
+        return tuple(group.enable_corruption for group, _ in self._groups.values())
+
+    @property
+    def terms(self) -> list[Term[ObservationTermCfg]]:
+        """The terms of all groups."""
+        return [term for _, terms in self._groups.values() for term in terms]
+
+    @property
     def takes_masks(self) -> bool:
         """Whether no term has anything to reset."""
         return not any(term.keeps_state for _, terms in self._groups.values() for term in terms)

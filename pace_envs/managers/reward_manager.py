@@ -43,6 +43,16 @@ class RewardManager:
         return self._sums
 
     @property
+    def constants(self) -> tuple[float, ...]:
+        """Numbers that a captured step repeats: the weights."""
+        return tuple(term.cfg.weight for term in self._terms)
+
+    @property
+    def terms(self) -> list[Term[RewardTermCfg]]:
+        """The terms."""
+        return self._terms
+
+    @property
     def takes_masks(self) -> bool:
         """Whether :meth:`reset_where` does what :meth:`reset` does."""
         return not any(term.keeps_state for term in self._terms)

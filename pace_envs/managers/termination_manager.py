@@ -59,6 +59,11 @@ class TerminationManager:
         return self.dones
 
     @property
+    def terms(self) -> list[Term[TerminationTermCfg]]:
+        """The terms."""
+        return self._terms
+
+    @property
     def takes_masks(self) -> bool:
         """Whether :meth:`reset_where` does what :meth:`reset` does."""
         return not any(term.keeps_state for term in self._terms)
