@@ -1,15 +1,21 @@
 """Friction at rest and while sliding, identified apart: PACE's flag."""
 
+import dataclasses
+
 import pytest
 import torch
+from problems import BENCH, CALM, chirp, record
 
 from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg
-from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs import ManagerBasedRLEnv, load_env_cfg, register_task
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_envs.tasks.pace.parameters import effect_parameters
 from pace_optim.diagnosis.diagnose import candidate_effects
+from pace_optim.fit import fit
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
 
 
 def separated(task: str, **bounds) -> PaceSim2realEnvCfg:
@@ -86,6 +92,27 @@ def test_a_stuck_joint_breaks_away_later_than_it_comes_to_rest():
     assert moved[0].abs() < 1e-4  # 0.6 N m: less than at rest
     assert moved[1] > 1e-3  # 1.0 N m: more
     assert speed[2] > 0.5 and speed[3] < 0.5  # already sliding: 0.6 N m is more than 0.4, 0.3 N m less
+
+
+def test_a_fit_of_a_task_with_the_flag_recovers_both_frictions(tmp_path):
+    """The bench with 0.8 N m at rest and half of it while sliding, 0.1 mrad of noise."""
+    register_task("Pace-SeparatedBench-v0", lambda: separated(BENCH))
+    truth = {**CALM, "friction": 0.8, "viscous_friction": 0.5, "dynamic_friction.ratio": 0.5}
+    made = record(chirp(2.0, 0.2, 4.0, 0.4), truth, cfg=separated(BENCH), noise=1e-4)
+    save_recording(tmp_path / "bench.npz", dataclasses.replace(made, name="bench"))
+    result, _ = fit(
+        FitSettings(
+            task="Pace-SeparatedBench-v0",
+            data=[str(tmp_path / "bench.npz")],
+            optimizer="least_squares",
+            check_consistency=False,
+            log_dir=str(tmp_path),
+        )
+    )
+    for name, tolerance in (("friction", 0.02), ("dynamic_friction.ratio", 0.02)):
+        (found,), (std,) = result.parameters[name].values(), result.std[name].values()
+        assert abs(found - truth[name]) < min(tolerance, 4 * std), name
+    assert result.effects == ["dynamic_friction"]
 
 
 def test_a_diagnosis_looks_for_the_general_law():
