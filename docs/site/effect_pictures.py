@@ -57,8 +57,8 @@ def draw(name: str, folder: Path) -> Path:
     path = PICTURES / f"{name}.png"
     figure.savefig(path, dpi=80, metadata={"Software": None})
     plt.close(figure)
-    with Image.open(path) as picture:  # 24 colours are enough, and a third of the size
-        small = picture.convert("RGB").quantize(24)
+    with Image.open(path) as picture:  # 64 colours are enough, and half the size
+        small = picture.convert("RGB").quantize(64)
     small.save(path, optimize=True)
     return path
 
