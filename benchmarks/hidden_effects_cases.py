@@ -18,10 +18,9 @@ import torch
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.beginning.base_fit import fit_base
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine, fit_to_whole
-from pace_optim.diagnosis.fitting.reference_update import OwnMotion
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
+from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import start_values
 from pace_optim.diagnosis.verdict.verdict import ranking
@@ -36,6 +35,7 @@ PAIRS = (
     ("joint_elasticity", "torque_gain"),
     ("load_dependent_friction", "measurement_delay"),
 )
+FITS = Fits()
 _BACKGROUNDS = (1 / 3, 1.0)  # share of the effect's own size, seed by seed in turn
 
 
@@ -118,9 +118,11 @@ def run_case(job: Job) -> dict[str, Any]:
     if true_effects and not job.case.background:
         same = set(true_effects) == set(final.model.effects)
         if not same:
-            follow = OwnMotion(problem=problem, candidates=candidate_effects(), enough=found.data.floor).follow
+            follow = ReferenceUpdate(
+                fits=FITS, problem=problem, candidates=candidate_effects(), enough=found.data.floor
+            ).follow
             twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
-            with_truth = _rms(validation_errors(twins, fit_to_whole(twins, [final]))[0])
+            with_truth = _rms(FITS.validation_errors(twins, FITS.to_whole(twins, [final]))[0])
         else:
             with_truth = _rms(outcome.final_errors)
     fitted = time.perf_counter()
@@ -166,9 +168,9 @@ def _base_error(job: Job, part: Literal["effects", "background"]) -> float:
     On the joints that have the effect.
     """
     problem, _ = _load(job, replace(job.case, part=part))
-    twins, base, _ = fit_base(problem, problem.space.to_physical(problem.space.start))
+    twins, base, _ = fit_base(FITS, problem, problem.space.to_physical(problem.space.start))
     joints = torch.tensor([bool(re.fullmatch(job.case.joints, name)) for name in problem.joint_names])
-    square = validation_errors(twins, [base])[0].mse[joints].mean()
+    square = FITS.validation_errors(twins, [base])[0].mse[joints].mean()
     return math.sqrt(max(float(square) - job.case.noise**2, 0.0))
 
 
@@ -178,7 +180,7 @@ def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]],
     for effect in effects:
         has = torch.tensor([name in str(truth["effects"][effect.name]) for name in twins.joint_names])
         model, physical = model.extended(physical, effect, has, start_values(effect, {}).repeat(n, 1))
-    return fit_coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
+    return FITS.coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
 
 
 def _rms(errors: BlockErrors) -> float:

@@ -13,11 +13,13 @@ from run_folders import JOINTS, make_result
 
 from pace_actuators.effects import Effect, get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Trial
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
@@ -116,7 +118,7 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
 
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
     model = SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")})
-    model.at_bounds = lambda _: torch.zeros_like(has)
+    model.at_bounds = lambda *_: torch.zeros_like(has)
     model.is_wide = lambda _: torch.zeros(has.shape[1], dtype=torch.bool)
     final = SimpleNamespace(model=model, x=None)
     return Outcome(
@@ -177,6 +179,36 @@ def errors_of(*rmse, roll=0):
     """Validation errors of joints with these RMSE [rad], in four blocks that scatter, by ``roll`` in another order."""
     scatter = torch.tensor([1.1, 1.0, 1.0, 0.9]).double().roll(roll)[:, None]
     return BlockErrors(square=scatter * torch.tensor(rmse).double() ** 2, weight=torch.ones(4).double())
+
+
+class FakeFits(Fits):
+    """Models stay where they start; their errors follow from the model."""
+
+    def __init__(self, errors, off=()):
+        super().__init__(cfg=DiagnosisCfg(off=off))
+        object.__setattr__(self, "errors", errors)
+
+    def side_by_side(self, problem, starts, *args, **kwargs):
+        return list(starts)
+
+    def coarse_to_fine(self, problem, starts, rough=False):
+        return list(starts)
+
+    def to_whole(self, problem, starts):
+        return list(starts)
+
+    def over_wide_steps(self, problem, now, kept=None):
+        return now
+
+    def validation_errors(self, problem, models):
+        return [self.errors(now) for now in models]
+
+
+def make_search(errors, floor=(1e-4,), effects=(None,) * 30, off=(), **changes):
+    """A search whose fits stay where they start, with the errors that a function gives of a model."""
+    floor = torch.tensor(floor, dtype=torch.float64)
+    fits = FakeFits(errors, off)
+    return Search(effects=effects, effort=5 * floor, floor=floor, max_effects=3, fits=fits, **changes)
 
 
 def with_effects(model, values, *effects):

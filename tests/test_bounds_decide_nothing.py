@@ -5,7 +5,7 @@ import torch
 from diagnoses import joint_alone
 
 from pace_actuators.effects import EffectCfg, EffectParameter, available_effects, get_effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import JointModel
@@ -62,7 +62,7 @@ def test_a_fit_that_a_bound_holds_back_goes_on_beyond_it():
 
     def refit(starts):
         calls.append(starts)
-        return fit_coarse_to_fine(robot.twins, starts)
+        return Fits().coarse_to_fine(robot.twins, starts)
 
     start = Fitted.start(model, values, tried=OFFSET)
     (fitted,) = beyond_bounds([start], refit, lambda _: None)

@@ -16,11 +16,13 @@ from run_folders import make_result
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import candidate_effects
-from pace_optim.diagnosis.candidates.screening import _FOLDS, _explained
+from pace_optim.diagnosis.candidates.screening import _explained
 from pace_optim.diagnosis.diagnose import search_effects
-from pace_optim.diagnosis.fitting.processes import spread
-from pace_optim.diagnosis.judging.acceptance import BlockErrors, block_errors, check_long_enough, judge
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.processes import parallel_map
+from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors, check_long_enough
 from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.telling.next_experiment import rivals_of
 from pace_optim.diagnosis.verdict.verdict import explained_joints, ranking, verdict
@@ -28,6 +30,7 @@ from pace_optim.terminal.atomic import write_json
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+FOLDS = DEFAULT.candidates.folds
 
 
 # ------------------------------------------------------------------ screening
@@ -39,7 +42,7 @@ def columns(probes=2, samples=2000, seed=0):
     jacobian = torch.randn(3, samples, 1, 1, generator=generator)
     changes = torch.randn(probes, samples, 1, 1, generator=generator)
     noise = torch.randn(samples, 1, 1, generator=generator)
-    fold = (torch.arange(samples) // 100 % _FOLDS)[:, None]
+    fold = (torch.arange(samples) // 100 % FOLDS)[:, None]
     return jacobian, changes, noise, fold
 
 
@@ -47,7 +50,7 @@ def test_what_a_probe_causes_it_explains_and_its_size_is_found():
     jacobian, changes, noise, fold = columns()
     # errors are simulated less measured: the measured motion has three times the probe's change
     error = 5 * jacobian[0] - 3 * changes[1] + 0.01 * noise
-    scores, sizes = _explained(error, jacobian, changes, fold)
+    scores, sizes = _explained(error, jacobian, changes, fold, FOLDS)
     assert scores[1, 0] > 0.999 and abs(float(scores[0, 0])) < 0.02
     assert float(sizes[1, 0]) == pytest.approx(3.0, rel=1e-2)
 
@@ -55,14 +58,14 @@ def test_what_a_probe_causes_it_explains_and_its_size_is_found():
 def test_what_the_parameters_explain_is_no_effect_s():
     jacobian, changes, noise, fold = columns()
     changes[0] = 0.5 * jacobian[1]
-    scores, _ = _explained(jacobian[1] + 0.01 * noise, jacobian, changes, fold)
+    scores, _ = _explained(jacobian[1] + 0.01 * noise, jacobian, changes, fold, FOLDS)
     assert float(scores.abs().max()) < 0.02
 
 
 def test_noise_is_explained_by_nothing_and_a_probe_without_change_by_zero():
     jacobian, changes, noise, fold = columns(probes=20)
     changes[3] = 0.0
-    scores, _ = _explained(noise, jacobian, changes, fold)
+    scores, _ = _explained(noise, jacobian, changes, fold, FOLDS)
     assert float(scores.max()) < 0.02 and float(scores[3, 0]) == 0.0
 
 
@@ -170,7 +173,7 @@ def test_a_search_flushes_denormal_numbers_and_puts_the_processors_setting_back(
     tiny, seen = sys.float_info.min, []
 
     def first_step(*_):
-        seen.append((tiny / 2, *spread(lambda own: [tiny / 2 for _ in own], [1, 2], [GAIN, None])))
+        seen.append((tiny / 2, *parallel_map(lambda own: [tiny / 2 for _ in own], [1, 2], [GAIN, None])))
         raise KeyboardInterrupt
 
     module = sys.modules["pace_optim.diagnosis.diagnose"]  # the package has a function of this name

@@ -14,17 +14,22 @@ from pace_optim.diagnosis.beginning import base_fit
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.candidates.multistart import far_starts
-from pace_optim.diagnosis.fitting import coarse_to_fine as descent
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.fitting.levenberg_marquardt import Way
-from pace_optim.diagnosis.fitting.reference_update import OwnMotion
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
+from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot, _merged
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
-from pace_optim.diagnosis.search import search
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+FITS = Fits()
+
+
+def descent(start, rough=False):
+    """Of one model, without a simulation."""
+    return LevenbergMarquardt(start, torch.ones(1), False, rough, DEFAULT.fitting)
 
 
 @pytest.fixture(scope="module")
@@ -44,23 +49,24 @@ def bench():
 def test_the_base_model_moves_along_what_was_measured_only_near_it(bench, monkeypatch, neighbours, left, references):
     used = []
 
-    def fitted_along(problem, fitted, along, model_effects, say):
+    def fitted_along(fits, problem, fitted, along, model_effects, say):
         used.append(along.__name__)
         twins = SimpleNamespace(path=SimpleNamespace(typical_effort=lambda armature: armature))
         return twins, replace(fitted, score=torch.tensor([left**2], dtype=torch.float64))
 
     monkeypatch.setattr(base_fit, "_fit_along", fitted_along)
     trees = [[*bench.problem.joint_names, *["other"] * neighbours]]
-    base_fit.fit_base(replace(bench.problem, trees=trees), bench.problem.space.to_physical(bench.problem.space.start))
+    problem = replace(bench.problem, trees=trees)
+    base_fit.fit_base(FITS, problem, problem.space.to_physical(problem.space.start))
     assert used == references
 
 
 def test_how_far_a_joint_is_from_its_reference(bench):
-    motion = OwnMotion(problem=bench.problem, candidates=(), enough=torch.zeros(1))
+    motion = ReferenceUpdate(fits=FITS, problem=bench.problem, candidates=(), enough=torch.zeros(1))
 
     def away(**changes):
         values = torch.tensor([[({**CALM, **changes})[name] for name in BASE]], dtype=torch.float64)
-        return motion._away(bench.twins, Fitted.start(JointModel.base(bench.problem), values))
+        return motion.away(bench.twins, Fitted.start(JointModel.base(bench.problem), values))
 
     assert away() < 1e-3
     assert away(encoder_bias=CALM["encoder_bias"] + 0.03) == pytest.approx(0.03, rel=0.1)
@@ -125,7 +131,7 @@ def test_side_by_side_each_model_keeps_the_order_of_its_effects():
 
 
 def test_the_descent_finds_the_base_parameters(bench):
-    _, fitted, effort = fit_base(bench.problem, bench.problem.space.to_physical(bench.problem.space.start))
+    _, fitted, effort = fit_base(FITS, bench.problem, bench.problem.space.to_physical(bench.problem.space.start))
     values = dict(zip(BASE, fitted.model.to_physical(fitted.x)[0].tolist(), strict=True))
     for name in ("armature", "viscous_friction", "friction", "delay"):
         assert values[name] == pytest.approx(CALM[name], rel=0.01), name
@@ -138,7 +144,7 @@ def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
     model, values = JointModel.base(bench.problem), bench.truth_values.clone()
     values[0, BASE.index("armature")] *= 1.2  # of such a size is what a coarse step does
     base = Fitted.start(model, values)
-    left = search.validation_errors(bench.twins, [base])[0].mse.sqrt()
+    left = FITS.validation_errors(bench.twins, [base])[0].mse.sqrt()
     run = SimpleNamespace(effects=[], rmse={"validation": {"servo": 1e-7}}, physics_dt=DT)
     for it, floor in (
         (run, left),
@@ -147,7 +153,7 @@ def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
         (SimpleNamespace(**{**vars(run), "physics_dt": bench.problem.physics_dt}), None),
         (None, None),
     ):
-        check = check_data(bench.problem, bench.twins, base, it)
+        check = check_data(FITS, bench.problem, bench.twins, base, it)
         said = [sentence for sentence in check.sentences if "comes from the step" in sentence]
         if floor is None:
             assert float(check.floor) < 0.5 * float(left) and not said
@@ -158,7 +164,7 @@ def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
 def test_a_fit_that_starts_at_the_truth_stays_there(bench):
     model = JointModel.base(bench.problem)
     x = model.to_normalised(torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64))
-    fitted = fit_side_by_side(
+    fitted = FITS.side_by_side(
         bench.twins,
         [Fitted.start(model, model.to_physical(x))],
         max_iteration=2,
@@ -171,7 +177,7 @@ def test_models_far_behind_are_left_at_the_coarse_step(bench):
     heavy = bench.truth_values.clone()
     heavy[:, BASE.index("armature")] *= 4
     held = replace(model, lower=heavy, upper=heavy)
-    far, near = fit_coarse_to_fine(bench.twins, [Fitted.start(held, heavy), Fitted.start(model, bench.truth_values)])
+    far, near = FITS.coarse_to_fine(bench.twins, [Fitted.start(held, heavy), Fitted.start(model, bench.truth_values)])
     assert far.jacobian is None and near.jacobian is not None
     assert float(far.score.sqrt()) > 3 * float(near.score.sqrt())
 
@@ -181,7 +187,7 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     model = JointModel.base(bench.problem)
     heavy[:, BASE.index("armature")] = model.upper[:, BASE.index("armature")]
     coarse, now = bench.twins.with_physics_dt(DT), Fitted.start(model, heavy)
-    starts = far_starts(coarse, now, [STRIBECK, get_effect("joint_elasticity")])
+    starts = far_starts(FITS, coarse, now, [STRIBECK, get_effect("joint_elasticity")])
     stiff = [start.tried.name for start in starts[1:]]
     assert starts[0].tried is STRIBECK and stiff == ["joint_elasticity"] * len(probe_points(starts[1].tried))
     slots = [Slot(model=model, rows=1), *(Slot(model=start.model, rows=1) for start in starts)]
@@ -214,7 +220,7 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     heavy[bench.problem.space["armature"]] *= 3
     elsewhere = twin_problem(bench.problem, reference_path(bench.problem, heavy))
     now = Fitted.start(JointModel.base(bench.problem), bench.truth_values)
-    follow = OwnMotion(problem=bench.problem, candidates=[], enough=torch.zeros(1)).follow
+    follow = ReferenceUpdate(fits=FITS, problem=bench.problem, candidates=[], enough=torch.zeros(1)).follow
     along, fitted = follow(elsewhere, now)
     assert float((along.path.position - bench.twins.path.position).abs().max()) < 1e-9
     assert float(fitted.score.sqrt()) < 2e-4
@@ -225,7 +231,7 @@ def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
 def test_a_descent_ends_although_damped_steps_keep_gaining_next_to_nothing(bench):
     """After such a step derivatives are new, which is no gain and no failure."""
     model = JointModel.base(bench.problem)
-    way = Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=False)
+    way = descent(Fitted.start(model, bench.truth_values), rough=False)
     lowest, last = 1.0, model.size + 2
     asked = 0
     while not way.finished and asked < 10:
@@ -251,7 +257,7 @@ def test_a_descent_ends_where_its_linear_model_promises_next_to_nothing(bench, p
     axes = torch.linalg.qr(torch.randn(40, model.size + 1, generator=torch.Generator().manual_seed(0)).double())[0]
     left, columns = axes[:, 0], axes[:, 1:]
     bottom = start[0] + torch.full((model.size,), math.sqrt(promised / model.size), dtype=torch.float64)
-    way = Way(Fitted.start(model, bench.truth_values), samples=torch.ones(1), keep=False, rough=rough)
+    way = descent(Fitted.start(model, bench.truth_values), rough=rough)
     asked = 0
     while not way.finished and asked < 10:
         asked += 1
@@ -261,20 +267,19 @@ def test_a_descent_ends_where_its_linear_model_promises_next_to_nothing(bench, p
     assert float(way.score) == pytest.approx(1.0 + (promised if expected == 1 else 0.0), abs=1e-6)
 
 
-def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside_it(bench, monkeypatch):
+def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside_it(bench):
     model = JointModel.base(bench.problem)
     off = bench.truth_values * torch.tensor([[1.5, 0.5, 2.0, 1.0, 1.0]])
-    first = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)])[0]
+    first = FITS.side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 9)[0]
     starts = [Fitted.start(model, model.to_physical(first.x)), Fitted.start(model, off)]
-    alone = [fit_side_by_side(bench.twins, [start], 4)[0] for start in starts]
+    alone = [FITS.side_by_side(bench.twins, [start], 4)[0] for start in starts]
     batches = []
 
     def side_by_side(problem, slots, training):
         batches.append(len(slots))
         return SideBySide(problem, slots, training=training)
 
-    monkeypatch.setattr(descent, "SideBySide", side_by_side)
-    together = fit_side_by_side(bench.twins, starts, 4)
+    together = Fits(batch=side_by_side).side_by_side(bench.twins, starts, 4)
     assert batches == [2, 1]
     for fitted, single in zip(together, alone, strict=True):
         assert torch.equal(fitted.x, single.x) and torch.equal(fitted.score, single.score)
@@ -282,7 +287,7 @@ def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside
 
 def gaining(model, truth, gains):
     """A descent whose favoured steps lower the error by these parts, (asks, joints); how often it had to be asked."""
-    way = Way(Fitted.start(model, truth), samples=torch.ones(1), keep=False, rough=False)
+    way = descent(Fitted.start(model, truth), rough=False)
     lowest, asked = torch.ones(model.num_joints), 0
     for gain in [torch.zeros(model.num_joints), *(torch.tensor(each) for each in gains)]:  # derivatives come first
         if way.finished:
@@ -311,7 +316,7 @@ def test_a_model_goes_on_that_is_near_the_best_on_any_joint():
     def model(*scores):
         return SimpleNamespace(score=torch.tensor(scores))
 
-    assert descent._near([model(1.0, 1.0), model(9.0, 0.5), model(9.0, 9.0)]) == [True, True, False]
+    assert FITS._near([model(1.0, 1.0), model(9.0, 0.5), model(9.0, 9.0)]) == [True, True, False]
 
 
 def test_a_descent_says_whether_it_was_still_falling_at_its_last_iteration(bench):
@@ -327,11 +332,15 @@ def test_a_descent_says_whether_it_was_still_falling_at_its_last_iteration(bench
     assert not falls()
 
 
-def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best(monkeypatch):
+def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best():
     scores = {"slow": [1.5, 1.0, 0.3], "far": [50.0, 0.0], "done": [0.6], "best": [0.5, 0.4, 0.3, 0.2]}  # run by run
     asked = []
 
-    def fit(problem, starts, *_, **__):
+    class Recorded(Fits):
+        def side_by_side(self, problem, starts, *_, **__):
+            return fit(problem, starts)
+
+    def fit(problem, starts):
         names = [start.name for start in starts]
         asked.append((problem, names))
         left = [scores[name] for name in names]
@@ -341,9 +350,8 @@ def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best(monkeypatch)
             for name, score, more in zip(names, own, left, strict=True)
         ]
 
-    monkeypatch.setattr(descent, "fit_side_by_side", fit)
     problem = SimpleNamespace(coarse=lambda: "coarse", in_windows=lambda: "windows")
-    fit_coarse_to_fine(problem, [SimpleNamespace(name=name) for name in scores])
+    Recorded().coarse_to_fine(problem, [SimpleNamespace(name=name) for name in scores])
     assert asked[:3] == [("coarse", list(scores)), ("coarse", ["slow", "best"]), ("coarse", ["slow", "best"])]
     near = ["slow", "done", "best"]
     assert asked[3:] == [("windows", near), (problem, near)]  # then the finer step, at last on whole recordings

@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnoses import errors_of, joint_alone
+from diagnoses import FakeFits, errors_of, joint_alone, make_search
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.screening import Probe
-from pace_optim.diagnosis.judging import some_joints
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
-from pace_optim.diagnosis.search import pooling as sharing
-from pace_optim.diagnosis.search import pruning
 from pace_optim.diagnosis.search.one_round import _ranked
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.pooling import pool
+from pace_optim.diagnosis.search.pruning import drop_last, drop_superfluous
+from pace_optim.diagnosis.search.state import Branch, Outcome
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 
@@ -52,22 +52,20 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
     assert physical[:, model.columns(STRIBECK)].tolist() == [[1.0, 0.1], [3.0, 1.3]]
 
 
-def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
+def test_one_value_is_shared_where_that_explains_as_much(bench):
     base = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
     model = replace(base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1))
     both = torch.tensor([True, True])
     found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
     model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, found)
-    final = Fitted.start(model, physical)
-    final.jacobian = torch.randn(model.size, 40, 3, 2, generator=torch.Generator().manual_seed(0))
-    final.jacobian[..., 0] *= 10  # the first joint knows its values better
+    jacobian = torch.randn(model.size, 40, 3, 2, generator=torch.Generator().manual_seed(0))
+    jacobian[..., 0] *= 10  # the first joint knows its values better
+    final = replace(Fitted.start(model, physical), jacobian=jacobian)
     weights = torch.ones(1).double()
     errors = BlockErrors(square=torch.tensor([[1e-8, 1e-8]]).double(), weight=weights)
     for cost, shared in ((1.0, True), (1.2, False)):
         after = BlockErrors(square=cost * errors.square, weight=weights)
-        monkeypatch.setattr(sharing, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
-        monkeypatch.setattr(sharing, "validation_errors", lambda *_, after=after: [after])
         outcome = Outcome(
             problem=None,
             base=final,
@@ -76,7 +74,7 @@ def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
             final_errors=errors,
             unevenness=torch.zeros(final.model.has.shape),
         )
-        sharing.share(outcome)
+        outcome = pool(FakeFits(lambda _, after=after: after), outcome)
         assert (STRIBECK in outcome.final.model.shared) is shared
         values = outcome.final.model.to_physical(outcome.final.x)[:, model.columns(STRIBECK)]
         if shared:
@@ -86,45 +84,38 @@ def test_one_value_is_shared_where_that_explains_as_much(bench, monkeypatch):
             assert values == pytest.approx(found)
 
 
-def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench, monkeypatch):
+def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench):
     base = JointModel.base(bench.problem)
     values, yes = bench.truth_values, torch.tensor([True])
     for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1])):
         base, values = base.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
-    now, weights = Fitted.start(base, values), torch.ones(1).double()
+    weights = torch.ones(1).double()
     before = BlockErrors(square=torch.tensor([[1e-8]]).double(), weight=weights)
+    newest = Round(trials=[[]], chosen=[QUADRATIC], rivals=[[]])
+    branch = Branch(problem=bench.twins, now=Fitted.start(base, values), errors=before, rounds=(newest,))
     for cost, kept in ((1.05, [False, True]), (1.3, [True, True])):
         after = BlockErrors(square=cost * before.square, weight=weights)
-        for module, name in ((some_joints, "fit_coarse_to_fine"), (pruning, "fit_side_by_side")):
-            monkeypatch.setattr(module, name, lambda _, starts, **kwargs: starts)
-        for module in (some_joints, pruning):
-            monkeypatch.setattr(module, "validation_errors", lambda *_, after=after: [after])
-        left, _ = pruning.pruned(bench.twins, now, before, [QUADRATIC])
+        left = drop_superfluous(make_search(lambda _, after=after: after), branch).now
         assert left.model.has[:, 0].tolist() == kept
         assert labels(left.model, ["servo"]) == [e.name for e, k in zip((STRIBECK, QUADRATIC), kept, strict=True) if k]
         assert ("stribeck_friction.effort" in whole_values(left.model, left.x, ["servo"])) is kept[0]
 
 
-def left_at_last(bench, monkeypatch, rmse):
+def left_at_last(bench, rmse):
     """The effects that a joint with three keeps, where its RMSE without some of them stands in a table, or is 9."""
     model, values, yes = JointModel.base(bench.problem), bench.truth_values, torch.tensor([True])
     for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1]), (GAIN, [0.1])):
         model, values = model.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
 
-    def errors(_, models):
-        lacking = [
-            frozenset(e for e, has in zip(m.model.effects, m.model.has[:, 0], strict=True) if not has) for m in models
-        ]
-        return [errors_of(1e-3 * rmse.get(each, 9.0)) for each in lacking]
+    def errors(now):
+        pairs = zip(now.model.effects, now.model.has[:, 0], strict=True)
+        return errors_of(1e-3 * rmse.get(frozenset(effect for effect, has in pairs if not has), 9.0))
 
-    for module, name in ((some_joints, "fit_coarse_to_fine"), (pruning, "fit_side_by_side")):
-        monkeypatch.setattr(module, name, lambda _, starts, **kwargs: starts)
-    for module in (some_joints, pruning):
-        monkeypatch.setattr(module, "validation_errors", errors)
     now = Fitted.start(model, values)
-    final, after = pruning.pruned_at_last(bench.twins, now, errors(None, [now])[0], tried=30)
-    assert torch.equal(after.square, errors(None, [final])[0].square)
-    return {e for e, has in zip(final.model.effects, final.model.has[:, 0], strict=True) if has}
+    branch = Branch(problem=bench.twins, now=now, errors=errors(now))
+    end = drop_last(make_search(errors), branch)
+    assert torch.equal(end.errors.square, errors(end.now).square)
+    return {e for e, has in zip(end.now.model.effects, end.now.model.has[:, 0], strict=True) if has}
 
 
 @pytest.mark.parametrize(
@@ -137,8 +128,8 @@ def left_at_last(bench, monkeypatch, rmse):
         ({(): 1.0, (STRIBECK,): 1.1, (STRIBECK, QUADRATIC): 1.2, (STRIBECK, QUADRATIC, GAIN): 1.25}, {GAIN}),
     ],
 )
-def test_effects_that_no_longer_pay_go_one_after_another(bench, monkeypatch, without, kept):
-    assert left_at_last(bench, monkeypatch, {frozenset(each): rmse for each, rmse in without.items()}) == kept
+def test_effects_that_no_longer_pay_go_one_after_another(bench, without, kept):
+    assert left_at_last(bench, {frozenset(each): rmse for each, rmse in without.items()}) == kept
 
 
 def test_every_structure_that_an_effect_can_have_starts_a_fit():
@@ -164,15 +155,15 @@ def test_where_an_encoder_sits_is_chosen_and_not_walked_to(bench):
     assert fits[0].model.free[0].tolist() == [True] * (len(BASE) + 2) + [False]
     link, motor = fits
     assert [float(f.model.to_physical(f.x)[0, -1]) for f in fits] == [0.0, 1.0]
-    link.take(motor, torch.tensor([False]))
-    assert float(link.model.to_physical(link.x)[0, -1]) == 0.0
-    link.take(motor, yes)
-    assert float(link.model.to_physical(link.x)[0, -1]) == 1.0
+    assert float(link.merged(motor, torch.tensor([False])).physical[0, -1]) == 0.0
+    assert float(link.merged(motor, yes).physical[0, -1]) == 1.0
     assert model.structure_held(STRIBECK, physical) is model  # it has nothing of the kind
 
 
 def test_a_joint_parts_motor_and_link_only_once_and_gets_nothing_barred(bench):
     backlash, elasticity = get_effect("backlash"), get_effect("joint_elasticity")
     model = JointModel.base(bench.problem).with_effect(backlash, torch.tensor([True]))
-    assert not model.may_get(elasticity) and not model.may_get(backlash) and model.may_get(STRIBECK)
-    assert not replace(model, barred={STRIBECK: torch.tensor([True])}).may_get(STRIBECK)
+    assert (
+        not model.allowed_joints(elasticity) and not model.allowed_joints(backlash) and model.allowed_joints(STRIBECK)
+    )
+    assert not replace(model, barred={STRIBECK: torch.tensor([True])}).allowed_joints(STRIBECK)

@@ -16,8 +16,8 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis.candidates.multistart import far_starts
 from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.fitting import processes
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.fitting.processes import spread
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 
@@ -34,25 +34,25 @@ def two_processors(monkeypatch):
 
 def test_results_come_back_in_order_from_two_processes():
     items, effects = list("abcde"), [GAIN, STRIBECK, GAIN, None, RIPPLE]
-    found = spread(lambda own: [(item, os.getpid()) for item in own], items, effects)
+    found = parallel_map(lambda own: [(item, os.getpid()) for item in own], items, effects)
     assert [item for item, _ in found] == items
     assert len({process for _, process in found}) == 2
     assert found[0][1] == found[2][1], "items of one effect stay together"
 
 
 def test_one_effect_needs_no_second_process():
-    assert set(spread(lambda own: [os.getpid()] * len(own), "ab", [GAIN, GAIN])) == {os.getpid()}
+    assert set(parallel_map(lambda own: [os.getpid()] * len(own), "ab", [GAIN, GAIN])) == {os.getpid()}
 
 
 def test_every_process_gets_about_as_much():
-    assert processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE], 2) == [[2], [0, 1, 3]]
-    assert processes._shares([GAIN, GAIN, GAIN, None, STRIBECK, RIPPLE], 2) == [[0, 1, 2], [3, 4, 5]]
-    assert processes._shares([GAIN, RIPPLE], 8) == [[0], [1]]
+    assert processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE], 2, 3.0) == [[2], [0, 1, 3]]
+    assert processes._shares([GAIN, GAIN, GAIN, None, STRIBECK, RIPPLE], 2, 3.0) == [[0, 1, 2], [3, 4, 5]]
+    assert processes._shares([GAIN, RIPPLE], 8, 3.0) == [[0], [1]]
 
 
 def test_worker_processes_and_other_systems_do_it_alone(monkeypatch):
     def pids():
-        return set(spread(lambda own: [os.getpid()] * len(own), "ab", [GAIN, RIPPLE]))
+        return set(parallel_map(lambda own: [os.getpid()] * len(own), "ab", [GAIN, RIPPLE]))
 
     monkeypatch.setattr(processes.sys, "platform", "darwin")
     assert pids() == {os.getpid()}
@@ -73,7 +73,7 @@ def test_effects_and_tensors_of_a_user_survive_the_way_back():
         return [SimpleNamespace(effect=effect, x=torch.full((2, 3), 0.1, dtype=torch.float64)) for effect in own]
 
     for order in ([GAIN, Own], [Own, GAIN]):
-        found = spread(work, order, order)
+        found = parallel_map(work, order, order)
         assert [each.effect for each in found] == order
         assert all(torch.equal(each.x, torch.full((2, 3), 0.1, dtype=torch.float64)) for each in found)
 
@@ -89,7 +89,7 @@ def test_an_error_reaches_the_caller_and_leaves_nothing_behind(wrong):
         return own
 
     with pytest.raises(ValueError, match="is wrong"):
-        spread(work, "ab", [GAIN, RIPPLE])
+        parallel_map(work, "ab", [GAIN, RIPPLE])
     assert os.sched_getaffinity(0) == before and gc.isenabled() == collects
     with pytest.raises(ChildProcessError):  # no process is left
         os.waitpid(-1, os.WNOHANG)
@@ -104,7 +104,7 @@ def test_a_process_that_is_killed_is_told():
         return own
 
     with pytest.raises(RuntimeError, match=r"exit code -9.*taskset"):
-        spread(work, "ab", [GAIN, RIPPLE])
+        parallel_map(work, "ab", [GAIN, RIPPLE])
 
 
 class TwoWordsError(Exception):
@@ -124,7 +124,7 @@ def test_what_went_wrong_elsewhere_is_told_with_its_place(error):
         return own
 
     with pytest.raises(Exception, match="this and that") as caught:
-        spread(work_of_a_user, "ab", [GAIN, RIPPLE])
+        parallel_map(work_of_a_user, "ab", [GAIN, RIPPLE])
     told = "".join([str(caught.value), *getattr(caught.value, "__notes__", [])])
     assert "in work_of_a_user" in told
 
@@ -144,7 +144,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
         "        os.kill(here, 9)\n"
         "    print(os.getpid(), flush=True)\n"
         "    return [bytes(10**7)]\n"
-        "processes.spread(work, 'ab', [get_effect('torque_gain'), get_effect('torque_ripple')])\n"
+        "processes.parallel_map(work, 'ab', [get_effect('torque_gain'), get_effect('torque_ripple')])\n"
     )
     first = subprocess.Popen([sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     other = int(first.stdout.readline())
@@ -159,14 +159,14 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
 
 
 def test_a_collection_in_the_fork_does_not_touch_simulations(monkeypatch):
-    found = spread(lambda own: [gc.isenabled()] * len(own), "ab", [GAIN, RIPPLE])
+    found = parallel_map(lambda own: [gc.isenabled()] * len(own), "ab", [GAIN, RIPPLE])
     assert found == [True, False]
 
 
 def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     bench = joint_alone()
     model, yes = JointModel.base(bench.problem), torch.tensor([True])
-    base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
+    base = Fits().side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
     effects, effort = [GAIN, ELASTICITY, RIPPLE], torch.tensor([5.0], dtype=torch.float64)
     heavy = bench.truth_values.clone()
     heavy[:, BASE.index("armature")] *= 2  # takes longer than one at the truth
@@ -177,8 +177,8 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
             Fitted.start(*model.extended(values, effect, yes, each), effect)
             for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
-        fits = fit_side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
-        return screen(bench.twins, base, effects, effort), fits, far_starts(bench.twins, base, effects)
+        fits = Fits().side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
+        return screen(Fits(), bench.twins, base, effects, effort), fits, far_starts(Fits(), bench.twins, base, effects)
 
     probes, fits, far = found()
     monkeypatch.setattr(processes, "available_processors", lambda: 1)

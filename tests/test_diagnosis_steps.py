@@ -1,25 +1,25 @@
 """The steps of the search: where it ends, its verdict, what takes another's place, what to record next."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import errors_of, joint_alone, make_trial, outcome_of, with_effects
+from diagnoses import errors_of, joint_alone, make_search, make_trial, outcome_of, with_effects
 from problems import DT
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.judging import some_joints
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.diagnosis.search import merge_effects as one_for_several
-from pace_optim.diagnosis.search import one_round, search
-from pace_optim.diagnosis.search import replace_effect as swapping
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.merge_effects import _options, merge_effects
+from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
+from pace_optim.diagnosis.search.search import add_effects
+from pace_optim.diagnosis.search.state import Branch, Outcome
 from pace_optim.diagnosis.telling import next_experiment
 from pace_optim.diagnosis.telling.next_experiment import distances, menu, next_experiments, rivals_of
 from pace_optim.diagnosis.verdict.proxy_effects import stand_ins
@@ -78,14 +78,10 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
     assert verdict(two, floor)[0] == "effect"  # beside another that is inside its bounds
 
 
-def test_a_search_ends_where_no_effect_gains_anything(bench, monkeypatch):
-    model = JointModel.base(bench.problem)
-    base = fit_side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
-    same = torch.ones(1, dtype=torch.float64)
-    begun = {None: SimpleNamespace(score=same), STRIBECK: SimpleNamespace(score=2 * same)}
-    monkeypatch.setattr(one_round, "_begun", lambda *_: begun)
-    monkeypatch.setattr(one_round, "_promising", lambda *_: {STRIBECK: 0 * same})
-    outcome = search.add_effects(bench.twins, base, [STRIBECK], 5 * same, 1e-9 * same, 2)
+def test_a_search_ends_where_no_effect_gains_anything(bench):
+    base = with_effects(JointModel.base(bench.problem), bench.truth_values)
+    search = make_search(lambda _: errors_of(1e-2), effects=[STRIBECK], try_effects=lambda *_, **__: None)
+    outcome = add_effects(search, bench.twins, base)
     assert outcome.rounds == [] and outcome.final is base
 
 
@@ -135,28 +131,14 @@ def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monk
 
 
 def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
-    fitted = fit_side_by_side(bench.twins, [Fitted.start(JointModel.base(bench.problem), bench.truth_values)], 2, True)[
-        0
-    ]
+    start, coarse = Fitted.start(JointModel.base(bench.problem), bench.truth_values), bench.twins.with_physics_dt(DT)
+    fitted, effort = Fits().side_by_side(bench.twins, [start], 2, True)[0], torch.tensor([5.0], dtype=torch.float64)
     effects = [get_effect(name) for name in ("stribeck_friction", "measurement_delay", "com_offset")]
-    found = absorbed_effects(bench.twins.with_physics_dt(DT), fitted, effects, torch.tensor([5.0], dtype=torch.float64))
+    found = absorbed_effects(Fits(), coarse, fitted, effects, effort)
     assert [effect.name for effect in found] == ["measurement_delay", "com_offset"]
     fitted.jacobian.normal_()  # as rough as a narrow step sees joints that stick
-    rough = absorbed_effects(bench.twins.with_physics_dt(DT), fitted, effects, torch.tensor([5.0], dtype=torch.float64))
+    rough = absorbed_effects(Fits(), coarse, fitted, effects, effort)
     assert [effect.name for effect in rough] == ["measurement_delay", "com_offset"]
-
-
-@pytest.fixture
-def no_fits(monkeypatch):
-    """Models stay where they start; returns how to say which errors they have, by the effect that is tried."""
-    for module in (swapping, one_for_several):
-        monkeypatch.setattr(module, "fit_side_by_side", lambda _, starts, *args, **kwargs: starts)
-    monkeypatch.setattr(some_joints, "fit_coarse_to_fine", lambda _, starts, *args, **kwargs: starts)
-
-    def say(errors_of):
-        monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [errors_of[m.tried] for m in models])
-
-    return say
 
 
 def two_joints(bench):
@@ -167,7 +149,7 @@ def two_joints(bench):
 
 @pytest.mark.parametrize("stood_out", [True, False])  # beside neighbours that moved wrongly
 @pytest.mark.parametrize(("rmse", "agree"), [(1.05e-4, True), (1.3e-4, False)])
-def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, no_fits, rmse, agree, stood_out):
+def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, rmse, agree, stood_out):
     base, values = two_joints(bench), bench.truth_values.repeat(2, 1)
     now = with_effects(base, values, (GAIN, [True, False], [0.8]), (STRIBECK, [False, True], [1.0, 0.1]))
     models = {
@@ -179,11 +161,13 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
         [make_trial(STRIBECK, 1, 1e-4), make_trial(GAIN, 1, 2e-4, stood_out)],
     ]
     this = Round(trials=trials, chosen=[GAIN, STRIBECK], rivals=[[], []], models=models)
-    no_fits({STRIBECK: errors_of(2e-4, 1e-4), GAIN: errors_of(1e-4, rmse)})
-    result = swapping.swapped(bench.twins, now, errors_of(1e-4, 1e-4), [this], torch.full((2,), 1e-4))
+    errors = {STRIBECK: errors_of(2e-4, 1e-4), GAIN: errors_of(1e-4, rmse), None: errors_of(1e-4, 1e-4)}
+    branch = Branch(problem=bench.twins, now=now, errors=errors[None], rounds=(this,))
+    end = replace_effects(make_search(lambda of: errors[of.tried], floor=(1e-4, 1e-4)), branch)
     if not agree:
-        assert result is None and this.chosen == [GAIN, STRIBECK]
+        assert end is branch
         return
+    result, (this,) = end.now, end.rounds
     assert labels(result.model, ["hip", "knee"]) == ["torque_gain"]
     gains = result.model.to_physical(result.x)[:, result.model.columns(GAIN)]
     assert gains[:, 0].tolist() == pytest.approx([0.8, 0.79])
@@ -198,23 +182,26 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
         ((3e-4, 3e-4), None),
     ],
 )
-def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, no_fits, alone, agree):
+def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, alone, agree):
     base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
     now = with_effects(base, values, (STRIBECK, both, [1.0, 0.1]), (QUADRATIC, both, [0.2]))
     models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [0.9]))}
     trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4, significant=False)] for j in range(2)]
     this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []], models=models)
     later = Round(trials=[[], []], chosen=[QUADRATIC, QUADRATIC], rivals=[[STRIBECK], []])
-    no_fits({GAIN: errors_of(*alone, roll=1)})
-    final = one_for_several.one_for_several(bench.twins, now, errors_of(1e-4, 1e-4), [this, later], tried=30)
+    errors = {GAIN: errors_of(*alone, roll=1), None: errors_of(1e-4, 1e-4)}
+    branch = Branch(problem=bench.twins, now=now, errors=errors[None], rounds=(this, later))
+    search = make_search(lambda of: errors[of.tried], floor=(1e-4, 1e-4), effects=(None,) * 15, off=("replace",))
+    end = merge_effects(search, branch)
     if agree is None:
-        assert final is None and this.chosen == [STRIBECK, STRIBECK] and later.chosen == [QUADRATIC, QUADRATIC]
+        assert end is branch
         return
+    final, (this, later) = end.now, end.rounds
     assert labels(final.model, ["hip", "knee"]) == agree and this.chosen[0] is GAIN
     physical = final.model.to_physical(final.x)[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
     assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([0.9])
-    assert later.chosen[0] is None and later.rivals[0] == []
+    assert later.chosen[0] is None and list(later.rivals[0]) == []
 
 
 def test_an_effect_of_the_whole_robot_is_not_replaced_on_one_joint(bench):
@@ -222,10 +209,10 @@ def test_an_effect_of_the_whole_robot_is_not_replaced_on_one_joint(bench):
     now = with_effects(base, values, (CLOCK, both, [1e-3]), (STRIBECK, both, [1.0, 0.1]))
     trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4)] for j in range(2)]
     this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []])
-    assert one_for_several._options(now, [this]) == {}
+    assert _options(now, [this], DEFAULT.judging) == {}
     now = with_effects(base, values, (GAIN, both, [1.1]), (STRIBECK, both, [1.0, 0.1]))
-    this.trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(CLOCK, j, 6e-4)] for j in range(2)]
-    assert one_for_several._options(now, [this]) == {}
+    this = replace(this, trials=[[make_trial(STRIBECK, j, 5e-4), make_trial(CLOCK, j, 6e-4)] for j in range(2)])
+    assert _options(now, [this], DEFAULT.judging) == {}
 
 
 def test_where_an_encoder_sits_is_held_in_exchanges(bench):
@@ -234,15 +221,15 @@ def test_where_an_encoder_sits_is_held_in_exchanges(bench):
     for side in (0.0, 1.0):
         elasticity = with_effects(base, bench.truth_values, (ELASTICITY, [True], [300.0, 1.0, side]))
         physical = elasticity.model.to_physical(elasticity.x)
-        model, physical = swapping.exchanged(base, bench.truth_values, here, [], elasticity, ELASTICITY, len(BASE))
+        model, physical = exchanged(base, bench.truth_values, here, [], elasticity, ELASTICITY, len(BASE))
         column = model.columns(ELASTICITY).stop - 1
         assert not bool(model.free[0, column]) and float(physical[0, column]) == side
         sides.append((model, elasticity))
-    model, physical = swapping.exchanged(sides[0][0], physical, here, [ELASTICITY], sides[1][1], ELASTICITY, len(BASE))
+    model, physical = exchanged(sides[0][0], physical, here, [ELASTICITY], sides[1][1], ELASTICITY, len(BASE))
     assert float(model.to_physical(model.to_normalised(physical))[0, column]) == 1.0  # and not where it was held before
 
 
-def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench, no_fits):
+def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench):
     base, values = JointModel.base(bench.problem), bench.truth_values
     now = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]))
     alone = with_effects(base, 1.1 * values, (GAIN, [True], [0.9]))
@@ -253,33 +240,36 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench,
         models={GAIN: alone},
     )
     second = Round(trials=[[make_trial(QUADRATIC, 0, 3e-4)]], chosen=[QUADRATIC], rivals=[[]])
-    floor = torch.tensor([1e-4])
-    no_fits({GAIN: errors_of(2.8e-4)})  # as good is not better: the older effect stays
-    assert swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor) is None
-    no_fits({GAIN: errors_of(1e-4)})
-    # at the floor nothing is left to gain
-    assert swapping.swapped(bench.twins, now, errors_of(1.2e-4), [first, second], floor) is None
-    result = swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor)
-    assert labels(result.model, ["servo"]) == ["quadratic_friction", "torque_gain"]
-    physical = result.model.to_physical(result.x)[0]
+
+    def replaced(with_gain, rmse=3e-4, rounds=(first, second), now=now):
+        errors = {GAIN: errors_of(with_gain), None: errors_of(rmse)}
+        branch = Branch(problem=bench.twins, now=now, errors=errors[None], rounds=tuple(rounds))
+        end = replace_effects(make_search(lambda of: errors[of.tried]), branch)
+        return None if end is branch else end
+
+    assert replaced(2.8e-4) is None  # as good is not better: the older effect stays
+    assert replaced(1e-4, rmse=1.2e-4) is None  # at the floor nothing is left to gain
+    end = replaced(1e-4)
+    assert labels(end.now.model, ["servo"]) == ["quadratic_friction", "torque_gain"]
+    physical = end.now.physical[0]
     assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
-    assert physical[result.model.columns(QUADRATIC)].tolist() == pytest.approx([0.2])
-    assert physical[result.model.columns(GAIN)].tolist() == pytest.approx([0.9])
-    assert first.chosen == [GAIN] and first.rivals == [[]] and second.chosen == [QUADRATIC]
+    assert physical[end.now.model.columns(QUADRATIC)].tolist() == pytest.approx([0.2])
+    assert physical[end.now.model.columns(GAIN)].tolist() == pytest.approx([0.9])
+    (one, two), unchanged = end.rounds, first
+    assert one.chosen == [GAIN] and one.rivals == [[]] and two.chosen == [QUADRATIC]
+    assert unchanged.chosen == [STRIBECK]
     # what did not stand out, and no joint has, is not tried
-    first.chosen, first.trials[0][1].significant = [STRIBECK], False
-    assert swapping.swapped(bench.twins, now, errors_of(3e-4), [first, second], floor) is None
-    first.trials[0][1].significant = True
+    weak = [[first.trials[0][0], replace(first.trials[0][1], significant=False)]]
+    assert replaced(1e-4, rounds=(replace(first, trials=weak), second)) is None
     # a lone effect was the best of its round: nothing is tried in its place
     lone = with_effects(base, values, (STRIBECK, [True], [1.0, 0.1]))
-    assert swapping.swapped(bench.twins, lone, errors_of(3e-4), [first], floor) is None
+    assert replaced(1e-4, rounds=(first,), now=lone) is None
 
 
 @pytest.mark.parametrize(("elastic", "chosen"), [(1.01, ELASTICITY), (1.04, BACKLASH), (0.99, ELASTICITY)])
 def test_of_two_effects_that_are_as_good_the_one_with_fewer_numbers_is_taken(elastic, chosen):
-    (taken,), ((other,),) = one_round._choose(
-        [[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]], [{}]
-    )
+    choice = choose([[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]], [{}])
+    (taken,), ((other,),) = choice.chosen, choice.rivals
     assert {taken, other} == {BACKLASH, ELASTICITY} and taken is chosen
 
 

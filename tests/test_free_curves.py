@@ -15,12 +15,12 @@ from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose,
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import summary_of
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.verdict import verdict
@@ -75,8 +75,8 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def fitted(run):
     """Its base model, and what that leaves."""
-    twins, base, _ = fit_base(run.problem, run.problem.space.to_physical(run.problem.space.start))
-    return twins, base, validation_errors(twins, [base])[0]
+    twins, base, _ = fit_base(Fits(), run.problem, run.problem.space.to_physical(run.problem.space.start))
+    return twins, base, Fits().validation_errors(twins, [base])[0]
 
 
 def ended(fitted, part, effect="quadratic_friction"):
@@ -98,7 +98,7 @@ def ended(fitted, part, effect="quadratic_friction"):
 
 @pytest.fixture(scope="module")
 def curves(fitted):
-    return fit_curves(ended(fitted, 1.0), FLOOR)
+    return fit_curves(Fits(), ended(fitted, 1.0), FLOOR)
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
@@ -118,14 +118,13 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     outcome = ended(fitted, 1.0 if times is None else times * left)
     before = outcome.final
     if times is not None:  # as evenly as the curve
-        outcome.final_errors = replace(
-            curves.errors[curves.best(0)], square=times * curves.errors[curves.best(0)].square
-        )
+        best = curves.errors[curves.best(0)]
+        outcome = replace(outcome, final_errors=replace(best, square=times * best.square))
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
     monkeypatch.setattr("pace_optim.diagnosis.verdict.free_curves.SomeJoints.refitted", lambda *_: fits)
-    found = fit_curves(outcome, FLOOR)
+    found = fit_curves(Fits(), outcome, FLOOR)
     assert found.instead.tolist() == [instead]
-    take_curves(outcome, found)
+    outcome = take_curves(outcome, found)
     if not instead:
         assert labels(outcome.final.model, ["servo"]) == ["quadratic_friction"]
         assert verdict(outcome, FLOOR)[0] == "effect"
@@ -137,18 +136,18 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     at_floor = replace(outcome, final_errors=replace(outcome.final_errors, square=0.0 * outcome.final_errors.square))
     assert verdict(at_floor, FLOOR)[0] == "unknown"
     # what it says of its errors is what its model leaves
-    assert validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
+    assert Fits().validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
         outcome.final_errors.mse.tolist(), rel=1e-3
     )
 
 
 def test_no_curve_is_fitted_near_the_floor(fitted):
     near = (fitted[2].mse.sqrt() / 2.5).double()
-    assert fit_curves(ended(fitted, 1.0), near) is None
+    assert fit_curves(Fits(), ended(fitted, 1.0), near) is None
 
 
 def test_a_joint_keeps_what_the_whole_robot_shares(fitted):
-    assert fit_curves(ended(fitted, 0.9, "clock_skew"), FLOOR) is None
+    assert fit_curves(Fits(), ended(fitted, 0.9, "clock_skew"), FLOOR) is None
 
 
 def errors_of(*rmse):
@@ -191,11 +190,11 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
         ("absorbed_effects", {}),
         ("add_effects", outcome),
-        ("share", None),
+        ("pool", outcome),
         ("fit_curves", curves),
-        ("shares", {spring: 0.8, curve: 0.2}),
+        ("contributions", {spring: 0.8, curve: 0.2}),
     ):
-        monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result: result)
+        monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result, **__: result)
     robot = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=0.0025)
     found = search_effects(robot, None, [spring], 3)
     assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]
@@ -207,7 +206,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         "friction_over_speed@b. With all of it"
     )
     monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
-    advice = advise(robot, outcome, found.verdict, found.data, [])
+    advice = advise(robot, found.outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
     told = error_map(curves, robot.joint_names, curves.base_errors)
     assert list(told) == ["b", "c"]

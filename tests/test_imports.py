@@ -33,6 +33,7 @@ FLOORS = {
         ["commands"],
     ),
     "pace_optim/diagnosis": (
+        ["diagnosis_cfg"],
         ["model", "settings"],
         ["fitting"],
         ["candidates"],

@@ -13,6 +13,7 @@ from pace_envs import set_physics_dt
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints, later_than_most
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.model import BASE
 
 LATE_LOG = get_effect("measurement_delay")
@@ -43,7 +44,7 @@ def fitted(legs, change=lambda recording: recording):
     train, validation = legs
     problem = make_problem(change(train), cfg=env_cfg(ANYMAL), validation=[change(validation)])
     problem = problem.with_physics_dt(DT / 2)
-    return problem, *fit_base(problem, physical(problem, TRUTH))
+    return problem, *fit_base(Fits(), problem, physical(problem, TRUTH))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_a_joint_is_late_beside_a_delay_that_most_joints_have(delay, late):
 
 def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     problem, twins, base, effort = fitted(legs, logged_late)
-    held, (sentence,) = hold_late_joints(twins, base)
+    held, (sentence,) = hold_late_joints(Fits(), twins, base)
     late = torch.tensor([name in LATE for name in problem.joint_names])
     delay = held.model.to_physical(held.x)[:, BASE.index("delay")]
     assert delay.tolist() == pytest.approx([TRUTH["delay"]] * len(late), abs=0.1)
@@ -80,19 +81,19 @@ def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     assert [float(ms) for ms in said.groups()] == pytest.approx([5.0, 5.0, 5.0], abs=0.5)
     assert bool((held.score[late] > 20 * base.score[late]).all())
     assert torch.allclose(held.score[~late], base.score[~late], rtol=1e-3)
-    absorbed = absorbed_effects(twins, held, [LATE_LOG], effort)
+    absorbed = absorbed_effects(Fits(), twins, held, [LATE_LOG], effort)
     assert torch.equal(absorbed[LATE_LOG], ~late)
 
 
 def test_where_no_joint_is_late_the_base_model_stays_as_it_is(punctual):
     twins, base = punctual
-    assert hold_late_joints(twins, base) == (base, [])
+    assert hold_late_joints(Fits(), twins, base) == (base, [])
 
 
 def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypatch):
     """That of a joint that hardly moves may be anything."""
     twins, base = punctual
     monkeypatch.setattr(
-        "pace_optim.diagnosis.beginning.shared_delay.later_than_most", lambda delay: torch.arange(len(delay)) == 4
+        "pace_optim.diagnosis.beginning.shared_delay.later_than_most", lambda delay, cfg: torch.arange(len(delay)) == 4
     )
-    assert hold_late_joints(twins, base) == (base, [])
+    assert hold_late_joints(Fits(), twins, base) == (base, [])

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace_optim.diagnosis.fitting import reference_update as own_motion
-from pace_optim.diagnosis.fitting.reference_update import OwnMotion
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 
 FLOOR = 0.5
 
@@ -17,14 +17,10 @@ class Robot:
     Joints with neighbours have no distance that would do.
     """
 
-    def __init__(self, monkeypatch, positions, scores, away=None):
+    def __init__(self, positions, scores, away=None):
         self.positions, self.scores, self.fits = iter(positions), iter(scores), 0
         self.problem = SimpleNamespace(joints_stand_alone=away is not None)
-        distances = iter(away or ())
-        monkeypatch.setattr(OwnMotion, "_away", lambda *_: next(distances))
-        monkeypatch.setattr(OwnMotion, "_path", lambda *_: self.path(next(self.positions)))
-        monkeypatch.setattr(own_motion, "twin_problem", lambda _, path: self.twins(path))
-        monkeypatch.setattr(own_motion, "fit_side_by_side", self.fit)
+        self.distances = iter(away or ())
 
     @staticmethod
     def path(position):
@@ -34,27 +30,43 @@ class Robot:
     def twins(path):
         return SimpleNamespace(path=path, in_windows=lambda: "windows")
 
-    def fit(self, problem, starts, max_iteration):
+    def side_by_side(self, problem, starts, max_iteration):
         assert problem == "windows"
         self.fits += 1
         return [SimpleNamespace(score=torch.tensor(next(self.scores)))]
 
     def follow(self, position, n=1):
         """Whether it is the same reference and the same model, and where the reference is."""
-        motion = OwnMotion(problem=self.problem, candidates=(), enough=torch.full((n,), FLOOR))
+        robot = self
+
+        class Made(ReferenceUpdate):
+            def away(self, twins, now):
+                return next(robot.distances)
+
+            def path(self, now):
+                return robot.path(next(robot.positions))
+
+            def along(self, path):
+                return robot.twins(path)
+
+        class Fake(Fits):
+            def side_by_side(self, *args):
+                return robot.side_by_side(*args)
+
+        motion = Made(fits=Fake(), problem=self.problem, candidates=(), enough=torch.full((n,), FLOOR))
         twins, now = self.twins(self.path(position)), SimpleNamespace(score=torch.full((n,), 40.0))
         along, fitted = motion.follow(twins, now)
         return along is twins, fitted is now, float(along.path.position)
 
 
-def test_a_joint_alone_that_hardly_moves_otherwise_stays_on_its_reference(monkeypatch):
-    robot = Robot(monkeypatch, positions=[], scores=[], away=[0.009])
+def test_a_joint_alone_that_hardly_moves_otherwise_stays_on_its_reference():
+    robot = Robot(positions=[], scores=[], away=[0.009])
     assert robot.follow(0.0) == (True, True, 0.0)
     assert robot.fits == 0
 
 
-def test_a_joint_alone_is_fitted_again_until_its_motion_stays(monkeypatch):
-    robot = Robot(monkeypatch, positions=[0.5, 0.45], scores=[[20.0], [10.0]], away=[0.3, 0.011, 0.005])
+def test_a_joint_alone_is_fitted_again_until_its_motion_stays():
+    robot = Robot(positions=[0.5, 0.45], scores=[[20.0], [10.0]], away=[0.3, 0.011, 0.005])
     assert robot.follow(0.0) == (False, False, pytest.approx(0.45))
     assert robot.fits == 2
 
@@ -68,7 +80,7 @@ def test_a_joint_alone_is_fitted_again_until_its_motion_stays(monkeypatch):
         ([[0.2, 0.2]], 1),  # near the floor at once
     ],
 )
-def test_joints_follow_their_neighbours_as_long_as_that_pays(monkeypatch, scores, fits):
-    robot = Robot(monkeypatch, positions=[0.0] * 4, scores=scores)
+def test_joints_follow_their_neighbours_as_long_as_that_pays(scores, fits):
+    robot = Robot(positions=[0.0] * 4, scores=scores)
     assert robot.follow(0.0, n=2)[:2] == (False, False)
     assert robot.fits == fits

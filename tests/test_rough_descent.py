@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace_optim.diagnosis.fitting import coarse_to_fine as descent
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
 
@@ -43,10 +42,9 @@ class Landscape:
 
 
 @pytest.fixture
-def fitted(monkeypatch):
+def fitted():
     def fit(roughness, rough, bend=0.0):
         landscape = Landscape(roughness, bend)
-        monkeypatch.setattr(descent, "SideBySide", landscape)
         bounds = torch.ones(1, len(BASE)).double()
         model = JointModel(
             effects=(),
@@ -57,7 +55,7 @@ def fitted(monkeypatch):
             slides=torch.zeros(1, dtype=torch.bool),
         )
         start = Fitted.start(model, 0 * bounds)
-        result = fit_side_by_side(None, [start], 25, rough=rough)[0]
+        result = Fits(batch=landscape).side_by_side(None, [start], 25, rough=rough)[0]
         return result.x[0] - TRUTH, landscape
 
     return fit

@@ -4,15 +4,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import errors_of, joint_alone, with_effects
+from diagnoses import FakeFits, errors_of, joint_alone, with_effects
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.diagnose import Findings, summary_of
-from pace_optim.diagnosis.judging import some_joints
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import JointModel
-from pace_optim.diagnosis.verdict.contributions import shares
+from pace_optim.diagnosis.telling.findings import Findings, summary_of
+from pace_optim.diagnosis.verdict.contributions import contributions
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 
@@ -44,24 +45,25 @@ def findings(outcome, each):
         ((0.5e-4, 2e-4), (1.0, 0.0), "Missing: quadratic_friction (100 %), stribeck_friction (0 %). With"),
     ],
 )
-def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, monkeypatch, without, expected, said):
+def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, without, expected, said):
     base, values = JointModel.base(bench.problem), bench.truth_values
     final = with_effects(base, values, (QUADRATIC, [True], [0.2]), (STRIBECK, [True], [1.0, 0.1]))
     after = {STRIBECK: errors_of(without[0]), QUADRATIC: errors_of(without[1])}
-    monkeypatch.setattr(some_joints, "fit_coarse_to_fine", lambda _, starts: starts)
-    monkeypatch.setattr(some_joints, "validation_errors", lambda _, models: [after[m.tried] for m in models])
     outcome = SimpleNamespace(
         problem=bench.twins,
         final=final,
         final_errors=errors_of(1e-4),
         base_errors=errors_of(1e-3),
         unevenness=torch.zeros(2, 1),
+        cfg=DEFAULT,
     )
-    each = shares(outcome)
+    each = contributions(FakeFits(lambda now: after[now.tried]), outcome)
     assert list(each.values()) == pytest.approx(expected, abs=1e-3)
     found = findings(outcome, each)
     assert summary_of(found, bench.problem).startswith(said)
-    assert shares(SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {GAIN: 1.0}
+    assert contributions(Fits(), SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {
+        GAIN: 1.0
+    }
 
 
 def test_no_name_is_claimed_where_none_dominates(bench):
@@ -72,6 +74,7 @@ def test_no_name_is_claimed_where_none_dominates(bench):
         final_errors=errors_of(1e-4),
         base_errors=errors_of(1e-3),
         unevenness=torch.zeros(3, 1),
+        cfg=DEFAULT,
     )
     found = findings(outcome, {QUADRATIC: 0.4, GAIN: 0.35, STRIBECK: 0.25})
     assert summary_of(found, bench.problem).startswith(

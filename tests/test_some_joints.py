@@ -14,9 +14,9 @@ from pace_envs.simulation import SimulationCfg
 from pace_optim.diagnosis.beginning.base_fit import joint_vectors
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.diagnosis.search.one_round import _choose
 from pace_optim.recording import Load
 from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.simulation import TwinSimulation
@@ -163,4 +163,4 @@ def test_what_moves_the_whole_robot_is_judged_by_all_its_joints(mount, chosen):
         [make_trial(MOUNT, j, 1e-4 * of_mount), make_trial(ELASTICITY, j, 1e-4 * own)]
         for j, (of_mount, own) in enumerate(rmse)
     ]
-    assert _choose(trials, [{}, {}, {}])[0] == [chosen, chosen, chosen]
+    assert choose(trials, [{}, {}, {}]).chosen == [chosen, chosen, chosen]

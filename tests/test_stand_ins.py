@@ -14,11 +14,11 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import Findings, summary_of
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
+from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import stand_ins, varying
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
@@ -39,11 +39,10 @@ def fitted_to(problem, *sizes, noise=0.3):
     for effect, own in ((SPRING, [2.0, 0.1]), (QUADRATIC, [0.1])):
         model, values = model.extended(values, effect, YES, torch.tensor([own], dtype=torch.float64))
     now, generator = Fitted.start(model, values), torch.Generator().manual_seed(0)
-    now.jacobian = torch.randn(model.size, 500, len(sizes), 1, generator=generator)
-    spring = now.jacobian[model.columns(SPRING).start]
-    now.error = spring * (torch.tensor(sizes) - sum(sizes) / len(sizes))[:, None]
-    now.error += noise * torch.randn(500, len(sizes), 1, generator=generator)
-    return now
+    jacobian = torch.randn(model.size, 500, len(sizes), 1, generator=generator)
+    error = jacobian[model.columns(SPRING).start] * (torch.tensor(sizes) - sum(sizes) / len(sizes))[:, None]
+    error += noise * torch.randn(500, len(sizes), 1, generator=generator)
+    return replace(now, jacobian=jacobian, error=error)
 
 
 def ended(problem, rmse, friction=False, noise=0.67):
@@ -79,10 +78,10 @@ def test_parameters_at_a_bound_do_not_count(run):
     even = fitted_to(run.problem, 1.0, 1.0, 1.0, 1.0)
     armature = BASE.index("armature")
     even.x[0, armature] = -1.0
-    even.error += 0.5 * even.jacobian[armature]
+    even.error.add_(0.5 * even.jacobian[armature])
     assert float(unevenness(even).max()) < 0.05
     even.x[0, even.model.columns(SPRING).start] = 1.0
-    even.error = fitted_to(run.problem, 1.0, 1.1, 0.9, 2.0).error
+    even = replace(even, error=fitted_to(run.problem, 1.0, 1.1, 0.9, 2.0).error)
     assert float(unevenness(even).max()) < 0.05  # that it is at its bound says enough
 
 
@@ -130,20 +129,20 @@ def four_joints(problem):
 
 def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
     outcome, floor = four_joints(run.problem), FLOOR.expand(4)
-    module = sys.modules[Findings.__module__]
+    module = sys.modules[search_effects.__module__]
     twins = SimpleNamespace(with_physics_dt=lambda _: None, coarsest_dt=0.0025, control_dt=0.0025)
     for name, made in (
         ("fit_base", (twins, outcome.base, FLOOR)),
         ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
         ("absorbed_effects", {}),
         ("add_effects", outcome),
-        ("share", None),
+        ("pool", outcome),
     ):
-        monkeypatch.setattr(module, name, lambda *_, made=made: made)
+        monkeypatch.setattr(module, name, lambda *_, made=made, **__: made)
     joints = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=DT)
     found = search_effects(joints, None, [SPRING], 3)
     assert (found.verdict, found.paying, found.added) == ("nothing_missing", [], [])
-    assert outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())
+    assert found.outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())
 
 
 @pytest.mark.parametrize("stopped", ["converged", "interrupted"])
@@ -171,9 +170,9 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch, stopped)
         return SimpleNamespace(stop_reasons=[stopped]), refit
 
     (run.folder.parent / "refit").mkdir(exist_ok=True)
-    module = sys.modules[Findings.__module__]
+    module = sys.modules[search_effects.__module__]
     for name, made in (("search_effects", found), ("advise", []), ("error_map", {}), ("sizes", [])):
-        monkeypatch.setattr(module, name, lambda *_, made=made: made)
+        monkeypatch.setattr(module, name, lambda *_, made=made, **__: made)
     monkeypatch.setattr(module, "fit", fit)
     line = SimpleNamespace(say=said.append, restart=lambda: None, close=lambda: None)
     assert diagnose(DiagnosisSettings(run=run.folder), line).runs == [str(run.folder)] and not refits

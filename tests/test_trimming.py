@@ -8,9 +8,7 @@ import torch
 from diagnoses import joint_alone
 from problems import DT
 
-from pace_optim.diagnosis.fitting import trimmed_fit as trimming
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_over_wide_steps
-from pace_optim.diagnosis.fitting.trimmed_fit import fit_trimmed
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.recording import windows
@@ -47,8 +45,8 @@ def off(bench, fitted):
 
 
 def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
-    with_all = fit_over_wide_steps(bench.swinging, away(bench))
-    trimmed = fit_trimmed(bench.swinging, with_all, ALL)
+    with_all = Fits().over_wide_steps(bench.swinging, away(bench))
+    trimmed = Fits().trimmed(bench.swinging, with_all, ALL)
     assert off(bench, with_all) > 0.05
     assert off(bench, trimmed) < 0.02
 
@@ -56,47 +54,49 @@ def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
 def test_windows_that_do_not_count_are_as_if_they_were_not_there(bench):
     kept = torch.ones(10, 1, dtype=torch.bool)
     kept[-1] = False
-    without = fit_over_wide_steps(bench.swinging, away(bench), kept)
+    without = Fits().over_wide_steps(bench.swinging, away(bench), kept)
     train = bench.swinging.dataset.train.clone()
     train[bench.place] = False
-    expected = fit_over_wide_steps(
+    expected = Fits().over_wide_steps(
         replace(bench.swinging, dataset=replace(bench.swinging.dataset, train=train)), away(bench)
     )
     assert torch.allclose(without.x, expected.x, atol=1e-6)
     assert float(without.score) == pytest.approx(float(expected.score), rel=1e-4)
 
 
-def rounds(monkeypatch, *rmse, joints=(True, True)):
+def rounds(*rmse, joints=(True, True)):
     """Which windows were left out in each round, with these errors by window and joint before each."""
     left, out = iter(rmse), []
 
-    def fit(problem, now, kept):
-        out.append([tuple(place) for place in (~kept).nonzero().tolist()])
-        return now
+    class Recorded(Fits):
+        def window_rmse(self, windows, now):
+            return torch.tensor(next(left))
 
-    monkeypatch.setattr(trimming, "_rmse", lambda *_: torch.tensor(next(left)))
-    monkeypatch.setattr(trimming, "fit_over_wide_steps", fit)
+        def over_wide_steps(self, problem, now, kept=None):
+            out.append([tuple(place) for place in (~kept).nonzero().tolist()])
+            return now
+
     problem = SimpleNamespace(in_windows=lambda: None)
-    result = fit_trimmed(problem, SimpleNamespace(score=torch.zeros(2)), torch.tensor(joints))
+    result = Recorded().trimmed(problem, SimpleNamespace(score=torch.zeros(2)), torch.tensor(joints))
     assert (result is None) == (not out)
     return out
 
 
-def test_each_joint_leaves_out_windows_of_its_own(monkeypatch):
+def test_each_joint_leaves_out_windows_of_its_own():
     worse = [[1.0, 1.0], [1.0, 1.0], [3.1, 1.0], [2.9, 9.0], [1.0, 1.0]]
-    assert rounds(monkeypatch, worse, worse) == [[(2, 0), (3, 1)]]
-    assert rounds(monkeypatch, worse, worse, joints=(True, False)) == [[(2, 0)]]
+    assert rounds(worse, worse) == [[(2, 0), (3, 1)]]
+    assert rounds(worse, worse, joints=(True, False)) == [[(2, 0)]]
 
 
-def test_nothing_is_fitted_where_the_model_is_about_as_good_everywhere(monkeypatch):
+def test_nothing_is_fitted_where_the_model_is_about_as_good_everywhere():
     even = [[1.0, 2.0], [2.0, 3.0], [2.9, 5.9]]
-    assert rounds(monkeypatch, even) == []
+    assert rounds(even) == []
 
 
-def test_it_goes_on_as_long_as_the_other_windows_come_down(monkeypatch):
+def test_it_goes_on_as_long_as_the_other_windows_come_down():
     def worst(scale):
         return [[scale, 1.0], [scale, 1.0], [9.0, 1.0]]
 
-    assert len(rounds(monkeypatch, worst(1.0), worst(0.9))) == 1
-    assert len(rounds(monkeypatch, worst(1.0), worst(0.7), worst(0.6))) == 2
-    assert len(rounds(monkeypatch, worst(1.0), worst(0.5), worst(0.25))) == 3  # at most
+    assert len(rounds(worst(1.0), worst(0.9))) == 1
+    assert len(rounds(worst(1.0), worst(0.7), worst(0.65))) == 2
+    assert len(rounds(worst(1.0), worst(0.5), worst(0.25))) == 3  # at most

@@ -11,7 +11,8 @@ from test_report import page_of
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.telling.text import lines_of
@@ -88,9 +89,9 @@ def test_sizes_and_error_bars_are_those_of_least_squares():
     robot = joint_alone()
     model, none = JointModel.base(robot.problem), torch.zeros(1, 1, dtype=torch.float64)
     extended, values = model.extended(robot.truth_values, GAIN, torch.tensor([True]), none + GAIN.parameters[0].null)
-    now = fit_side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
-    outcome = SimpleNamespace(problem=robot.twins, final=now)
-    (size,) = sizes(outcome, ("servo",))
+    now = Fits().side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
+    outcome = SimpleNamespace(problem=robot.twins, final=now, cfg=DEFAULT)
+    (size,) = sizes(Fits(), outcome, ("servo",))
     assert size["effect"] == "torque_gain" and size["joint"] == "servo" and not size["at_bound"]
     assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
 

@@ -8,7 +8,7 @@ from diagnoses import make_trial
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.candidates.evidence import _evidence
-from pace_optim.diagnosis.search import one_round
+from pace_optim.diagnosis.judging.choice import choose, contenders
 
 K, OWN, OTHERS = 200, 2, 6
 OFFSET, SPRING, GAIN = (get_effect(name) for name in ("torque_offset", "parallel_spring", "torque_gain"))
@@ -72,14 +72,12 @@ def test_effects_near_to_each_other_and_far_from_the_floor_are_weighed():
             make_trial(GAIN, 3, 1e-3, False),
         ],
     ]
-    contenders = one_round._contenders(trials, torch.full((4,), 1e-4))
-    assert contenders == [[OFFSET, SPRING], [], [], [OFFSET, SPRING]]
+    found = contenders(trials, torch.full((4,), 1e-4))
+    assert found == [[OFFSET, SPRING], [], [], [OFFSET, SPRING]]
 
 
 @pytest.mark.parametrize(("spring", "chosen", "alike"), [(4.0, SPRING, [OFFSET]), (-4.0, OFFSET, [])])
 def test_of_effects_that_were_weighed_the_one_with_the_most_evidence_is_taken(spring, chosen, alike):
     """What leaves 14 % more than it is no rival."""
-    (taken,), (rivals,) = one_round._choose(
-        [[make_trial(OFFSET, 0, 1.0e-3), make_trial(SPRING, 0, 1.14e-3)]], [{OFFSET: 0.0, SPRING: spring}]
-    )
-    assert taken is chosen and rivals == alike
+    choice = choose([[make_trial(OFFSET, 0, 1.0e-3), make_trial(SPRING, 0, 1.14e-3)]], [{OFFSET: 0.0, SPRING: spring}])
+    assert choice.chosen == [chosen] and choice.rivals == [alike]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -13,24 +14,30 @@ import torch
 from pace_actuators.effects import Effect, available_effects, get_effect
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.beginning.base_fit import fit_base
-from pace_optim.diagnosis.beginning.data_check import FLOOR_MARGIN, DataCheck, check_data
+from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.denormals import flushed_denormals
-from pace_optim.diagnosis.fitting.reference_update import OwnMotion
-from pace_optim.diagnosis.judging.acceptance import check_long_enough
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
+from pace_optim.diagnosis.fitting.validation import check_long_enough
+from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
+from pace_optim.diagnosis.judging.decisions import Decision, Log, as_lines, unlogged
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
-from pace_optim.diagnosis.search.pooling import share
-from pace_optim.diagnosis.search.search import Outcome, add_effects
+from pace_optim.diagnosis.search.pooling import pool
+from pace_optim.diagnosis.search.search import add_effects
+from pace_optim.diagnosis.search.state import Search
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.telling.advice import advise
+from pace_optim.diagnosis.telling.findings import Findings, by_joint, ladder, summary_of
 from pace_optim.diagnosis.telling.result import FILE, Diagnosis
-from pace_optim.diagnosis.verdict.contributions import DOMINANT, shares
-from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
-from pace_optim.diagnosis.verdict.proxy_effects import UNKNOWN_RATIO, curves_in, stand_ins, varying
+from pace_optim.diagnosis.verdict.contributions import contributions
+from pace_optim.diagnosis.verdict.free_curves import error_map, fit_curves, take_curves
+from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.diagnosis.verdict.sizes import sizes
-from pace_optim.diagnosis.verdict.verdict import explained_joints, keep_on, likes, ranking, verdict
+from pace_optim.diagnosis.verdict.verdict import explained_joints, likes, ranking, restrict_to, verdict
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem
 from pace_optim.report import check_folder, report_text
@@ -38,37 +45,6 @@ from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
-
-
-@dataclass(kw_only=True, eq=False)
-class Findings:
-    """What the search on the twins found."""
-
-    outcome: Outcome
-    data: DataCheck
-    absorbed: dict[type[Effect], torch.Tensor]
-    """Effects that a base parameter takes up, and on which joints (n,): these recordings would not show them there."""
-    verdict: str
-    explained: float
-    """Part of the error above the floor that the effects found explain."""
-    paying: list[str]
-    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
-    ``unknown`` all that lower the error, though they are not what is missing."""
-    shares: dict[type[Effect], float]
-    """How much of what they explain is due to each, in the same order."""
-    curves: Curves | None = None
-    """Which variable carries what is missing; ``None`` where the effects found leave little."""
-
-    @property
-    def free_form(self) -> list[str]:
-        """Those of them that are curves, where an effect is not known."""
-        names = {e.name for e in self.shares if e.free_form}
-        return [label for label in self.paying if label.partition("@")[0] in names]
-
-    @property
-    def added(self) -> list[str]:
-        """Those that are what is missing."""
-        return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
 
 
 def diagnose(
@@ -97,14 +73,17 @@ def diagnose(
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
     problem = run.problem(physics_dt=physics_dt, effects=())
     base = {name: result.parameters[name] for name in problem.space.slices}
+    decisions: list[Decision] = []
     found = search_effects(
-        problem, problem.space.from_dict(base), candidates, settings.max_effects, progress.say, result
+        problem,
+        problem.space.from_dict(base),
+        candidates,
+        settings.max_effects,
+        progress.say,
+        result,
+        cfg=settings.cfg,
+        log=decisions.append,
     )
-    if result.effects:
-        found.data.sentences.append(
-            f"The run has {', '.join(result.effects)}: the search started from the base model, and looked for it again."
-        )
-    found.data.sentences += _other_error(found, problem, result)
     diagnosis = Diagnosis(
         run=str(folder),
         verdict=found.verdict,
@@ -115,43 +94,50 @@ def diagnose(
         shares={effect.name: share for effect, share in found.shares.items()},
         free_form=found.free_form,
         ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
-        sizes=sizes(found.outcome, problem.joint_names),
+        sizes=sizes(Fits(cfg=settings.cfg), found.outcome, problem.joint_names),
         likes=likes(found.outcome),
-        joints=_joints(found, problem),
-        data=found.data.sentences,
+        joints=by_joint(found, problem),
+        data=[*found.data.sentences, *_about_run(found, problem, result)],
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
         advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         runs=[str(folder)],
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
-        ladder=_ladder(found),
-        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors),
+        ladder=ladder(found),
+        error_map=error_map(
+            found.curves, problem.joint_names, found.outcome.base_errors, settings.cfg.verdict.worth_a_word
+        ),
+        cfg=json.loads(json_text(asdict(settings.cfg))),
         wall_time_s=time.monotonic() - begin,
     )
-    _save(diagnosis)
+    _save(diagnosis, decisions)
     progress.close()
     on_verdict(diagnosis)
     explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
     if refit and found.paying and (path := _refit(found, problem, run, diagnosis, progress)) is not None:
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
-        _save(diagnosis)
+        _save(diagnosis, decisions)
     return diagnosis
 
 
-def _save(diagnosis: Diagnosis) -> None:
-    """Write the diagnosis and the report of each of its runs, all or nothing."""
-    files: dict[Path, bytes] = {}
+def _save(diagnosis: Diagnosis, decisions: Sequence[Decision]) -> None:
+    """Write the diagnosis, its decisions, and the report of each of its runs, all or nothing."""
+    files: dict[Path, bytes] = {Path(diagnosis.run) / DECISIONS: as_lines(decisions)}
     for run in map(Path, diagnosis.runs):
         files[run / FILE] = json_text(asdict(diagnosis))
         files[run / "report.html"] = report_text(run, {FILE: asdict(diagnosis)})
     write_together(files)
 
 
-def _other_error(found: Findings, problem: Problem, run: FitResult) -> list[str]:
-    """Why the run tells another error of the same model, where it does."""
+def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
+    """What the run has, and why it tells another error of the same model, where it does."""
+    if run.effects:
+        return [
+            f"The run has {', '.join(run.effects)}: the search started from the base model, and looked for it again."
+        ]
     own, here = run.rmse["validation"].get("all"), float(found.outcome.base_errors.mse.mean().sqrt())
-    if own is None or run.effects or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
+    if own is None or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
         return []
     ways = []
     if not math.isclose(run.physics_dt, problem.physics_dt):
@@ -222,6 +208,9 @@ def search_effects(
     max_effects: int,
     say: Callable[[str], None] = lambda _: None,
     run: FitResult | None = None,
+    *,
+    cfg: DiagnosisCfg | None = None,
+    log: Log = unlogged,
 ) -> Findings:
     """Look for missing effects, each joint simulated alone.
 
@@ -232,30 +221,40 @@ def search_effects(
         max_effects: Most effects of a joint.
         say: Shows how far it is.
         run: The whole robot's own fit, if there is one.
+        cfg: Its numbers.
+        log: Gets every decision.
 
     Raises:
         ValueError: If the validation recordings are too short to judge by.
     """
-    check_long_enough(problem.dataset.validation, problem.control_dt)
-    twins, base, effort = fit_base(problem, physical, candidates, say)
-    data = check_data(problem, twins, base, run)
-    base, sentences = hold_late_joints(twins, base)
-    data.sentences += sentences
-    absorbed = absorbed_effects(twins.with_physics_dt(twins.coarsest_dt), base, candidates, effort)
-    base.model = replace(base.model, barred=absorbed)
+    cfg = cfg or DiagnosisCfg()
+    fits = Fits(cfg=cfg)
+    check_long_enough(problem.dataset.validation, problem.control_dt, cfg=cfg.judging)
+    twins, base, effort = fit_base(fits, problem, physical, candidates, say)
+    data = check_data(fits, problem, twins, base, run)
+    if cfg.has("late_joints"):
+        base, sentences = hold_late_joints(fits, twins, base)
+        data = replace(data, sentences=[*data.sentences, *sentences])
+    absorbed = absorbed_effects(fits, twins.with_physics_dt(twins.coarsest_dt), base, candidates, effort)
+    base = replace(base, model=replace(base.model, barred=absorbed))
 
-    floor = FLOOR_MARGIN * data.floor
-    follow = OwnMotion(problem=problem, candidates=candidates, enough=floor, say=say).follow
-    outcome = add_effects(twins, base, candidates, effort, floor, max_effects, say, follow)
-    share(outcome)
-    if (curves := fit_curves(outcome, data.floor, say)) is not None:
-        take_curves(outcome, curves)
+    search = Search(
+        effects=candidates, effort=effort, floor=data.floor, max_effects=max_effects, fits=fits, say=say, log=log
+    )
+    reference = ReferenceUpdate(fits=fits, problem=problem, candidates=candidates, enough=search.at_floor, say=say)
+    outcome = add_effects(replace(search, follow=reference.follow), twins, base)
+    if cfg.has("pool"):
+        outcome = pool(fits, outcome, log)
+    curves = fit_curves(fits, outcome, data.floor, say, log) if cfg.has("curves") else None
+    if curves is not None:
+        outcome = take_curves(outcome, curves)
     decision, explained = verdict(outcome, data.floor)
     if decision != "unknown":
         with_curve = curves_in(outcome.final.model).any(dim=0)
-        keep_on(outcome, with_curve | (explained_joints(outcome, data.floor) & (decision == "effect")))
+        known = explained_joints(outcome, data.floor) & (decision == "effect")
+        outcome = restrict_to(outcome, with_curve | known)
         _, explained = verdict(outcome, data.floor)
-    each = shares(outcome)
+    each = contributions(fits, outcome)
     return Findings(
         outcome=outcome,
         data=data,
@@ -266,76 +265,3 @@ def search_effects(
         shares=each,
         curves=curves,
     )
-
-
-def summary_of(found: Findings, problem: Problem) -> str:
-    """The verdict in a sentence or two."""
-    before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
-    after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
-    floor = 1e3 * float(found.data.floor.square().mean().sqrt())
-    about = (found.outcome, problem.joint_names, found.data.floor)
-    if found.verdict == "nothing_missing":
-        return (
-            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} mrad, the "
-            f"floor of noise and numerics {floor:.3g} mrad."
-        )
-    if found.verdict == "unknown":
-        text = (
-            f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
-            f"mrad, the floor {floor:.3g} mrad, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
-            "what lies between."
-        )
-        return " ".join([text, *stand_ins(*about), *varying(*about)])
-    all_of_it = "all of it" if found.free_form else "it"
-    summary = (
-        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} mrad "
-        f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
-    )
-    if after > UNKNOWN_RATIO * floor and not found.free_form:
-        summary += " Something else is missing too, which no known effect explains."
-    return " ".join([summary, *varying(*about)])
-
-
-def _what_pays(found: Findings) -> str:
-    """What lowers the error without being what is missing."""
-    if not found.paying:
-        return "the effects tried explain"
-    if len(found.free_form) == len(found.paying):
-        return f"a curve in its place, {', '.join(found.paying)}, explains"
-    curves = ", with a curve where none is known" if found.free_form else ""
-    return f"what pays{curves}, {', '.join(found.paying)}, explains"
-
-
-def _missing(found: Findings) -> str:
-    """The effects found; where there are several, what is due to each, and whether one of them stands out."""
-    if found.free_form:
-        return (
-            f"Missing: {', '.join(found.added)}. On other joints no known effect explains the error; a curve takes its "
-            f"place: {', '.join(found.free_form)}."
-        )
-    if len(found.added) < 2:
-        return f"Missing: {found.added[0]}."
-    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
-    if max(found.shares.values()) >= DOMINANT:
-        return f"Missing: {', '.join(parts)}."
-    return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
-
-
-def _ladder(found: Findings) -> list[dict]:
-    steps = [("base model", found.outcome.base_errors)]
-    if found.paying:
-        steps.append((" + ".join(found.paying), found.outcome.final_errors))
-    return [{"model": model, "validation_rmse": float(errors.mse.mean().sqrt())} for model, errors in steps]
-
-
-def _joints(found: Findings, problem: Problem) -> dict[str, dict]:
-    outcome, model = found.outcome, found.outcome.final.model
-    return {
-        name: {
-            "validation_rmse_before": float(outcome.base_errors.mse[j].sqrt()),
-            "validation_rmse_after": float(outcome.final_errors.mse[j].sqrt()),
-            "floor": float(found.data.floor[j]),
-            "effects": [e.name for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])],
-        }
-        for j, name in enumerate(problem.joint_names)
-    }

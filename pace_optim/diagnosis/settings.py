@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
+
 
 @dataclass(kw_only=True)
 class DiagnosisSettings:
@@ -31,6 +33,9 @@ class DiagnosisSettings:
     refit: bool | None = None
     """Whether the model with the effects found is fitted to the whole robot, as a run of its own; ``None``: where they
     are what is missing, or a curve explains it in their place."""
+
+    cfg: DiagnosisCfg = field(default_factory=DiagnosisCfg)
+    """Its numbers, and which of its rules are in force."""
 
     def __post_init__(self) -> None:
         """Check what can be checked without reading anything.

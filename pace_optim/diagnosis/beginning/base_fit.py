@@ -7,22 +7,16 @@ from collections.abc import Callable, Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side, fit_to_whole
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_FAR = 0.02
-"""Where a normalised parameter has moved further than this the reference is computed again."""
-_ROUNDS = 3
-_AWAY = 0.05
-"""What a joint without neighbours feels is taken along the measured motion, unless it ends further from it than this
-(RMS) [rad]: then gravity is not linear in between."""
-
 
 def fit_base(
+    fits: Fits,
     problem: Problem,
     physical: torch.Tensor,
     effects: Sequence[type[Effect]] = (),
@@ -31,6 +25,7 @@ def fit_base(
     """Fit the base model from a first guess; the reference that the joints move along follows.
 
     Args:
+        fits: Fits models.
         problem: The whole robot, without effects.
         physical: First guess of its parameters, (size,).
         effects: Effects whose influence on the rigid bodies is wanted.
@@ -43,14 +38,15 @@ def fit_base(
     fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
     names = [effect.name for effect in effects if effect.overrides("write_model")]
     along = measured_path if problem.joints_stand_alone else reference_path
-    twins, fitted = _fit_along(problem, fitted, along, names, say)
-    if along is measured_path and float(fitted.score.max()) > _AWAY**2:
-        twins, fitted = _fit_along(problem, fitted, reference_path, names, say)
-    armature = fitted.model.to_physical(fitted.x)[:, BASE.index("armature")]
+    twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
+    if along is measured_path and float(fitted.score.max()) > fits.cfg.beginning.away**2:
+        twins, fitted = _fit_along(fits, problem, fitted, reference_path, names, say)
+    armature = fitted.physical[:, BASE.index("armature")]
     return twins, fitted, twins.path.typical_effort(armature)
 
 
 def _fit_along(
+    fits: Fits,
     problem: Problem,
     fitted: Fitted,
     along: Callable[[Problem, torch.Tensor, Sequence[str]], ReferencePath],
@@ -60,17 +56,18 @@ def _fit_along(
     """The joints along a reference that follows the model, and the model fitted there."""
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
-        return along(of, whole_vector(of, fitted.model.to_physical(fitted.x)), model_effects)
+        return along(of, whole_vector(of, fitted.physical), model_effects)
 
+    cfg = fits.cfg.fitting
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
-    for i in range(_ROUNDS):
+    for i in range(cfg.rounds):
         say(f"base model, round {i + 1}")
         coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()
-        before, fitted = fitted, fit_side_by_side(coarse, [fitted], max_iteration=6)[0]
-        if float((fitted.x - before.x).abs().max()) < _FAR:
+        before, fitted = fitted, fits.side_by_side(coarse, [fitted], cfg.again)[0]
+        if float((fitted.x - before.x).abs().max()) < fits.cfg.beginning.moved:
             break
     twins = twin_problem(problem, path(problem, model_effects))
-    return twins, fit_to_whole(twins, [fit_side_by_side(twins.in_windows(), [fitted], max_iteration=5)[0]])[0]
+    return twins, fits.to_whole(twins, fits.side_by_side(twins.in_windows(), [fitted], cfg.settle))[0]
 
 
 def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:

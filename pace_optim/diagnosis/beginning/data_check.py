@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pace_optim.diagnosis.beginning.base_fit import whole_vector
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -18,17 +18,14 @@ from pace_optim.recording.noise import lattice_step, noise_floor
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_model.problem import TwinProblem
 
-FLOOR_MARGIN = 1.1
-"""An RMSE up to this many times the floor is at the floor."""
 
-
-@dataclass(kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DataCheck:
     """What the recordings can show."""
 
     floor: torch.Tensor
-    """RMSE that no model can go below: measurement noise and the error of the physics step, (n,) [rad]. Where the
-    run's own step leaves no more than that, all that this one leaves."""
+    """Noise and step error combined, (n,) [rad]. Where the run's own physics step already reaches this floor it
+    is raised to what the base model leaves here: the recording is of a simulation."""
     noise: torch.Tensor
     """(n,) [rad]."""
     numerical: torch.Tensor
@@ -40,10 +37,13 @@ class DataCheck:
     """Number of different gains."""
 
 
-def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResult | None = None) -> DataCheck:
+def check_data(
+    fits: Fits, problem: Problem, twins: TwinProblem, base: Fitted, run: FitResult | None = None
+) -> DataCheck:
     """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are.
 
     Args:
+        fits: Tells errors.
         problem: The whole robot with the base model.
         twins: Its joints simulated alone.
         base: The base model, fitted to them.
@@ -60,7 +60,7 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResul
             if step is not None:
                 steps[name] = step
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
-    numerical = step_error(problem, whole_vector(problem, base.model.to_physical(base.x)), data.validation)
+    numerical = step_error(problem, whole_vector(problem, base.physical), data.validation)
     sentences = [
         f"Measurement noise: {_span(1e3 * noise)}; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
@@ -78,8 +78,9 @@ def check_data(problem: Problem, twins: TwinProblem, base: Fitted, run: FitResul
     floor = (noise**2 + numerical**2).sqrt()
     if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
         by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
-        left = validation_errors(twins, [base])[0].mse.sqrt()
-        by_step = (by_run <= FLOOR_MARGIN * floor) & (left > FLOOR_MARGIN * floor)
+        left = fits.validation_errors(twins, [base])[0].mse.sqrt()
+        at_floor = fits.cfg.judging.alike * floor
+        by_step = (by_run <= at_floor) & (left > at_floor)
         if bool(by_step.any()):
             floor = torch.where(by_step, left, floor)
             sentences.append(

@@ -9,64 +9,61 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, BeginningCfg
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
 from pace_optim.single_joint_model.problem import TwinProblem
 
 _DELAY = BASE.index("delay")
-_LATE, _SCATTERS = 0.2, 6.0
-"""A joint is late that is so many control steps later than the median, and so many times the joints' scatter."""
-_ALL = 0.9
-"""A delay of its own must take away more than this part of the squared error of a joint that is late."""
-_ITERATIONS = 5
 
 
-def hold_late_joints(twins: TwinProblem, base: Fitted) -> tuple[Fitted, list[str]]:
+def hold_late_joints(fits: Fits, twins: TwinProblem, base: Fitted) -> tuple[Fitted, list[str]]:
     """The base model with the robot's delay on joints that are later and have nothing else to explain.
 
     Args:
+        fits: Fits models.
         twins: The joints simulated alone.
         base: The base model, fitted, with a delay of each joint's own.
 
     Returns:
         The model, fitted with its Jacobian (``base`` itself where no joint is late), and what was held, in a sentence.
     """
-    delay = base.model.to_physical(base.x)[:, _DELAY]
-    late = later_than_most(delay)
+    delay = base.physical[:, _DELAY]
+    late = later_than_most(delay, cfg=fits.cfg.beginning)
     while bool(late.any()):
-        held = _held(twins, base, late, delay.median())
-        with_one, with_own = (errors.mse for errors in validation_errors(twins, [held, base]))
-        if (only_late := late & (with_own < (1 - _ALL) * with_one)).equal(late):
-            return held, [_told(twins, delay, late)]
+        held = _held(fits, twins, base, late, delay.median())
+        with_one, with_own = (errors.mse for errors in fits.validation_errors(twins, [held, base]))
+        if (only_late := late & (with_own < (1 - fits.cfg.verdict.nearly_all) * with_one)).equal(late):
+            return held, [_sentence(twins, delay, late)]
         late = only_late
     return base, []
 
 
-def later_than_most(delay: torch.Tensor) -> torch.Tensor:
+def later_than_most(delay: torch.Tensor, *, cfg: BeginningCfg = DEFAULT.beginning) -> torch.Tensor:
     """Joints that are later than the delay that most joints have, (n,) bool; nobody knows it of one joint or two.
 
     Args:
         delay: Of each joint, (n,) [control steps].
+        cfg: From when on a joint is late.
     """
     behind = delay - delay.median()
     scatter = behind.abs().median()
-    return (behind > max(_LATE, _SCATTERS * float(scatter))) & (len(delay) > 2)
+    return (behind > max(cfg.late, cfg.scatters * float(scatter))) & (len(delay) > 2)
 
 
-def _held(twins: TwinProblem, base: Fitted, joints: torch.Tensor, delay: torch.Tensor) -> Fitted:
+def _held(fits: Fits, twins: TwinProblem, base: Fitted, joints: torch.Tensor, delay: torch.Tensor) -> Fitted:
     """The base model fitted with that delay on some joints."""
     lower, upper = base.model.lower.clone(), base.model.upper.clone()
     lower[joints, _DELAY] = upper[joints, _DELAY] = delay
-    start = Fitted.start(replace(base.model, lower=lower, upper=upper), base.model.to_physical(base.x))
-    return fit_side_by_side(twins, [start], max_iteration=_ITERATIONS, keep_jacobian=True)[0]
+    start = Fitted.start(replace(base.model, lower=lower, upper=upper), base.physical)
+    return fits.side_by_side(twins, [start], fits.cfg.fitting.settle, keep_jacobian=True)[0]
 
 
-def _told(twins: TwinProblem, delay: torch.Tensor, late: torch.Tensor) -> str:
+def _sentence(twins: TwinProblem, delay: torch.Tensor, late: torch.Tensor) -> str:
     one, ms = delay.median(), 1e3 * twins.control_dt
     said = [f"{twins.joint_names[j]} by {ms * float(delay[j] - one):.2g} ms" for j in late.nonzero()[:, 0].tolist()]
     return (
         f"Some joints are later than the delay of {ms * float(one):.3g} ms that most have: {', '.join(said)}. The "
-        "robot's model has one delay, so it was sought what makes them late."
+        "model has a single delay, so the extra lag of these joints was treated as an error to explain."
     )

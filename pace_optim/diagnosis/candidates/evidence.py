@@ -5,24 +5,24 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.screening import free_columns, simulated_probes
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.fitting.processes import spread
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_INDEPENDENT = 0.4
-"""Errors of a wrong model that are further apart than this count as independent [s]."""
 _LEAST, _MOST, _POINTS = 1e-6, 1e4, 81
 """Ratios λ that are tried, in parts of what a probe of unit size explains, evenly by their logarithm."""
 _RIDGE = 1e-9
 
 
 def log_evidence(
+    fits: Fits,
     problem: TwinProblem,
     models: Mapping[type[Effect], Fitted],
     effects: Sequence[type[Effect]],
@@ -44,6 +44,7 @@ def log_evidence(
     (MacKay 1992, Bayesian interpolation). Simulated in windows at the control step.
 
     Args:
+        fits: Fits models.
         problem: The joints simulated alone.
         models: The models, fitted, by the effect in which they differ.
         effects: Everything that may be there.
@@ -53,29 +54,31 @@ def log_evidence(
         Of each joint, (n,).
     """
     coarse = problem.coarse()
-    starts = [Fitted.start(m.model, m.model.to_physical(m.x), tried=effect) for effect, m in models.items()]
-    seen = fit_side_by_side(coarse, starts, max_iteration=1, keep_jacobian=True)
-    found = spread(
-        lambda own: [_of_model(coarse, each, effects, effort) for each in own], seen, [each.tried for each in seen]
+    seen = fits.looked_at(coarse, [replace(fitted, tried=effect) for effect, fitted in models.items()])
+    found = parallel_map(
+        lambda own: [_of_model(fits, coarse, each, effects, effort) for each in own],
+        seen,
+        [each.tried for each in seen],
+        fits.cfg.fitting.stiff_cost,
     )
     return dict(zip(models, found, strict=True))
 
 
 def _of_model(
-    problem: TwinProblem, seen: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits, problem: TwinProblem, seen: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
 ) -> torch.Tensor:
     """:func:`log_evidence` of one model."""
     if seen.error is None or seen.tried is None:
         raise ValueError("The evidence needs a model that was fitted with keep_jacobian, and the effect it is about.")
-    others = [effect for effect in effects if bool(seen.model.may_get(effect).any())]
-    probes, changes, where = simulated_probes(problem, seen, others, effort)
+    others = [effect for effect in effects if bool(seen.model.allowed_joints(effect).any())]
+    probes, changes, where = simulated_probes(fits, problem, seen, others, effort)
     count = Counter(effect for effect, _ in probes)
     parts = torch.tensor([1 / math.sqrt(count[effect]) for effect, _ in probes], dtype=torch.float64)
-    independent = max(2.0, float(where.sum()) * problem.control_dt / _INDEPENDENT)
-    jacobian, numbers = free_columns(seen), len(seen.tried.parameters)
+    independent = max(2.0, float(where.sum()) * problem.control_dt / fits.cfg.candidates.independent_s)
+    jacobian, numbers = free_columns(seen, fits.cfg.fitting.at_bound), len(seen.tried.parameters)
     result = torch.full((seen.model.num_joints,), -torch.inf, dtype=torch.float64)
     for j in range(seen.model.num_joints):
-        may = torch.tensor([bool(seen.model.may_get(effect)[j]) for effect, _ in probes], dtype=torch.float64)
+        may = torch.tensor([bool(seen.model.allowed_joints(effect)[j]) for effect, _ in probes], dtype=torch.float64)
         own, rest, error = jacobian[..., j].flatten(1), changes[..., j].flatten(1), seen.error[..., j].flatten()
         result[j] = _evidence(own, rest, error, parts * may, independent) - 0.5 * numbers * math.log(independent)
     return result

@@ -7,22 +7,15 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.fitting.processes import spread
-from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.processes import parallel_map
+from pace_optim.diagnosis.fitting.side_by_side import Slot
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_LEVELS = (-0.9, -0.5)
-"""Normalised friction and viscous friction to begin with, beside those of the base model."""
-_MOST = 12
-"""Effects with more probes than this are looked at at some of them."""
-_PART = 0.7
-"""Of each window."""
-_STRIDE = 2
 
-
-def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
+def far_starts(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
     Of a stiff one, the best point of each probe: the error at a point says little of where it leads, as another
@@ -30,30 +23,34 @@ def far_starts(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]
     the beginning of each window of the training recordings.
 
     Args:
+        fits: Fits models.
         problem: The joints simulated alone, coarsely.
         now: The present model.
         effects: What is tried.
     """
-    starts = spread(lambda own: _best_points(problem, now, own), effects, effects)
+    starts = parallel_map(
+        lambda own: _best_points(fits, problem, now, own), effects, effects, fits.cfg.fitting.stiff_cost
+    )
     return [start for of_effect in starts for start in of_effect]
 
 
-def _best_points(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[list[Fitted]]:
+def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[list[Fitted]]:
     """:func:`far_starts` in one process."""
-    bases = _bases(now)
+    cfg = fits.cfg
+    bases = _bases(now, cfg.candidates.frictions)
     slots, values = [], []
     for effect in effects:
         points = probe_points(effect)
-        points = points[:: -(-len(points) // _MOST)]
+        points = points[:: -(-len(points) // cfg.candidates.points)]
         own = [start_values(effect, point).repeat(now.model.num_joints, 1) for point in points]
-        may = now.model.may_get(effect)
+        may = now.model.allowed_joints(effect)
         tried = [now.model.extended(base, effect, may, each) for base in bases for each in own]
         slots.append(Slot(model=tried[0][0], rows=len(tried)))
         values.append(torch.stack([physical for _, physical in tried]))
-    batch = SideBySide(problem, slots, training=True)
+    batch = fits.batch(problem, slots, training=True)
     where = batch.dataset.train.clone()
-    where[int(_PART * len(where)) :] = False
-    scores = batch.simulate(values, where, _STRIDE).square().sum(dim=(1, 2))
+    where[int(cfg.fitting.part * len(where)) :] = False
+    scores = batch.simulate(values, where, cfg.fitting.stride).square().sum(dim=(1, 2))
     result = []
     for effect, slot, points_of, score in zip(effects, slots, values, batch.split(scores), strict=True):
         every = torch.arange(len(score))
@@ -69,15 +66,14 @@ def _best(now: Fitted, model: JointModel, effect: type[Effect], points: torch.Te
     return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
 
 
-def _bases(now: Fitted) -> list[torch.Tensor]:
+def _bases(now: Fitted, levels: Sequence[float]) -> list[torch.Tensor]:
     """The present values, and with less friction of both kinds, the other parameters in the middle, (n, P) each."""
-    model: JointModel = now.model
-    result = [model.to_physical(now.x)]
-    for level in _LEVELS:
+    result = [now.physical]
+    for level in levels:
         x = now.x.clone()
         x[:, BASE.index("armature")] = level
         x[:, BASE.index("viscous_friction")] = level
         x[:, BASE.index("friction")] = level
         x[:, BASE.index("delay")] = -0.5
-        result.append(model.to_physical(x))
+        result.append(now.model.to_physical(x))
     return result

@@ -9,21 +9,15 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.fitting.processes import spread
-from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.processes import parallel_map
+from pace_optim.diagnosis.fitting.side_by_side import Slot
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, start_values
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_FOLDS = 5
-_BLOCK_S = 0.2
-_STRIDE = 2
-_AT_BOUND = 1e-3
 _RIDGE = 1e-9
-_SEEN = 0.3
-"""Part of an effect's amplitude: with less than this left, a base parameter takes it up."""
-_WIDE = 0.1
-"""Normalised step of that parameter: joints that stick make the error rough, and a narrow step sees the roughness."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +33,9 @@ class Probe:
     """Multiple of the probe that fits best, (n,)."""
 
 
-def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor) -> list[Probe]:
+def screen(
+    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+) -> list[Probe]:
     """Look at each effect at its probes.
 
     With e the error, J its derivatives by the parameters that the model has, and S the change that a probe makes, e is
@@ -48,37 +44,44 @@ def screen(problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], e
         score = 1 - SSE[J, S] / SSE[J]
 
     Args:
+        fits: Fits models.
         problem: The joints simulated alone.
         now: The present model, fitted, with its Jacobian.
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
     """
-    each = spread(lambda own: _screened(problem, now, own, effort), effects, effects)
+    each = parallel_map(
+        lambda own: _screened(fits, problem, now, own, effort), effects, effects, fits.cfg.fitting.stiff_cost
+    )
     return [probe for probes in each for probe in probes]
 
 
 def _screened(
-    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
 ) -> list[list[Probe]]:
     """:func:`screen` in one process; the probes of each effect."""
     if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
-    probes, changes, where = simulated_probes(problem, now, effects, effort)
-    scores, sizes = _explained(now.error, free_columns(now), changes, _blocks(where, problem.control_dt))
+    probes, changes, where = simulated_probes(fits, problem, now, effects, effort)
+    cfg = fits.cfg
+    steps = where.any(dim=1).nonzero()[:, 0][:: cfg.fitting.stride]
+    fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg.candidates), -1)
+    scores, sizes = _explained(now.error, free_columns(now, cfg.fitting.at_bound), changes, fold, cfg.candidates.folds)
     result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
-        allowed = now.model.may_get(effect) & ((size > 0) | effect.two_sided)
+        allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
         probe = Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size)
         result[effect].append(probe)
     return list(result.values())
 
 
 def absorbed_effects(
-    problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
 ) -> dict[type[Effect], torch.Tensor]:
     """Effects that a base parameter takes up, and on which joints (n,): these recordings would not show them there.
 
     Args:
+        fits: Fits models.
         problem: The joints simulated alone.
         now: The base model, fitted, with its Jacobian.
         effects: What is tried; only those count that name such a parameter.
@@ -88,12 +91,13 @@ def absorbed_effects(
     if not suspects:
         return {}
     takers = sorted({BASE.index(effect.absorbed_by) for effect in suspects})
-    steps = torch.where(now.x > 0, -_WIDE, _WIDE)
+    cfg = fits.cfg.candidates
+    steps = torch.where(now.x > 0, -cfg.seen_step, cfg.seen_step)
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
-    probes, changes, _ = simulated_probes(problem, now, suspects, effort, beside)
-    jacobian = free_columns(now)
+    probes, changes, _ = simulated_probes(fits, problem, now, suspects, effort, beside)
+    jacobian = free_columns(now, fits.cfg.fitting.at_bound)
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
@@ -103,7 +107,7 @@ def absorbed_effects(
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
             columns = columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12)
             seen = own - _solve(_bordered(columns, own), len(columns)) @ columns
-            if float(seen.norm()) > _SEEN * float(own.norm()):
+            if float(seen.norm()) > cfg.seen * float(own.norm()):
                 result[effect][j] = False
     return {effect: joints for effect, joints in result.items() if bool(joints.any())}
 
@@ -115,6 +119,7 @@ def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def simulated_probes(
+    fits: Fits,
     problem: TwinProblem,
     now: Fitted,
     effects: Sequence[type[Effect]],
@@ -125,40 +130,37 @@ def simulated_probes(
 
     ``beside``, (b, n, P) normalised, are more values of the model itself; what those change comes first.
     """
-    model = now.model
-    physical = model.to_physical(now.x)
+    model, physical = now.model, now.physical
+    stride, usual = fits.cfg.fitting.stride, fits.cfg.candidates.usual_effort
     own = now.x[None] if beside is None else torch.cat([now.x[None], beside])
     slots, values = [Slot(model=model, rows=len(own))], [model.to_physical(own)]
     probes: list[tuple[type[Effect], torch.Tensor]] = []
     for effect in effects:
-        points = [_probe_values(effect, point, effort) for point in probe_points(effect)]
-        extended = [model.extended(physical, effect, model.may_get(effect), each) for each in points]
+        points = [_probe_values(effect, point, effort / usual) for point in probe_points(effect)]
+        extended = [model.extended(physical, effect, model.allowed_joints(effect), each) for each in points]
         slots.append(Slot(model=extended[0][0], rows=len(points)))
         values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
-    batch = SideBySide(problem, slots, training=True)
-    errors = batch.simulate(values, batch.dataset.train, _STRIDE)
+    batch = fits.batch(problem, slots, training=True)
+    errors = batch.simulate(values, batch.dataset.train, stride)
     return probes, errors[1:] - errors[:1], batch.dataset.train
 
 
-def _probe_values(effect: type[Effect], point: dict[str, float], effort: torch.Tensor) -> torch.Tensor:
-    """A probe's physical values on each joint, (n, parameters): small torques for small drives."""
-    values = start_values(effect, point).repeat(len(effort), 1)
+def _probe_values(effect: type[Effect], point: dict[str, float], size: torch.Tensor) -> torch.Tensor:
+    """A probe's physical values on each joint, (n, parameters): small torques for drives of a small size, (n,)."""
+    values = start_values(effect, point).repeat(len(size), 1)
     for k, parameter in enumerate(effect.parameters):
         if parameter.unit == "N m" and parameter.null == 0.0:
-            values[:, k] *= (effort / _USUAL_EFFORT).clamp(max=1.0)
+            values[:, k] *= size.clamp(max=1.0)
     return values
 
 
-_USUAL_EFFORT = 5.0
-"""Torque for which the probes' torques are meant [N m]."""
-
-
-def starts_of(probe: Probe) -> torch.Tensor:
+def starts_of(probe: Probe, cfg: CandidatesCfg) -> torch.Tensor:
     """Where a refit starts: the probe, its amplitude multiplied by what fits best, (n, parameters)."""
     values = probe.values.clone()
-    factor = probe.size.clamp(-20.0, 20.0)
-    factor = torch.where(factor.abs() < 0.2, torch.sign(factor) * 0.2, factor)
+    least, most = cfg.multiple
+    factor = probe.size.clamp(-most, most)
+    factor = torch.where(factor.abs() < least, torch.sign(factor) * least, factor)
     for k, p in enumerate(probe.effect.parameters):
         if p.null == 0.0:
             values[:, k] = (values[:, k] * factor).clamp(p.lower, p.upper)
@@ -167,27 +169,24 @@ def starts_of(probe: Probe) -> torch.Tensor:
     return values
 
 
-def _blocks(where: torch.Tensor, control_dt: float) -> torch.Tensor:
-    """Fold of each kept sample, (K, R); -1 where there is none."""
-    steps = where.any(dim=1).nonzero()[:, 0][::_STRIDE]
-    second = (steps * control_dt / _BLOCK_S).long()
-    fold = (second[:, None] + torch.arange(where.shape[1])) % _FOLDS
-    return torch.where(where[steps], fold, -1)
+def _folds(time: torch.Tensor, recordings: int, cfg: CandidatesCfg) -> torch.Tensor:
+    """Fold of each sample, (K, R), in blocks that alternate, by the time of each, (K,) [s]."""
+    return ((time / cfg.fold_s).long()[:, None] + torch.arange(recordings)) % cfg.folds
 
 
-def free_columns(now: Fitted) -> torch.Tensor:
-    """The Jacobian (P, K, R, n), without entries that sit at a bound."""
+def free_columns(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
+    """The Jacobian (P, K, R, n), without entries that sit at a bound: beyond that normalised value."""
     if now.jacobian is None:
         raise ValueError("This needs a model that was fitted with keep_jacobian.")
     columns = now.jacobian.clone()
-    fixed = (now.x.abs() > 1 - _AT_BOUND) | ~now.model.free
+    fixed = (now.x.abs() > at_bound) | ~now.model.free
     for j, p in fixed.nonzero().tolist():
         columns[p, ..., j] = 0.0
     return columns
 
 
 def _explained(
-    error: torch.Tensor, jacobian: torch.Tensor, changes: torch.Tensor, fold: torch.Tensor
+    error: torch.Tensor, jacobian: torch.Tensor, changes: torch.Tensor, fold: torch.Tensor, folds: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Score and coefficient of every change, (probes, n) each.
 
@@ -195,7 +194,8 @@ def _explained(
         error: (K, R, n).
         jacobian: (P, K, R, n).
         changes: (probes, K, R, n).
-        fold: (K, R).
+        fold: Of each sample, (K, R).
+        folds: How many there are.
     """
     n, size = error.shape[-1], len(jacobian)
     scores = torch.zeros(len(changes), n, dtype=torch.float64)
@@ -208,7 +208,7 @@ def _explained(
         probes = changes[..., j]
         amplitude = probes.flatten(1).norm(dim=1).clamp(min=1e-12)
         probes = probes / amplitude[:, None, None]
-        for f in range(_FOLDS):
+        for f in range(folds):
             at = fold == f
             a, s = columns[:, at], probes[:, at]
             per_fold.append(((a @ a.T).double(), (s @ a.T).double(), s.square().sum(dim=1, dtype=torch.float64)))

@@ -1,34 +1,18 @@
-"""Levenberg–Marquardt of one model, joint by joint: it is asked for rows, and told the errors that they gave."""
+"""Levenberg–Marquardt of one model with an ask/tell interface; each joint is an independent problem."""
 
 from __future__ import annotations
 
 import torch
 
+from pace_optim.diagnosis.diagnosis_cfg import FittingCfg
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.optimizers.least_squares import bounded_step
 
-TRIALS = (1.0, 30.0, 1e3)
-"""Multiples of the damping that are tried side by side."""
-_SMOOTH = (1e-4,)
-"""Normalised step of the derivatives."""
-_ROUGH = (3e-2, 1e-2, 1e-4)
-"""The same where contacts and sticking make the error rough: a narrow one sees the roughness and not the slope. The
-next is taken when one leads no further."""
-_DAMPING = 1e-3
-_ENOUGH = 3e-3
-"""A joint whose score falls by less than this part in an iteration has converged."""
-_STILL = 2
-"""Steps in a row that gain less than that, after which a joint has converged."""
-_PROMISED = 3e-4
-"""A joint has converged, too, from where its linear model promises less than this part of the score."""
-_FALLS, _FALLS_OVER = 0.05, 3
-"""A model still falls whose squared error over all joints has fallen by more than this part over so many steps."""
 
+class LevenbergMarquardt:
+    """One model's descent: rows are the favoured step, its P neighbours for the next Jacobian, and the other trials."""
 
-class Way:
-    """One model's way down: rows are the favoured step, its P neighbours, and the other trials."""
-
-    def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool):
+    def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool, cfg: FittingCfg):
         """Begin at the model's x.
 
         Args:
@@ -36,18 +20,20 @@ class Way:
             samples: How many count for each joint, (n,).
             keep: Whether the last Jacobian is kept.
             rough: Whether derivatives are taken over wide steps first.
+            cfg: Dampings, steps and tolerances.
         """
+        self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
-        self._damping = torch.full((n,), _DAMPING, dtype=torch.float64)
+        self._damping = torch.full((n,), cfg.damping, dtype=torch.float64)
         self._hessian = torch.zeros(n, size, size, dtype=torch.float64)
         self._gradient = torch.zeros(n, size, dtype=torch.float64)
         self._known = torch.zeros(n, dtype=torch.bool)
         self._still = torch.zeros(n, dtype=torch.long)
         self._converged = torch.zeros(n, dtype=torch.bool)
-        self._widths = torch.tensor(_ROUGH if rough else _SMOOTH, dtype=torch.float64)
+        self._widths = torch.tensor([*(cfg.wide if rough else ()), cfg.narrow], dtype=torch.float64)
         self._width = torch.zeros(n, dtype=torch.long)
         self._free = start.model.free
         self._jacobian: torch.Tensor | None = None
@@ -62,14 +48,14 @@ class Way:
     def ask(self) -> torch.Tensor:
         """Normalised rows, (P + trials, n, P)."""
         n, size = self.x.shape
-        trials = self.x.repeat(len(TRIALS), 1, 1)
+        trials = self.x.repeat(len(self._cfg.trials), 1, 1)
         for j in range(n):
             free = self._free[j]
             if not bool(self._known[j]) or not bool(free.any()):
                 continue
             at = free.nonzero()[:, 0]
             hessian, gradient = self._hessian[j][at[:, None], at], self._gradient[j][at]
-            for t, factor in enumerate(TRIALS):
+            for t, factor in enumerate(self._cfg.trials):
                 trials[t, j, at] = bounded_step(self.x[j, at], hessian, gradient, float(self._damping[j]) * factor)
         favoured = trials[0]
         width = self._widths[self._width][:, None]
@@ -90,22 +76,24 @@ class Way:
         # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and tells nothing of a gain
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
-        self._still = torch.where(fresh, self._still, torch.where(gain > _ENOUGH, 0, self._still + 1))
+        self._still = torch.where(fresh, self._still, torch.where(gain > self._cfg.enough, 0, self._still + 1))
         narrower = (self._still > 0) & (self._width + 1 < len(self._widths))
         self._still[narrower] = 0
-        self._converged |= self._still >= _STILL
+        self._converged |= self._still >= 2
         chosen = x[choice].gather(0, best[None, :, None].expand(1, -1, size))[0]
         moved = better & ~fresh
         self.x = torch.where(moved[:, None], chosen, self.x)
         self.score = torch.where(better, lowest, self.score)
         self._scores.append(float(self.score.sum()))
-        factor = torch.tensor(TRIALS, dtype=torch.float64)[best]
+        factor = torch.tensor(self._cfg.trials, dtype=torch.float64)[best]
         lowered = (self._damping * factor / 10).clamp(min=1e-9)
-        self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * 1e3))
+        self._damping = torch.where(
+            moved, lowered, torch.where(fresh, self._damping, self._damping * self._cfg.trials[-1])
+        )
         at_favoured = fresh | (moved & (best == 0))
         self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known)) & ~narrower
         self._width += narrower
-        self._damping = torch.where(narrower, _DAMPING, self._damping)
+        self._damping = torch.where(narrower, self._cfg.damping, self._damping)
         if bool(at_favoured.any()):
             difference = error[1 : 1 + size] - error[:1]
             columns = difference / self._step.T[:, None, None, :].float()
@@ -127,9 +115,9 @@ class Way:
         for j in result.nonzero()[:, 0].tolist():
             at = self._free[j].nonzero()[:, 0]
             x, hessian, gradient = self.x[j, at], self._hessian[j][at[:, None], at], self._gradient[j][at]
-            move = bounded_step(x, hessian, gradient, _DAMPING) - x if len(at) else x
+            move = bounded_step(x, hessian, gradient, self._cfg.damping) - x if len(at) else x
             promised = -float(2 * gradient @ move + move @ hessian @ move)
-            result[j] = promised < _PROMISED * float(self.score[j])
+            result[j] = promised < self._cfg.promised * float(self.score[j])
         return result
 
     def result(self) -> Fitted:
@@ -146,5 +134,5 @@ class Way:
 
     def _falls(self) -> bool:
         """Whether the last steps have lowered the error."""
-        last = self._scores[-1 - _FALLS_OVER :]
-        return not self.finished and len(last) > 1 and last[-1] < (1 - _FALLS) * last[0]
+        last = self._scores[-1 - self._cfg.rounds :]
+        return not self.finished and len(last) > 1 and last[-1] < (1 - self._cfg.falls) * last[0]

@@ -30,12 +30,13 @@ Result = TypeVar("Result")
 
 _PR_SET_PDEATHSIG = 1
 """Of Linux's prctl: the signal that a process gets when its parent dies."""
-_STIFF = 3.0
-"""What an item of a stiff effect costs, as a multiple of another one's."""
 
 
-def spread(
-    work: Callable[[list[Item]], list[Result]], items: Sequence[Item], effects: Sequence[type[Effect] | None]
+def parallel_map(
+    work: Callable[[list[Item]], list[Result]],
+    items: Sequence[Item],
+    effects: Sequence[type[Effect] | None],
+    stiff_cost: float = 1.0,
 ) -> list[Result]:
     """``work(items)``, with the items shared out among as many processes as there are processors.
 
@@ -46,11 +47,12 @@ def spread(
         work: Gives one result per item, in order.
         items: What there is to do.
         effects: The effect of each item; items of one effect stay together.
+        stiff_cost: What an item of a stiff effect costs, as a multiple of another one's.
 
     Raises:
         RuntimeError: If a process ended without a result.
     """
-    shares = _shares(effects, _processes())
+    shares = _shares(effects, _processes(), stiff_cost)
     if len(shares) < 2:
         return work(list(items))
     results: list[Result | None] = [None] * len(items)
@@ -75,13 +77,14 @@ def _processes() -> int:
     return available_processors() if forks else 1
 
 
-def _shares(effects: Sequence[type[Effect] | None], count: int) -> list[list[int]]:
+def _shares(effects: Sequence[type[Effect] | None], count: int, stiff_cost: float) -> list[list[int]]:
     """Indices for each process, about as much work for each; the dearest effects are dealt out first."""
     groups: dict[type[Effect] | None, list[int]] = {}
     for i, effect in enumerate(effects):
         groups.setdefault(effect, []).append(i)
     cost = {
-        effect: len(own) * (_STIFF if effect is not None and effect.is_stiff else 1.0) for effect, own in groups.items()
+        effect: len(own) * (stiff_cost if effect is not None and effect.is_stiff else 1.0)
+        for effect, own in groups.items()
     }
     shares: list[list[int]] = [[] for _ in range(min(count, len(groups)))]
     load = [0.0] * len(shares)

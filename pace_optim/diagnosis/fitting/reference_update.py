@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
@@ -18,21 +18,13 @@ from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.path import ReferencePath
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_FAR = 0.01
-"""A joint without neighbours feels a reference that is this near (RMS) [rad] as its own motion: gravity is linear
-there."""
-_TIMES = 4
-"""At most: what was fitted along the motion of a wrong model gives a better one, and so on."""
-_ITERATIONS = 6
-"""Of the fit along each."""
-_GAIN = 0.9
-"""The motion is renewed again where it lowered the squared error to less than this part."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OwnMotion:
+class ReferenceUpdate:
     """Renews the reference of the joints of a robot."""
 
+    fits: Fits
+    """Fits models."""
     problem: Problem
     """The whole robot with the base model."""
     candidates: Sequence[type[Effect]]
@@ -50,18 +42,18 @@ class OwnMotion:
             now: The model, fitted along it.
         """
         self.say("motion of the robot with what was found")
-        alone = self.problem.joints_stand_alone
-        for _ in range(_TIMES):
-            if alone and self._away(twins, now) < _FAR:
+        alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
+        for _ in range(cfg.fitting.renewals):
+            if alone and self.away(twins, now) < cfg.beginning.near:  # gravity is linear there
                 break
             before = now.score
-            twins = twin_problem(self.problem, self._path(now))
-            now = fit_side_by_side(twins.in_windows(), [now], max_iteration=_ITERATIONS)[0]
-            if bool(((now.score <= self.enough**2) | (now.score > _GAIN * before)).all()):
+            twins = self.along(self.path(now))
+            now = self.fits.side_by_side(twins.in_windows(), [now], cfg.fitting.again)[0]
+            if bool(((now.score <= self.enough**2) | (now.score > cfg.fitting.gain * before)).all()):
                 break
         return twins, now
 
-    def _away(self, twins: TwinProblem, now: Fitted) -> float:
+    def away(self, twins: TwinProblem, now: Fitted) -> float:
         """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""
         problem = twins.coarse().with_effects(labels(now.model, twins.joint_names))
         rollout, sampled = problem.evaluator().rollout(1), problem.dataset.sampled
@@ -73,7 +65,12 @@ class OwnMotion:
         rollout.env.close()
         return math.sqrt(float(square) / (int(sampled.sum()) * len(problem.joint_names)))
 
-    def _path(self, now: Fitted) -> ReferencePath:
+    def along(self, path: ReferencePath) -> TwinProblem:
+        """The joints along a reference."""
+        return twin_problem(self.problem, path)
+
+    def path(self, now: Fitted) -> ReferencePath:
+        """The motion of the whole robot with a model."""
         problem = self.problem.with_effects(labels(now.model, self.problem.joint_names))
         changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
         return reference_path(problem, self._values(problem, now), changing)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -81,18 +81,19 @@ class SomeJoints:
         return Fitted(model=replace(model, has=has, lower=lower, upper=upper), x=x, score=score, tried=own.tried)
 
     def refitted(
-        self, problem: TwinProblem, starts: Sequence[Fitted], errors: BlockErrors
+        self, fits: Fits, problem: TwinProblem, starts: Sequence[Fitted], errors: BlockErrors
     ) -> tuple[list[Fitted], list[BlockErrors]]:
         """Fit models of all joints on these, and their errors; the others stay as they are.
 
         Args:
+            fits: Fits models.
             problem: All joints.
             starts: The models.
             errors: What the other joints' errors are.
         """
         own = self.of_problem(problem)
-        fitted = fit_coarse_to_fine(own, [self.of_fit(start) for start in starts])
-        after = [self._errors_of_all(each, errors) for each in validation_errors(own, fitted)]
+        fitted = fits.coarse_to_fine(own, [self.of_fit(start) for start in starts])
+        after = [self._errors_of_all(each, errors) for each in fits.validation_errors(own, fitted)]
         return [self._fit_of_all(each, start) for each, start in zip(fitted, starts, strict=True)], after
 
     def _errors_of_all(self, own: BlockErrors, now: BlockErrors) -> BlockErrors:
@@ -104,9 +105,11 @@ class SomeJoints:
     def round_of_all(self, own: Round, now: Fitted) -> Round:
         """A round of all joints, in which nothing was tried on the others."""
         n = len(self.which)
-        found = Round(trials=[[] for _ in range(n)], chosen=[None] * n, rivals=[[] for _ in range(n)])
+        trials: list[Sequence[Trial]] = [()] * n
+        chosen: list[type[Effect] | None] = [None] * n
+        rivals: list[Sequence[type[Effect]]] = [()] * n
         for k, j in enumerate(self.indices):
-            found.trials[j] = [replace(trial, joint=j) for trial in own.trials[k]]
-            found.chosen[j], found.rivals[j] = own.chosen[k], own.rivals[k]
-        found.models.update({effect: self._fit_of_all(fitted, now) for effect, fitted in own.models.items()})
-        return found
+            trials[j] = [replace(trial, joint=j) for trial in own.trials[k]]
+            chosen[j], rivals[j] = own.chosen[k], own.rivals[k]
+        models = {effect: self._fit_of_all(fitted, now) for effect, fitted in own.models.items()}
+        return Round(trials=trials, chosen=chosen, rivals=rivals, models=models)

@@ -10,7 +10,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.model.model import JointModel
 
 
-@dataclass(kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
     """A model fitted to the training recordings."""
 
@@ -34,16 +34,26 @@ class Fitted:
         unknown = torch.full((model.num_joints,), torch.inf, dtype=torch.float64)
         return cls(model=model, x=model.to_normalised(physical), score=unknown, tried=tried)
 
-    def take(self, other: Fitted, joints: torch.Tensor) -> None:
-        """Take over another fit of the same effects on some joints, (n,) bool, and what is known of it there."""
+    @property
+    def physical(self) -> torch.Tensor:
+        """Physical values, (n, P)."""
+        return self.model.to_physical(self.x)
+
+    def merged(self, other: Fitted, joints: torch.Tensor) -> Fitted:
+        """The same with another fit of the same effects on some joints, (n,) bool, and what is known of it there."""
+
+        def either(one: torch.Tensor | None, two: torch.Tensor | None) -> torch.Tensor | None:
+            return one if one is None or two is None else torch.where(joints, two, one)
+
         lower, upper = (
             torch.where(joints[:, None], getattr(other.model, side), getattr(self.model, side))
             for side in ("lower", "upper")
         )
-        self.model = replace(self.model, lower=lower, upper=upper)
-        self.x = torch.where(joints[:, None], other.x, self.x)
-        self.score = torch.where(joints, other.score, self.score)
-        if self.jacobian is not None and other.jacobian is not None:
-            self.jacobian = torch.where(joints, other.jacobian, self.jacobian)
-        if self.error is not None and other.error is not None:
-            self.error = torch.where(joints, other.error, self.error)
+        return replace(
+            self,
+            model=replace(self.model, lower=lower, upper=upper),
+            x=torch.where(joints[:, None], other.x, self.x),
+            score=torch.where(joints, other.score, self.score),
+            jacobian=either(self.jacobian, other.jacobian),
+            error=either(self.error, other.error),
+        )

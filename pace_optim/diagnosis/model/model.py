@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.effects import Effect
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.problem.problem import Problem
 
 BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
 """The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
-_AT_BOUND = 0.998
-"""Normalised values beyond this are at a bound."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -192,7 +191,7 @@ class JointModel:
                 lower[has, column] = upper[has, column] = physical[has, column]
         return replace(self, lower=lower, upper=upper)
 
-    def may_get(self, effect: type[Effect]) -> torch.Tensor:
+    def allowed_joints(self, effect: type[Effect]) -> torch.Tensor:
         """Joints that can have an effect beside those that they have, (n,) bool; only one can part motor and link."""
         excluded = self.barred.get(effect, torch.zeros(self.num_joints, dtype=torch.bool)).clone()
         for other, has in zip(self.effects, self.has, strict=True):
@@ -203,21 +202,22 @@ class JointModel:
                 excluded |= those
         return ~excluded
 
-    def at_bounds(self, x: torch.Tensor) -> torch.Tensor:
+    def at_bounds(self, x: torch.Tensor, beyond: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
         """Joints with an effect whose size has run into a bound, (effects, n) bool.
 
         A size is what vanishes at a null; the bound that is the null, or next to an infinite one, does not count.
 
         Args:
             x: Normalised, (n, P).
+            beyond: From where normalised values are at a bound.
         """
         result = torch.zeros_like(self.has)
         for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
             for parameter, value in zip(effect.parameters, x[:, self.columns(effect)].unbind(dim=1), strict=True):
                 if parameter.null is not None and parameter.null > parameter.lower:
-                    result[row] |= has & (value <= -_AT_BOUND)
+                    result[row] |= has & (value <= -beyond)
                 if parameter.null is not None and parameter.null < parameter.upper:
-                    result[row] |= has & (value >= _AT_BOUND)
+                    result[row] |= has & (value >= beyond)
         return result
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:

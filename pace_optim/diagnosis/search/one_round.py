@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -11,34 +11,18 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.evidence import log_evidence
 from pace_optim.diagnosis.candidates.multistart import far_starts
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_coarse_to_fine, fit_side_by_side
-from pace_optim.diagnosis.judging.acceptance import FIRST_RATIO, BlockErrors
-from pace_optim.diagnosis.judging.candidate_results import ALIKE, FAR, RIVAL, Round, Trial
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Round, Trial
+from pace_optim.diagnosis.judging.choice import choose, contenders
+from pace_optim.diagnosis.judging.decisions import Log, decision
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
-SCREEN_THRESHOLD = 0.03
-"""An effect that would explain less than this of what is left is not refitted."""
-SHORT_LIST = 6
-"""Effects refitted because they would explain most of the whole robot's error."""
-WORST_JOINTS = 4
-"""Joints whose own best candidates are refitted too."""
-PER_JOINT = 4
-"""How many of them."""
-FROM_SCREENING = 2
-"""How many of the best screened go on in any case, where refits began with all effects."""
-_PART, _ITERATIONS = 0.7, 6
-"""Of each window, and how far, where refits begin: after four, what needs another derivative gain too is far behind."""
-CONTENDERS = 1.15
-"""Where more than one effect is missing, the main one may be any whose validation RMSE is within this factor of the
-best."""
-FAR_FROM_FLOOR = 50.0
-"""An error that is this many times the floor is beyond what screening can judge: refits begin with all effects, as they
-do for the first one."""
-
 
 def try_effects(
+    fits: Fits,
     problem: TwinProblem,
     now: Fitted,
     errors: BlockErrors,
@@ -46,65 +30,109 @@ def try_effects(
     effort: torch.Tensor,
     floor: torch.Tensor,
     say: Callable[[str], None],
+    log: Log,
     rough: bool = False,
 ) -> Round | None:
     """Screen effects, refit the promising ones on top of a model, and judge them; ``None`` if none is promising.
 
     Args:
+        fits: Fits models.
         problem: The joints simulated alone.
         now: The present model.
         errors: Its errors.
         effects: Candidates.
         effort: Typical torque of each joint, (n,) [N m].
-        floor: Below this RMSE of each joint there is nothing to find, (n,) [rad].
+        floor: RMSE of each joint that no model can go below, (n,) [rad].
         say: Shows how far it is.
+        log: Gets the decision.
         rough: Whether refits go on over wide steps.
     """
-    start = Fitted.start(now.model, now.model.to_physical(now.x))
-    # one iteration stays where it is, and sees the errors and their derivatives in windows
-    seen = fit_side_by_side(problem.in_windows(), [start], max_iteration=1, keep_jacobian=True)[0]
-    probes = screen(problem.coarse(), seen, effects, effort)
-    excess = (errors.mse - floor**2).clamp(min=0.0)
-    listed = with_likes(_short_list(_promising(probes, excess), excess), effects)
-    first = not now.model.effects
-    far = bool((errors.mse.sqrt() > FAR_FROM_FLOOR * floor).any())
-    wide = first or far
+    begun, probes = _begin(fits, problem, now, errors, effects, effort, floor, say)
+    if not begun:
+        return None
+    cfg, first = fits.cfg, not now.model.effects
+    say(f"refitting with {_names(list(begun))}")
+    fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
+    if cfg.has("widen_bounds"):
+        beyond = cfg.fitting.at_bound
+        fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), say, beyond)
+    models = dict(zip(begun, fitted, strict=True))
+    after = dict(zip(begun, fits.validation_errors(problem, fitted), strict=True))
+    tried = len(effects) * now.model.num_joints
+    trials: list[list[Trial]] = [[] for _ in range(now.model.num_joints)]
+    for effect, fitted_with in models.items():
+        for j in now.model.allowed_joints(effect).nonzero()[:, 0].tolist():
+            own = fitted_with.physical[j, fitted_with.model.columns(effect)].tolist()
+            values = dict(zip([p.name for p in effect.parameters], own, strict=True))
+            score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
+            trial = Trial(effect=effect, joint=j, screen_score=score, values=values)
+            trials[j].append(trial.judged(errors, after[effect], tried, first, cfg=cfg.judging))
+    weighed = contenders(trials, floor, cfg=cfg.judging) if cfg.has("evidence") else [[] for _ in trials]
+    evidence = _evidence(fits, problem, models, weighed, effects, effort, say)
+    choice = choose(trials, evidence, cfg=cfg.judging)
+    log(
+        decision(
+            "add",
+            range(len(trials)),
+            errors,
+            {effect.name: own for effect, own in after.items()},
+            {j: effect.name for j, effect in enumerate(choice.chosen) if effect is not None},
+            {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
+            candidates=tried,
+            first=first,
+            floor=floor.tolist(),
+            evidence=[{effect.name: value for effect, value in own.items()} for own in evidence],
+            rivals=[[effect.name for effect in own] for own in choice.rivals],
+        )
+    )
+    return Round(trials=choice.trials, chosen=choice.chosen, rivals=choice.rivals, models=models)
+
+
+def _begin(
+    fits: Fits,
+    problem: TwinProblem,
+    now: Fitted,
+    errors: BlockErrors,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    floor: torch.Tensor,
+    say: Callable[[str], None],
+) -> tuple[dict[type[Effect], Fitted], list[Probe]]:
+    """Where refits with the promising effects start, and how all were screened; arguments as for `try_effects`."""
+    cfg = fits.cfg.candidates
+    seen = fits.looked_at(problem.in_windows(), [replace(now, tried=None)])[0]
+    probes = screen(fits, problem.coarse(), seen, effects, effort)
+    excess = (errors.mse - (fits.cfg.judging.alike * floor) ** 2).clamp(min=0.0)
+    listed = with_likes(_short_list(_promising(probes, excess, cfg.explains), excess, cfg), effects)
+    far = bool((errors.mse.sqrt() > cfg.beyond_screening * floor).any())
+    wide = not now.model.effects or far
     begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
     if not begin:
-        return None
+        return {}, probes
     say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
-    begun = _begun(problem, now, probes, begin, far)
+    begun = _begun(fits, problem, now, probes, begin, far and fits.cfg.has("far_starts"))
     if wide:
-        listed = with_likes([*_short_list(_gained(begun), excess), *listed[:FROM_SCREENING]], effects)
-    if not listed:  # no effect does better than the base parameters alone
-        return None
-    say(f"refitting with {_names(listed)}")
-    fitted = fit_coarse_to_fine(problem, [begun[effect] for effect in listed], rough)
-    fitted = beyond_bounds(fitted, lambda starts: fit_coarse_to_fine(problem, starts, rough), say)
-    blocks = validation_errors(problem, fitted)
-    n = now.model.num_joints
-    tried = len(effects) * n
-    trials: list[list[Trial]] = [[] for _ in range(n)]
-    keep: dict[type[Effect], Fitted] = {}
-    for effect, chosen, after in zip(listed, fitted, blocks, strict=True):
-        for j in now.model.may_get(effect).nonzero()[:, 0].tolist():
-            values = chosen.model.to_physical(chosen.x)[j, chosen.model.columns(effect)].tolist()
-            trial = Trial(
-                effect=effect,
-                joint=j,
-                screen_score=max(float(p.score[j]) for p in probes if p.effect is effect),
-                values=dict(zip([p.name for p in effect.parameters], values, strict=True)),
-            )
-            trials[j].append(trial.judged(errors, after, tried, first))
-        keep[effect] = chosen
-    contenders, evidence = _contenders(trials, floor), {}
-    if weighed := list(dict.fromkeys(effect for own in contenders for effect in own)):
-        say(f"weighing {_names(weighed)}")
-        evidence = log_evidence(problem, {effect: keep[effect] for effect in weighed}, effects, effort)
-    chosen_effects, rivals = _choose(
-        trials, [{effect: float(evidence[effect][j]) for effect in own} for j, own in enumerate(contenders)]
-    )
-    return Round(trials=trials, chosen=chosen_effects, rivals=rivals, models=keep)
+        listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
+    # where nothing is listed no effect does better than the base parameters alone
+    return {effect: begun[effect] for effect in listed}, probes
+
+
+def _evidence(
+    fits: Fits,
+    problem: TwinProblem,
+    models: Mapping[type[Effect], Fitted],
+    weighed: Sequence[Sequence[type[Effect]]],
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    say: Callable[[str], None],
+) -> list[dict[type[Effect], float]]:
+    """Of each joint, the log evidence of effects between which its error does not decide."""
+    every = list(dict.fromkeys(effect for own in weighed for effect in own))
+    if not every:
+        return [{} for _ in weighed]
+    say(f"weighing {_names(every)}")
+    known = log_evidence(fits, problem, {effect: models[effect] for effect in every}, effects, effort)
+    return [{effect: float(known[effect][j]) for effect in own} for j, own in enumerate(weighed)]
 
 
 def with_likes(listed: Sequence[type[Effect]], effects: Sequence[type[Effect]]) -> list[type[Effect]]:
@@ -114,7 +142,10 @@ def with_likes(listed: Sequence[type[Effect]], effects: Sequence[type[Effect]]) 
 
 
 def beyond_bounds(
-    fitted: Sequence[Fitted], refit: Callable[[list[Fitted]], list[Fitted]], say: Callable[[str], None]
+    fitted: Sequence[Fitted],
+    refit: Callable[[list[Fitted]], list[Fitted]],
+    say: Callable[[str], None],
+    at_bound: float,
 ) -> list[Fitted]:
     """The fits, those again that an effect's bound holds back, with bounds as wide as physics allows.
 
@@ -122,18 +153,19 @@ def beyond_bounds(
         fitted: The present model with each effect.
         refit: Fits models from where they start.
         say: Shows how far it is.
+        at_bound: Normalised values beyond this are at a bound.
     """
     result, stuck, starts = list(fitted), [], []
     for k, each in enumerate(fitted):
         effect = each.tried
         if effect is None or effect not in each.model.effects:
             continue
-        joints = each.model.at_bounds(each.x)[each.model.effects.index(effect)]
+        joints = each.model.at_bounds(each.x, at_bound)[each.model.effects.index(effect)]
         model = each.model.widened(effect, joints)
         if torch.equal(model.lower, each.model.lower) and torch.equal(model.upper, each.model.upper):
             continue
         stuck.append(k)
-        starts.append(Fitted.start(model, each.model.to_physical(each.x), tried=effect))
+        starts.append(Fitted.start(model, each.physical, tried=effect))
     if starts:
         say(f"widening the bounds of {_names([start.tried for start in starts if start.tried is not None])}")
         for k, each in zip(stuck, refit(starts), strict=True):
@@ -141,49 +173,52 @@ def beyond_bounds(
     return result
 
 
-def _promising(probes: Sequence[Probe], excess: torch.Tensor) -> dict[type[Effect], torch.Tensor]:
+def _promising(probes: Sequence[Probe], excess: torch.Tensor, least: float) -> dict[type[Effect], torch.Tensor]:
     """What each effect would explain of each joint's error, (n,) [rad²], by its best probe."""
     best: dict[type[Effect], torch.Tensor] = {}
     for probe in probes:
         best[probe.effect] = torch.maximum(best.get(probe.effect, probe.score), probe.score)
-    return {effect: torch.where(score > SCREEN_THRESHOLD, score, 0.0) * excess for effect, score in best.items()}
+    return {effect: torch.where(score > least, score, 0.0) * excess for effect, score in best.items()}
 
 
-def _short_list(explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor) -> list[type[Effect]]:
+def _short_list(
+    explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor, cfg: CandidatesCfg
+) -> list[type[Effect]]:
     """Effects that explain most of the whole robot's error, then those that explain most of the worst joints'.
 
     Args:
         explained: Squared error that each effect explains of each joint, (n,).
         excess: Squared error of each joint that could be explained, (n,); zero where there is nothing to find.
+        cfg: How many are wanted.
     """
     total = {effect: float(values[excess > 0].sum()) for effect, values in explained.items()}
-    wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[:SHORT_LIST]
-    for j in excess.argsort(descending=True)[:WORST_JOINTS].tolist():
+    wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[: cfg.of_robot]
+    for j in excess.argsort(descending=True)[: cfg.of_joint].tolist():
         own = sorted((e for e in explained if explained[e][j] > 0), key=lambda e: -float(explained[e][j]))
-        wanted += own[:PER_JOINT]
+        wanted += own[: cfg.of_joint]
     return list(dict.fromkeys(wanted))
 
 
 def _begun(
-    problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
+    fits: Fits, problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
 ) -> dict[type[Effect] | None, Fitted]:
     """The present model with each effect after a few coarse steps, and without any (None).
 
     Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
     goes on, joint by joint. Far from the floor the best of many points is another start.
     """
-    coarse = problem.coarse()
-    starts = [Fitted.start(now.model, now.model.to_physical(now.x))]
+    coarse, cfg = problem.coarse(), fits.cfg
+    starts = [Fitted.start(now.model, now.physical)]
     for effect in effects:
         own = [probe for probe in probes if probe.effect is effect]
         ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
-        starts += [_start(now, effect, [best[k] for best in ranked]) for k in range(len(ranked[0]))]
+        starts += [_start(now, effect, [best[k] for best in ranked], cfg.candidates) for k in range(len(ranked[0]))]
     if far:
-        starts = _neighbours_together([*starts, *far_starts(coarse, now, effects)])
+        starts = _neighbours_together([*starts, *far_starts(fits, coarse, now, effects)])
     result: dict[type[Effect] | None, Fitted] = {}
-    for each in fit_side_by_side(coarse, starts, max_iteration=_ITERATIONS, part=_PART):
+    for each in fits.side_by_side(coarse, starts, cfg.fitting.again, part=cfg.fitting.part):
         best = result.setdefault(each.tried, each)
-        best.take(each, each.score < best.score)
+        result[each.tried] = best.merged(each, each.score < best.score)
     return result
 
 
@@ -216,95 +251,8 @@ def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], t
     return {effect: (without - each.score).clamp(min=0.0) for effect, each in begun.items() if effect is not None}
 
 
-def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe]) -> Fitted:
+def _start(now: Fitted, effect: type[Effect], probes: Sequence[Probe], cfg: CandidatesCfg) -> Fitted:
     """The present model with an effect at each joint's probe."""
-    own = torch.stack([starts_of(probe)[j] for j, probe in enumerate(probes)])
-    physical = now.model.to_physical(now.x)
-    model, physical = now.model.extended(physical, effect, now.model.may_get(effect), own)
+    own = torch.stack([starts_of(probe, cfg)[j] for j, probe in enumerate(probes)])
+    model, physical = now.model.extended(now.physical, effect, now.model.allowed_joints(effect), own)
     return Fitted.start(model.structure_held(effect, physical), physical, tried=effect)
-
-
-def _contenders(trials: Sequence[Sequence[Trial]], floor: torch.Tensor) -> list[list[type[Effect]]]:
-    """Of each joint, effects between which the error alone does not decide: near to each other, and far from the floor.
-
-    Args:
-        trials: Of each joint.
-        floor: Of each joint, (n,) [rad].
-    """
-    found: list[list[type[Effect]]] = []
-    for own, least in zip(trials, floor.tolist(), strict=True):
-        # where none is significant, what is weighed is not chosen, but told first
-        pool = [trial for trial in own if trial.significant] or [trial for trial in own if trial.ratio >= FIRST_RATIO]
-        near = _near(pool, CONTENDERS)
-        alike = len(near) > 1 and near[0].mse_after > (FAR * least) ** 2
-        found.append([trial.effect for trial in near] if alike else [])
-    return found
-
-
-def _near(trials: Sequence[Trial], factor: float) -> list[Trial]:
-    """A joint's best trials, up to a factor of the best one's RMSE, best first."""
-    ordered = sorted(trials, key=lambda trial: trial.mse_after)
-    return [trial for trial in ordered if trial.mse_after <= ordered[0].mse_after * factor**2]
-
-
-def _choose(
-    trials: list[list[Trial]], evidence: Sequence[Mapping[type[Effect], float]]
-) -> tuple[list[type[Effect] | None], list[list[type[Effect]]]]:
-    """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest.
-
-    Where rivals were weighed, the one with the most evidence in place of the simplest.
-
-    Args:
-        trials: Of each joint; ordered here: those that were weighed by their evidence, then the others by their error.
-        evidence: Of each joint, the log evidence of effects that were weighed.
-    """
-    wanted: dict[type[Effect], int] = {}
-    near: list[list[Trial]] = []
-    refused = _worse_for_the_robot(trials)
-    for own, known in zip(trials, evidence, strict=True):
-        own.sort(key=lambda t: (-known.get(t.effect, -math.inf), t.mse_after))
-        good = [t for t in own if t.significant and t.effect not in refused]
-        weighed = [t for t in good if t.effect in known]
-        close = weighed if len(weighed) > 1 else _near(good, RIVAL)
-        near.append(close)
-        for trial in close:
-            wanted[trial.effect] = wanted.get(trial.effect, 0) + 1
-    chosen: list[type[Effect] | None] = []
-    rivals: list[list[type[Effect]]] = []
-    for close, known in zip(near, evidence, strict=True):
-        if not close:
-            chosen.append(None)
-            rivals.append([])
-            continue
-        most = max(wanted[t.effect] for t in close)
-        left = [t for t in close if wanted[t.effect] == most]
-        are_weighed = all(trial.effect in known for trial in left)
-        best = max(left, key=lambda t: known[t.effect]) if are_weighed else _simplest(left)
-        chosen.append(best.effect)
-        most_alike = RIVAL**2 * best.mse_after
-        rivals.append([t.effect for t in close if t.effect is not best.effect and t.mse_after <= most_alike])
-    return chosen, rivals
-
-
-def _simplest(trials: Sequence[Trial]) -> Trial:
-    """The best trial of a joint, or one with fewer numbers that is as good."""
-    least = min(t.mse_after for t in trials)
-    alike = [t for t in trials if t.mse_after <= ALIKE**2 * least]
-    return min(alike, key=lambda t: (len(t.effect.parameters), t.mse_after))
-
-
-def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]:
-    """Effects that all joints share by their nature, and that leave more over all joints than effects of their own."""
-    good = [[trial for trial in own if trial.significant] for own in trials if own]
-    before = [own[0].mse_before for own in trials if own]
-
-    def left(effects: set[type[Effect]]) -> float:
-        """Squared error over all joints with the best of some effects."""
-        return sum(
-            min([without, *(t.mse_after for t in own if t.effect in effects)])
-            for own, without in zip(good, before, strict=True)
-        )
-
-    found = {trial.effect for own in good for trial in own}
-    shared = {effect for effect in found if effect.shared}
-    return {effect for effect in shared if left({effect}) > left(found - shared)}

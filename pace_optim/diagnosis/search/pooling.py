@@ -7,19 +7,16 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
-from pace_optim.diagnosis.judging.validation import validation_errors
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.judging.comparison import within
+from pace_optim.diagnosis.judging.decisions import Log, decision, unlogged
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 
-_COST = 1.05
-"""Squared validation error, as a multiple of that with a value for each joint, that one value for all may cost."""
-_ITERATIONS = 5
 _RIDGE = 1e-12
 
 
-def share(outcome: Outcome) -> None:
+def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
     """Give each effect found on several joints one value for all of them, where that explains as much.
 
     The value is the joints' mean, weighted by how well each is known beside its other parameters (the Schur
@@ -29,17 +26,23 @@ def share(outcome: Outcome) -> None:
         if effect.shared or int(has.sum()) < 2:
             continue
         held = _held(outcome.final, effect, has)
-        fitted = fit_side_by_side(outcome.problem, [held], _ITERATIONS, keep_jacobian=True)[0]
-        errors = validation_errors(outcome.problem, [fitted])[0]
-        if float(errors.mse[has].sum()) <= _COST * float(outcome.final_errors.mse[has].sum()):
-            _take(outcome, fitted, errors, effect)
+        fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.fitting.settle, keep_jacobian=True)[0]
+        errors = fits.validation_errors(outcome.problem, [fitted])[0]
+        with_one, with_own = (float(each.mse[has].sum()) for each in (errors, outcome.final_errors))
+        taken = within(with_one, with_own, fits.cfg.judging.as_good)
+        joints = has.nonzero()[:, 0].tolist()
+        names = dict.fromkeys(joints if taken else [], effect.name)
+        log(decision("pool", joints, outcome.final_errors, {effect.name: errors}, names))
+        if taken:
+            outcome = replace(_pooled(outcome, fitted, effect), final_errors=errors)
+    return outcome
 
 
 def _held(now: Fitted, effect: type[Effect], has: torch.Tensor) -> Fitted:
     """The model with the effect's values held at the joints' common one."""
     model, columns = now.model, now.model.columns(effect)
     common = _common(now, columns, has)
-    physical = model.to_physical(now.x)
+    physical = now.physical
     at = model.to_normalised(physical)
     at[has, columns] = common
     physical[has, columns] = model.to_physical(at)[has, columns]
@@ -51,7 +54,7 @@ def _held(now: Fitted, effect: type[Effect], has: torch.Tensor) -> Fitted:
 def _common(now: Fitted, columns: slice, has: torch.Tensor) -> torch.Tensor:
     """Weighted mean of the normalised values, (parameters,)."""
     if now.jacobian is None:
-        raise ValueError("Sharing needs a model that was fitted with keep_jacobian.")
+        raise ValueError("Pooling needs a model that was fitted with keep_jacobian.")
     size = now.model.size
     own = torch.arange(size)[columns]
     others = torch.tensor([p for p in range(size) if p not in own.tolist()])
@@ -68,10 +71,8 @@ def _common(now: Fitted, columns: slice, has: torch.Tensor) -> torch.Tensor:
     return torch.linalg.solve(weight, moment).clamp(-1.0, 1.0)
 
 
-def _take(outcome: Outcome, fitted: Fitted, errors: BlockErrors, effect: type[Effect]) -> None:
-    """Let the model with the common value be the final one, with the bounds that it had."""
+def _pooled(outcome: Outcome, fitted: Fitted, effect: type[Effect]) -> Outcome:
+    """The outcome with the common value in its final model, and the bounds that that had."""
     model = outcome.final.model
-    shared = replace(model, shared=model.shared | {effect})
-    x = model.to_normalised(fitted.model.to_physical(fitted.x))
-    outcome.final = replace(fitted, model=shared, x=x)
-    outcome.final_errors = errors
+    pooled = replace(model, shared=model.shared | {effect})
+    return replace(outcome, final=replace(fitted, model=pooled, x=model.to_normalised(fitted.physical)))

@@ -2,118 +2,123 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.judging.acceptance import BlockErrors, judge
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.comparison import judge, within
+from pace_optim.diagnosis.judging.decisions import decision
 from pace_optim.diagnosis.judging.some_joints import SomeJoints
-from pace_optim.diagnosis.judging.validation import validation_errors
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.single_joint_model.problem import TwinProblem
-
-SUPERFLUOUS = 1.05
-"""An older effect is dropped where the validation RMSE without it is no larger than this multiple."""
+from pace_optim.diagnosis.search.state import Branch, Search
 
 
-def pruned(
-    problem: TwinProblem, now: Fitted, errors: BlockErrors, newest: Sequence[type[Effect] | None]
-) -> tuple[Fitted, BlockErrors]:
-    """Drop what the newest effects made superfluous: an older effect without which a joint's error is no larger.
+def drop_superfluous(search: Search, branch: Branch) -> Branch:
+    """Drop what the newest effects made superfluous: an older effect without which a joint's error is as good.
 
-    Args:
-        problem: The joints simulated alone.
-        now: The present model.
-        errors: Its errors.
-        newest: Each joint's newest effect, which stays.
+    Each joint's newest effect stays.
     """
+    model, newest = branch.now.model, branch.rounds[-1].chosen
     latest = torch.tensor([e is not None for e in newest])
     older = {
         effect: has & latest & torch.tensor([e is not effect for e in newest])
-        for effect, has in zip(now.model.effects, now.model.has, strict=True)
+        for effect, has in zip(model.effects, model.has, strict=True)
     }
-    without = Without(problem, now, errors, older)
+    left = LeftOut.of(search, branch, older)
+    if left.tried:
+        search.say("trying to do without what was found earlier")
     dropped = {}
-    for j, effects in without.tried.items():
-        best = min(effects, key=lambda effect: without.mse(effect, j))
-        if without.mse(best, j) <= SUPERFLUOUS**2 * float(errors.mse[j]):
+    for j, effects in left.tried.items():
+        best = min(effects, key=lambda effect: left.mse(effect, j))
+        if within(left.mse(best, j), float(branch.errors.mse[j]), search.cfg.judging.as_good):
             dropped[j] = best
-    return without.dropping(dropped)
+    _tell(search, branch, "drop", left, dropped)
+    return _without(search, branch, left, dropped)
 
 
-def pruned_at_last(problem: TwinProblem, now: Fitted, errors: BlockErrors, tried: int) -> tuple[Fitted, BlockErrors]:
+def drop_last(search: Search, branch: Branch) -> Branch:
     """Drop, one after another, effects that would not be added to the others of their joint now.
 
     When they were found, others were missing, and neighbours moved wrongly.
-
-    Args:
-        problem: The joints simulated alone.
-        now: The model at the end of the search.
-        errors: Its errors.
-        tried: How many candidates were tried, over all joints.
     """
-    open_joints = torch.ones(now.model.num_joints, dtype=torch.bool)
+    begun = branch
+    open_joints = torch.ones(branch.now.model.num_joints, dtype=torch.bool)
     while True:
-        several = open_joints & (now.model.has.sum(dim=0) > 1)
-        own = zip(now.model.effects, now.model.has, strict=True)
-        without = Without(problem, now, errors, {e: has & several for e, has in own if not e.shared})
+        model, tried = branch.now.model, search.tried_over_joints
+        several = open_joints & (model.has.sum(dim=0) > 1)
+        own = zip(model.effects, model.has, strict=True)
+        left = LeftOut.of(search, branch, {e: has & several for e, has in own if not e.shared})
         dropped = {}
-        for j, effects in without.tried.items():
-            least = min(effects, key=lambda effect: without.mse(effect, j))
-            if not judge(without.errors[least], errors, j, tried, first=False).significant:
+        for j, effects in left.tried.items():
+            least = min(effects, key=lambda effect: left.mse(effect, j))
+            pays = judge(left.errors[least], branch.errors, j, tried, first=False, cfg=search.cfg.judging)
+            if not pays.significant:
                 dropped[j] = least
+        _tell(search, branch, "drop_last", left, dropped)
         if not dropped:
-            return now, errors
-        now, errors = without.dropping(dropped)
-        open_joints = torch.tensor([j in dropped for j in range(now.model.num_joints)])
+            return branch if branch is begun else search.along_own_motion(branch, branch.now)
+        branch = _without(search, branch, left, dropped)
+        open_joints = torch.tensor([j in dropped for j in range(model.num_joints)])
 
 
-class Without:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LeftOut:
     """A model without each of its effects in turn, the rest refitted."""
 
-    def __init__(
-        self, problem: TwinProblem, now: Fitted, errors: BlockErrors, effects: Mapping[type[Effect], torch.Tensor]
-    ):
-        """Refit.
+    tried: Mapping[int, list[type[Effect]]] = field(default_factory=dict)
+    """Joint -> effects left out of it."""
+    fitted: Mapping[type[Effect], Fitted] = field(default_factory=dict)
+    """Effect -> the model without it."""
+    errors: Mapping[type[Effect], BlockErrors] = field(default_factory=dict)
+    """Effect -> errors without it."""
 
-        Args:
-            problem: The joints simulated alone.
-            now: The model.
-            errors: Its errors.
-            effects: What is left out, and of which joints, (n,) bool.
-        """
-        self._problem, self._now, self._now_errors = problem, now, errors
-        model, physical = now.model, now.model.to_physical(now.x)
+    @classmethod
+    def of(cls, search: Search, branch: Branch, effects: Mapping[type[Effect], torch.Tensor]) -> LeftOut:
+        """Refit a branch's model without each of some effects; where each is left out, (n,) bool."""
         effects = {effect: joints for effect, joints in effects.items() if bool(joints.any())}
-        self.tried: dict[int, list[type[Effect]]] = {}
-        """Joint -> effects left out of it."""
+        if not effects:
+            return cls()
+        now = branch.now
+        tried: dict[int, list[type[Effect]]] = {}
         for effect, joints in effects.items():
             for j in joints.nonzero()[:, 0].tolist():
-                self.tried.setdefault(j, []).append(effect)
-        self.errors: dict[type[Effect], BlockErrors] = {}
-        """Effect -> errors without it."""
-        self._fitted: dict[type[Effect], Fitted] = {}
-        if effects:
-            starts = [Fitted.start(model.without_effect(e, joints), physical, tried=e) for e, joints in effects.items()]
-            part = SomeJoints(torch.stack(list(effects.values())).any(dim=0))
-            fitted, after = part.refitted(problem, starts, errors)
-            self.errors = dict(zip(effects, after, strict=True))
-            self._fitted = dict(zip(effects, fitted, strict=True))
+                tried.setdefault(j, []).append(effect)
+        starts = [
+            Fitted.start(now.model.without_effect(effect, joints), now.physical, tried=effect)
+            for effect, joints in effects.items()
+        ]
+        part = SomeJoints(torch.stack(list(effects.values())).any(dim=0))
+        fitted, after = part.refitted(search.fits, branch.problem, starts, branch.errors)
+        return cls(
+            tried=tried, fitted=dict(zip(effects, fitted, strict=True)), errors=dict(zip(effects, after, strict=True))
+        )
 
     def mse(self, effect: type[Effect], joint: int) -> float:
         """Of a joint without an effect [rad²]."""
         return float(self.errors[effect].mse[joint])
 
-    def dropping(self, effects: Mapping[int, type[Effect]]) -> tuple[Fitted, BlockErrors]:
-        """The model without an effect on some joints, {joint: effect}, fitted, and its errors."""
-        if not effects:
-            return self._now, self._now_errors
-        model, x = self._now.model, self._now.x.clone()
-        for j, effect in effects.items():
-            model = model.without_effect(effect, torch.arange(model.num_joints) == j)
-            x[j] = self._fitted[effect].x[j]
-        left = Fitted.start(model, model.to_physical(x))
-        now = fit_side_by_side(self._problem, [left], max_iteration=4, keep_jacobian=True)[0]
-        return now, validation_errors(self._problem, [now])[0]
+
+def _without(search: Search, branch: Branch, left: LeftOut, dropped: Mapping[int, type[Effect]]) -> Branch:
+    """The branch without an effect on some joints, fitted along the same motion."""
+    if not dropped:
+        return branch
+    model, x = branch.now.model, branch.now.x.clone()
+    for j, effect in dropped.items():
+        model = model.without_effect(effect, torch.arange(model.num_joints) == j)
+        x[j] = left.fitted[effect].x[j]
+    start, iterations = Fitted.start(model, model.to_physical(x)), search.cfg.fitting.settle
+    now = search.fits.side_by_side(branch.problem, [start], iterations, keep_jacobian=True)[0]
+    return replace(branch, now=now, errors=search.fits.validation_errors(branch.problem, [now])[0])
+
+
+def _tell(search: Search, branch: Branch, rule: str, left: LeftOut, dropped: Mapping[int, type[Effect]]) -> None:
+    if left.tried:
+        after = {effect.name: errors for effect, errors in left.errors.items()}
+        on = {effect.name: [j for j, own in left.tried.items() if effect in own] for effect in left.errors}
+        names = {j: effect.name for j, effect in dropped.items()}
+        search.log(
+            decision(rule, list(left.tried), branch.errors, after, names, on, candidates=search.tried_over_joints)
+        )

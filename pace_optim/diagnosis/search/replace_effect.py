@@ -2,87 +2,95 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
-from pace_optim.diagnosis.judging.acceptance import BlockErrors
-from pace_optim.diagnosis.judging.candidate_results import NEXT_FLOOR, RIVAL, Round, near_trials
+from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
+from pace_optim.diagnosis.judging.comparison import within
+from pace_optim.diagnosis.judging.decisions import decision
 from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.single_joint_model.problem import TwinProblem
+from pace_optim.diagnosis.search.state import Branch, Search
 
-_PER_JOINT = 3
-"""How many effects are tried in place of one that a newer effect has joined."""
-
-_Exchange = dict[int, tuple[type[Effect], Round]]
-"""Joint -> the effect that another one takes the place of, and the round that it was chosen in."""
+_Exchange = dict[int, tuple[type[Effect], int]]
+"""Joint -> the effect that another one takes the place of, and the round that it was chosen in, by index."""
 
 
-def swapped(
-    problem: TwinProblem, now: Fitted, errors: BlockErrors, rounds: Sequence[Round], floor: torch.Tensor
-) -> Fitted | None:
-    """Try what each joint could have had instead, now that the rest is known; ``None`` if nothing is better.
+def replace_effects(search: Search, branch: Branch) -> Branch:
+    """Try what each joint could have had instead, now that the rest is known; the same branch if nothing is better.
 
     When an effect was chosen, its neighbours moved as the base model does, and effects that were found since were
     missing: what came close then may be the right one. Where both do equally well, joints agree on the effect that most
     of them want.
-
-    Args:
-        problem: The joints simulated alone, along the motion of the present model.
-        now: The present model.
-        errors: Its errors.
-        rounds: What was tried; their choices are updated.
-        floor: Nearer to this RMSE of each joint there is nothing to gain, (n,) [rad].
     """
-    exchanges = _exchanges(now, rounds, errors.mse.sqrt() > NEXT_FLOOR * floor)
+    cfg, now, errors, rounds = search.cfg.judging, branch.now, branch.errors, list(branch.rounds)
+    exchanges = _exchanges(now, rounds, errors.mse.sqrt() > cfg.near * search.at_floor, cfg)
     if not exchanges:
-        return None
-    starts = [_start(now, effect, joints) for effect, joints in exchanges.items()]
+        return branch
+    search.say("trying others in place of what was found")
+    starts = [_start(now, rounds, effect, joints) for effect, joints in exchanges.items()]
     which = torch.zeros(now.model.num_joints, dtype=torch.bool)
     which[[j for joints in exchanges.values() for j in joints]] = True
-    fitted, blocks = SomeJoints(which).refitted(problem, starts, errors)
+    fitted, blocks = SomeJoints(which).refitted(search.fits, branch.problem, starts, errors)
     after, models = dict(zip(exchanges, blocks, strict=True)), dict(zip(exchanges, fitted, strict=True))
-    chosen = _choose(now, errors, exchanges, {effect: block.mse for effect, block in after.items()})
+    chosen = _choose(now, errors, exchanges, {effect: block.mse for effect, block in after.items()}, cfg)
+    search.log(
+        decision(
+            "replace",
+            which.nonzero()[:, 0].tolist(),
+            errors,
+            {effect.name: own for effect, own in after.items()},
+            {j: effect.name for j, effect in chosen.items()},
+            {effect.name: list(joints) for effect, joints in exchanges.items()},
+        )
+    )
     if not chosen:
-        return None
-    model, physical = now.model, now.model.to_physical(now.x)
+        return branch
+    model, physical = now.model, now.physical
     for j, effect in chosen.items():
-        (old, this), here = exchanges[effect][j], torch.arange(model.num_joints) == j
+        (old, at), here = exchanges[effect][j], torch.arange(model.num_joints) == j
         model, physical = exchanged(model, physical, here, [old], models[effect], effect, now.model.size)
-        this.exchange(j, effect, tie=float(errors.mse[j]) <= RIVAL**2 * float(after[effect].mse[j]))
-    return fit_side_by_side(problem.in_windows(), [Fitted.start(model, physical)], max_iteration=6)[0]
+        alike = within(float(errors.mse[j]), float(after[effect].mse[j]), cfg.alike)
+        rounds[at] = rounds[at].exchanged(j, effect, tie=alike)
+    start, iterations = Fitted.start(model, physical), search.cfg.fitting.again
+    other = search.fits.side_by_side(branch.problem.in_windows(), [start], iterations)[0]
+    return search.along_own_motion(replace(branch, rounds=tuple(rounds)), other)
 
 
-def _exchanges(now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor) -> dict[type[Effect], _Exchange]:
+def _exchanges(
+    now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor, cfg: JudgingCfg
+) -> dict[type[Effect], _Exchange]:
     """What is tried in place of what, joint by joint."""
     model = now.model
     in_use = {effect for effect, has in zip(model.effects, model.has, strict=True) if bool(has.any())}
     result: dict[type[Effect], _Exchange] = {}
-    for this in rounds:
+    for at, this in enumerate(rounds):
         for j, old in enumerate(this.chosen):
             if old is None or old not in in_use or not bool(model.has[model.effects.index(old), j]):
                 continue
             several = int(model.has[:, j].sum()) > 1 and bool(unexplained[j])
             without = model.without_effect(old, torch.arange(model.num_joints) == j)
-            near = [t for t in near_trials(this.trials[j], old) if bool(without.may_get(t.effect)[j])]
-            own = [t.effect for t in near if t.significant][: _PER_JOINT if several else 0]
+            near = [t for t in near_trials(this.trials[j], old, cfg=cfg) if bool(without.allowed_joints(t.effect)[j])]
+            own = [t.effect for t in near if t.significant][: cfg.in_place if several else 0]
             # what other joints have need not have stood out here
             wanted = [t.effect for t in near if t.effect in in_use or t.effect in own]
             for effect in wanted:
-                result.setdefault(effect, {}).setdefault(j, (old, this))
+                result.setdefault(effect, {}).setdefault(j, (old, at))
     return result
 
 
-def _start(now: Fitted, effect: type[Effect], joints: _Exchange) -> Fitted:
+def _start(now: Fitted, rounds: Sequence[Round], effect: type[Effect], joints: _Exchange) -> Fitted:
     """The present model with an effect, as it was fitted in its round, in place of others."""
-    model, physical = now.model, now.model.to_physical(now.x)
-    for j, (old, this) in joints.items():
+    model, physical = now.model, now.physical
+    for j, (old, at) in joints.items():
         here = torch.arange(model.num_joints) == j
-        model, physical = exchanged(model, physical, here, [old], this.models[effect], effect, len(BASE))
+        model, physical = exchanged(model, physical, here, [old], rounds[at].models[effect], effect, len(BASE))
     return Fitted.start(model, physical, tried=effect)
 
 
@@ -106,7 +114,7 @@ def exchanged(
         effect: What they get.
         size: How many of the first entries come along with those of the effect.
     """
-    values = source.model.to_physical(source.x)
+    values = source.physical
     for each in old:
         model = model.without_effect(each, joints)
     model, physical = model.extended(physical, effect, joints, values[:, source.model.columns(effect)])
@@ -117,8 +125,9 @@ def exchanged(
 def _choose(
     now: Fitted,
     errors: BlockErrors,
-    exchanges: dict[type[Effect], _Exchange],
-    after: dict[type[Effect], torch.Tensor],
+    exchanges: Mapping[type[Effect], _Exchange],
+    after: Mapping[type[Effect], torch.Tensor],
+    cfg: JudgingCfg,
 ) -> dict[int, type[Effect]]:
     """Joints that change, with their new effect: the best of each; among rivals, the one most wanted."""
     model = now.model
@@ -127,7 +136,7 @@ def _choose(
         options = {effect: float(after[effect][j]) for effect, joints in exchanges.items() if j in joints}
         options |= {joints[j][0]: float(errors.mse[j]) for joints in exchanges.values() if j in joints}
         least = min(options.values())
-        near[j] = {effect: mse for effect, mse in options.items() if mse <= RIVAL**2 * least}
+        near[j] = {effect: mse for effect, mse in options.items() if within(mse, least, cfg.alike)}
     wanted: dict[type[Effect], int] = {}
     for j in range(model.num_joints):
         own = near.get(j, [e for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])])

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.next_experiment import next_experiments
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.problem.problem import Problem

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import Effect
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import whole_values
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.excitation import make_excitation
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
@@ -20,11 +21,6 @@ from pace_optim.recording.dataset import make_dataset
 from pace_optim.terminal.cli import command
 
 _MOTIONS = ("chirp", "multisine", "ramp", "steps")
-_DURATION = 10.0
-_GAIN = 1.5
-_LOAD = 1.5
-_CLEAR = 3.0
-"""Predictions that part by fewer times the noise than this are not told apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,15 +69,15 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
     pairs = rivals_of(outcome)
     if not pairs or problem.env_cfg.sim2real.excitation is None:
         return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
-    predictions = [each for pair in pairs for each in _predictions(problem, pair, noise)]
+    predictions = [each for pair in pairs for each in _predictions(problem, pair, noise, outcome.cfg.verdict)]
     result = []
-    clear = [each for each in predictions if each.times >= _CLEAR]
+    clear = [each for each in predictions if each.times >= outcome.cfg.verdict.clearly]
     while clear:
         best = _most_telling(clear)
         result.append(_sentence(best, problem))
         told = [each.pair for each in best]
         clear = [each for each in clear if each.pair not in told]
-    seen = [each.pair for each in predictions if each.times >= _CLEAR]
+    seen = [each.pair for each in predictions if each.times >= outcome.cfg.verdict.clearly]
     for pair in [pair for pair in pairs if pair not in seen]:
         count = sum(each.pair is pair for each in predictions)
         text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
@@ -89,8 +85,8 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
     return result
 
 
-def _predictions(problem: Problem, pair: Rivals, noise: torch.Tensor) -> list[Prediction]:
-    choices = list(menu(problem, pair.joints[0]))
+def _predictions(problem: Problem, pair: Rivals, noise: torch.Tensor, cfg: VerdictCfg) -> list[Prediction]:
+    choices = list(menu(problem, pair.joints[0], cfg=cfg))
     apart = distances(problem, pair, [choice.recording for choice in choices]).tolist()
     level = float(noise[pair.joints].mean())
     return [
@@ -141,19 +137,19 @@ def rivals_of(outcome: Outcome) -> list[Rivals]:
     return result
 
 
-def menu(problem: Problem, joint: int) -> Iterator[Choice]:
+def menu(problem: Problem, joint: int, *, cfg: VerdictCfg = DEFAULT.verdict) -> Iterator[Choice]:
     """Every motion as the robot was, with a larger proportional gain, and with more load on a joint."""
     like = problem.dataset.recordings[problem.dataset.trained()[0]]
-    conditions = [("", "", like), *_other_gain(like), *_other_load(problem, like, joint)]
+    conditions = [("", "", like), *_other_gain(like, cfg), *_other_load(problem, like, joint, cfg)]
     for motion in _MOTIONS:
         trajectory = make_excitation(
-            motion, problem.env_cfg.sim2real, control_dt=problem.control_dt, duration=_DURATION
+            motion, problem.env_cfg.sim2real, control_dt=problem.control_dt, duration=cfg.duration
         )[0]
         target = trajectory.des_dof_pos
         for words, arguments, facts in conditions:
             yield Choice(
-                words=f"Another recording ({motion}, {_DURATION:g} s{words})",
-                arguments=f"--excitation {motion} --duration {_DURATION:g}{arguments}",
+                words=f"Another recording ({motion}, {cfg.duration:g} s{words})",
+                arguments=f"--excitation {motion} --duration {cfg.duration:g}{arguments}",
                 recording=Recording(
                     name=motion,
                     joint_names=problem.joint_names,
@@ -178,25 +174,25 @@ def distances(problem: Problem, pair: Rivals, recordings: Sequence[Recording]) -
     return (errors[0] - errors[1]).square().mean(dim=(0, 2)).sqrt()
 
 
-def _other_gain(like: Recording) -> Iterator[tuple[str, str, Recording]]:
+def _other_gain(like: Recording, cfg: VerdictCfg) -> Iterator[tuple[str, str, Recording]]:
     stiffness = like.drive.stiffness
     if stiffness is None:
         return
-    words = f", {_GAIN:g} times the proportional gain"
+    words = f", {cfg.factor:g} times the proportional gain"
     same = bool(np.ptp(stiffness) < 1e-9)
-    arguments = f" --stiffness {_GAIN * stiffness[0]:g}" if same else ""
-    yield words, arguments, replace(like, drive=replace(like.drive, stiffness=_GAIN * stiffness))
+    arguments = f" --stiffness {cfg.factor * stiffness[0]:g}" if same else ""
+    yield words, arguments, replace(like, drive=replace(like.drive, stiffness=cfg.factor * stiffness))
 
 
-def _other_load(problem: Problem, like: Recording, joint: int) -> Iterator[tuple[str, str, Recording]]:
+def _other_load(problem: Problem, like: Recording, joint: int, cfg: VerdictCfg) -> Iterator[tuple[str, str, Recording]]:
     if like.load.load_mass is not None:
-        mass = round(_LOAD * like.load.load_mass, 2)
+        mass = round(cfg.factor * like.load.load_mass, 2)
         yield f", {mass:g} kg on the arm", f" --load_mass {mass:g}", _loaded(like, load_mass=mass)
         return
     env = problem.make_env(1)
     model = env.sim.model
     body = model.body(int(model.jnt_bodyid[model.joint(problem.joint_names[joint]).id]))
-    mass = max(0.1, round((_LOAD - 1) * float(body.mass[0]), 1))
+    mass = max(1, round(10 * (cfg.factor - 1) * float(body.mass[0]))) / 10
     env.close()
     added = {**like.load.added_mass, body.name: like.load.added_mass.get(body.name, 0.0) + mass}
     yield (

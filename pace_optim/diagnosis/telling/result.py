@@ -12,7 +12,7 @@ VERSION = 1
 FILE = "diagnosis.json"
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """The content of ``diagnosis.json``; field names are the file's keys."""
 
@@ -59,6 +59,8 @@ class Diagnosis:
     error_map: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Which variable carries what is missing, on each joint whose error effects do not explain: what part of it each
     curve explains by itself, and the best curve."""
+    cfg: dict[str, Any] = field(default_factory=dict)
+    """The numbers that it was made with."""
     wall_time_s: float = 0.0
 
     def save(self, folder: str | Path) -> Path:

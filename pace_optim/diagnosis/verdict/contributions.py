@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pace_actuators.effects import Effect
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.search.search import Outcome
-
-DOMINANT = 0.5
-"""An effect with less than this share is one among several."""
+from pace_optim.diagnosis.search.state import Outcome
 
 
-def shares(outcome: Outcome) -> dict[type[Effect], float]:
+def contributions(fits: Fits, outcome: Outcome) -> dict[type[Effect], float]:
     """The share of each effect found, the largest first; shares add up to 1.
 
     Each is left out in turn and the rest is fitted again. What the squared validation error rises by then is due to it;
@@ -21,10 +19,9 @@ def shares(outcome: Outcome) -> dict[type[Effect], float]:
     found = [(effect, has) for effect, has in zip(now.model.effects, now.model.has, strict=True) if bool(has.any())]
     if len(found) < 2:
         return {effect: 1.0 for effect, _ in found}
-    physical = now.model.to_physical(now.x)
-    without = [Fitted.start(now.model.without_effect(effect, has), physical, tried=effect) for effect, has in found]
+    without = [Fitted.start(now.model.without_effect(effect, has), now.physical, tried=effect) for effect, has in found]
     part = SomeJoints(now.model.has.any(dim=0))
-    _, after = part.refitted(outcome.problem, without, outcome.final_errors)
+    _, after = part.refitted(fits, outcome.problem, without, outcome.final_errors)
     rise = {
         effect: float((errors.mse - outcome.final_errors.mse)[has].clamp(min=0.0).sum())
         for (effect, has), errors in zip(found, after, strict=True)

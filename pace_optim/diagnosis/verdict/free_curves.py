@@ -10,23 +10,20 @@ import torch
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
-from pace_optim.diagnosis.judging.acceptance import BlockErrors, judge
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.comparison import judge
+from pace_optim.diagnosis.judging.decisions import Log, decision, unlogged
 from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
-from pace_optim.diagnosis.search.search import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import EXPLAINED, above_floor, near_floor
+from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.verdict.proxy_effects import above_floor, near_floor
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_BETTER = 0.5
-"""A curve says more than the effects found where it leaves less than this part of the squared error that they leave."""
-_REACHED = 0.998
-"""Quantile of a variable up to which the knots of a curve reach."""
-_WORTH_A_WORD = 0.1
-"""With less than this part explained a curve is not told of, nor drawn."""
 
-
-@dataclass(kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
     """Each curve by itself on top of the base model, on the joints that effects leave far from the floor."""
 
@@ -50,7 +47,13 @@ class Curves:
         return int(self.explained[:, joint].argmax())
 
 
-def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None] = lambda _: None) -> Curves | None:
+def fit_curves(
+    fits: Fits,
+    outcome: Outcome,
+    floor: torch.Tensor,
+    say: Callable[[str], None] = lambda _: None,
+    log: Log = unlogged,
+) -> Curves | None:
     """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
@@ -58,9 +61,11 @@ def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None]
     effect that the whole robot shares are left out.
 
     Args:
+        fits: Fits models.
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
         say: Shows how far it is.
+        log: Gets the decision.
     """
     model = outcome.final.model
     joints = ~near_floor(outcome, floor)
@@ -69,35 +74,40 @@ def fit_curves(outcome: Outcome, floor: torch.Tensor, say: Callable[[str], None]
     if not bool(joints.any()):
         return None
     say("fitting curves of any form in place of effects")
-    ranges = _ranges(outcome.problem, outcome.base)
+    ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
     known = (get_effect(name) for name in available_effects())
     effects = [each for each in known if issubclass(each, FreeForm) and each.variable in ranges]
-    without = Fitted.start(outcome.base.model, outcome.base.model.to_physical(outcome.base.x))
+    without = Fitted.start(outcome.base.model, outcome.base.physical)
     starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
-    models, errors = SomeJoints(joints).refitted(outcome.problem, starts, outcome.base_errors)
+    models, errors = SomeJoints(joints).refitted(fits, outcome.problem, starts, outcome.base_errors)
     above = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
-    found = Curves(
+    explained = torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0)
+    best = explained.argmax(dim=0)
+    _, left = above_floor(outcome, floor)
+    tried, cfg, instead = len(effects) * int(joints.sum()), outcome.cfg, torch.zeros_like(joints)
+    for j in joints.nonzero()[:, 0].tolist():
+        k, has_effects = int(best[j]), bool(model.has[:, j].any())
+        now = outcome.final_errors if has_effects else errors[0]
+        pays = judge(now, errors[1 + k], j, tried, first=not has_effects, cfg=cfg.judging).significant
+        says_more = not has_effects or float(above[1 + k, j]) < cfg.verdict.most * float(left[j])
+        instead[j] = pays and says_more and float(explained[k, j]) >= cfg.verdict.most
+        taken = {j: effects[k].name} if instead[j] else {}
+        facts = {"candidates": tried, "first": not has_effects, "floor": [float(floor[j])], "left": [float(left[j])]}
+        facts["base"] = [float(errors[0].mse[j])]
+        log(decision("curves", [j], now, {effects[k].name: errors[1 + k]}, taken, None, **facts))
+    return Curves(
         joints=joints,
         effects=effects,
         models=models[1:],
         errors=errors[1:],
         base_errors=errors[0],
-        explained=torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0),
-        instead=torch.zeros_like(joints),
+        explained=explained,
+        instead=instead,
     )
-    _, left = above_floor(outcome, floor)
-    tried = len(effects) * int(joints.sum())
-    for j in joints.nonzero()[:, 0].tolist():
-        k, has_effects = found.best(j), bool(model.has[:, j].any())
-        now = outcome.final_errors if has_effects else found.base_errors
-        pays = judge(now, found.errors[k], j, tried, first=not has_effects).significant
-        says_more = not has_effects or float(above[1 + k, j]) < _BETTER * float(left[j])
-        found.instead[j] = pays and says_more and float(found.explained[k, j]) >= EXPLAINED
-    return found
 
 
-def take_curves(outcome: Outcome, curves: Curves) -> None:
-    """Let the final model have a joint's best curve in place of its effects, where that says more."""
+def take_curves(outcome: Outcome, curves: Curves) -> Outcome:
+    """The outcome with a joint's best curve in place of its effects, where that says more."""
     model, errors = outcome.final.model, outcome.final_errors
     for effect in model.effects:
         model = model.without_effect(effect, curves.instead)
@@ -106,25 +116,34 @@ def take_curves(outcome: Outcome, curves: Curves) -> None:
     for j in curves.instead.nonzero()[:, 0].tolist():
         k = curves.best(j)
         effect, own = curves.effects[k], curves.models[k]
-        values = own.model.to_physical(own.x)
+        values = own.physical
         here = torch.arange(len(physical)) == j
         model, physical = model.extended(physical, effect, here, values[:, own.model.columns(effect)])
         model = model.held(effect, _shape(effect), physical)
         physical[j, : len(BASE)] = values[j, : len(BASE)]
         square[:, j], score[j] = curves.errors[k].square[:, j], own.score[j]
     more = torch.zeros(len(model.effects) - len(outcome.unevenness), len(physical), dtype=outcome.unevenness.dtype)
-    outcome.unevenness = torch.cat([outcome.unevenness, more])
-    outcome.final = Fitted(model=model, x=model.to_normalised(physical), score=score)
-    outcome.final_errors = replace(errors, square=square)
+    return replace(
+        outcome,
+        unevenness=torch.cat([outcome.unevenness, more]),
+        final=Fitted(model=model, x=model.to_normalised(physical), score=score),
+        final_errors=replace(errors, square=square),
+    )
 
 
-def error_map(curves: Curves | None, joint_names: Sequence[str], base_errors: BlockErrors) -> dict[str, dict[str, Any]]:
+def error_map(
+    curves: Curves | None,
+    joint_names: Sequence[str],
+    base_errors: BlockErrors,
+    least: float = DEFAULT.verdict.worth_a_word,
+) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
     Args:
         curves: What was fitted.
         joint_names: The joints.
         base_errors: Of the base model, as everything else in the diagnosis tells them.
+        least: With less than this part explained a curve is not told of.
     """
     if curves is None:
         return {}
@@ -140,15 +159,16 @@ def error_map(curves: Curves | None, joint_names: Sequence[str], base_errors: Bl
             "kind": "friction" if effect.resists else "missing torque",
             "validation_rmse_before": before,
             "validation_rmse_after": after,
-            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after),
-            "curve": _curve(curves.models[k], effect, j) if part >= _WORTH_A_WORD else None,
+            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after) if part >= least else _NONE,
+            "curve": _curve(curves.models[k], effect, j) if part >= least else None,
         }
     return joints
 
 
+_NONE = "no curve over a single variable carries the error."
+
+
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
-    if part < _WORTH_A_WORD:
-        return "no curve over a single variable carries the error."
     kind = "friction" if effect.resists else "torque"
     return (
         f"a curve of {kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the floor "
@@ -158,7 +178,7 @@ def _sentence(effect: type[FreeForm], part: float, before: float, after: float) 
 
 def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list[float]]:
     """Where the knots are, and the torque that is missing there, or all friction that there is [N m]."""
-    physical = fitted.model.to_physical(fitted.x)[joint]
+    physical = fitted.physical[joint]
     names = [p.name for p in effect.parameters]
     curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
     if effect.resists:  # what the base model has of it and what the curve has cannot be told apart everywhere
@@ -181,7 +201,7 @@ def _start(base: Fitted, effect: type[FreeForm], joints: torch.Tensor, seen: tor
     for column, p in enumerate(effect.parameters):
         if p.name in shape:
             values[:, column] = shape[p.name].clamp(p.lower, p.upper)
-    model, physical = base.model.extended(base.model.to_physical(base.x), effect, joints, values)
+    model, physical = base.model.extended(base.physical, effect, joints, values)
     return Fitted.start(model.held(effect, _shape(effect), physical), physical, tried=effect)
 
 
@@ -190,25 +210,26 @@ def _shape(effect: type[FreeForm]) -> list[str]:
     return [p.name for p in effect.parameters if p.null is None]
 
 
-def _ranges(problem: TwinProblem, base: Fitted) -> dict[str, torch.Tensor]:
+def _ranges(problem: TwinProblem, base: Fitted, reached: float) -> dict[str, torch.Tensor]:
     """From where to where each variable goes in what is trained on, (2, n) by its name."""
     path, data = problem.path, problem.dataset
-    effort, load = path.effort(base.model.to_physical(base.x)[:, BASE.index("armature")]), path.load()
+    effort, load = path.effort(base.physical[:, BASE.index("armature")]), path.load()
     # what holds a load has its size, and pulls the other way
     seen = {"position": path.position, "torque": effort, "speed": path.speed(), "load on the gear": effort - load}
     time = data.session_start + problem.control_dt * torch.arange(len(path.position))[:, None]
     seen["time"] = time[..., None].expand(path.position.shape)
-    return {name: _quantiles(values, data.train) for name, values in seen.items()}
+    return {name: _quantiles(values, data.train, reached) for name, values in seen.items()}
 
 
-def _quantiles(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+def _quantiles(values: torch.Tensor, where: torch.Tensor, reached: float) -> torch.Tensor:
     """Almost the smallest and the largest, (2, n), of (T', R, n) that leave out as many steps at the end as before.
 
     Args:
         values: The values.
         where: Which steps count, (T, R) bool.
+        reached: The upper quantile.
     """
     left_out = (len(where) - len(values)) // 2
     flat = values[where[left_out : left_out + len(values)]].double().sort(dim=0).values
     last = len(flat) - 1
-    return flat[[round((1 - _REACHED) * last), round(_REACHED * last)]]
+    return flat[[round((1 - reached) * last), round(reached * last)]]

@@ -1,4 +1,4 @@
-"""Which effects found are really there, and which stand in for something that is not known."""
+"""Which effects found are really there, and which are a proxy for something that is not known."""
 
 from __future__ import annotations
 
@@ -7,20 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from pace_optim.diagnosis.model.model import JointModel
-from pace_optim.diagnosis.search.search import Outcome
-
-EXPLAINED = 0.5
-"""Less than this part of the error above the floor, and the effects found are not what is missing."""
-UNKNOWN_RATIO = 3.0
-"""An unexplained error above this many times the floor is a finding of its own."""
-DOMINANT = 0.9
-"""Of effects that explain more than this part of the error above the floor, sizes do not matter."""
-UNEVEN = 0.15
-"""Above this unevenness an effect stands in for something else. Measured: up to 0.08 for the evenest effect among many
-others as large together, 0.18 to 0.36 for such that stood in."""
-VARYING = 0.5
-"""Above this one, most of what is left would go: the effect's form is right, and its size depends on something more.
-Measured: 0.73 for the friction of a servo at gains from 100 to 800."""
+from pace_optim.diagnosis.search.state import Outcome
 
 
 def above_floor(outcome: Outcome, floor: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -36,7 +23,7 @@ def above_floor(outcome: Outcome, floor: torch.Tensor) -> tuple[torch.Tensor, to
 
 def near_floor(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints whose error is near the floor in the end, (n,) bool."""
-    return outcome.final_errors.mse.sqrt() <= UNKNOWN_RATIO * floor
+    return outcome.final_errors.mse.sqrt() <= outcome.cfg.judging.far * floor
 
 
 def real_effects(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
@@ -54,7 +41,8 @@ def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Effects that count as missing, (effects, n) bool: no curves, no smoothing of friction where it hardly shows."""
     model = outcome.final.model
     smooths = torch.tensor([effect.smooths_friction for effect in model.effects], dtype=torch.bool)[:, None]
-    return model.has & ~curves_in(model) & ~(smooths & (outcome.base_errors.mse.sqrt() <= UNKNOWN_RATIO * floor))
+    hardly_shows = outcome.base_errors.mse.sqrt() <= outcome.cfg.judging.far * floor
+    return model.has & ~curves_in(model) & ~(smooths & hardly_shows)
 
 
 def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
@@ -68,7 +56,7 @@ def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> li
 
 def varying(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
     """Effects of the right form whose size differs between recordings, in a sentence."""
-    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= VARYING))
+    said = _said(outcome, names, _much_left(outcome, floor) & (outcome.unevenness >= outcome.cfg.verdict.most))
     return [f"Its size differs between recordings, so it depends on something more: {said}."] if said else []
 
 
@@ -83,15 +71,15 @@ def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
 
 def _at_bounds(outcome: Outcome) -> torch.Tensor:
     model = outcome.final.model
-    return model.at_bounds(outcome.final.x) & ~curves_in(model)
+    return model.at_bounds(outcome.final.x, outcome.cfg.fitting.at_bound) & ~curves_in(model)
 
 
 def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     share = outcome.unevenness
-    return _much_left(outcome, floor) & (share > UNEVEN) & (share < VARYING)
+    return _much_left(outcome, floor) & (share > outcome.cfg.verdict.uneven) & (share < outcome.cfg.verdict.most)
 
 
 def _much_left(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints whose effects do not explain nearly all, so that their sizes matter, (n,) bool."""
     before, after = above_floor(outcome, floor)
-    return (after > (1 - DOMINANT) * before) & ~near_floor(outcome, floor)
+    return (after > (1 - outcome.cfg.verdict.nearly_all) * before) & ~near_floor(outcome, floor)

@@ -8,19 +8,21 @@ import torch
 
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.diagnosis.candidates.screening import free_columns
-from pace_optim.diagnosis.fitting.coarse_to_fine import fit_side_by_side
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.uncertainty.uncertainty import sandwich
 
 _RIDGE = 1e-12
 
 
-def sizes(outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
+def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
     """Every parameter of every effect found, joint by joint, for ``diagnosis.json``; curves are left out.
 
     Args:
+        fits: Fits models.
         outcome: Where the search ended.
         joint_names: The joints.
 
@@ -32,14 +34,15 @@ def sizes(outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]
     found = now.model.has & ~curves_in(now.model)
     if not bool(found.any()):
         return []
-    if now.jacobian is None or now.error is None:  # one iteration stays where it is, and sees the derivatives
-        now = fit_side_by_side(outcome.problem, [_start(now)], max_iteration=1, keep_jacobian=True)[0]
-    physical, std, stuck = now.model.to_physical(now.x), standard_deviations(now), now.model.at_bounds(now.x)
+    if now.jacobian is None or now.error is None:
+        now = fits.looked_at(outcome.problem, [now])[0]
+    at_bound = outcome.cfg.fitting.at_bound
+    std, stuck = standard_deviations(now, at_bound), now.model.at_bounds(now.x, at_bound)
     result = []
-    for effect, has, at_bound in zip(now.model.effects, found, stuck, strict=True):
+    for effect, has, held_back in zip(now.model.effects, found, stuck, strict=True):
         columns = now.model.columns(effect)
         for j in has.nonzero()[:, 0].tolist():
-            own = zip(effect.parameters, physical[j, columns].tolist(), std[j, columns].tolist(), strict=True)
+            own = zip(effect.parameters, now.physical[j, columns].tolist(), std[j, columns].tolist(), strict=True)
             result += [
                 {
                     "effect": effect.name,
@@ -49,15 +52,11 @@ def sizes(outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]
                     "std": error if error > 0 else None,
                     "unit": parameter.unit,
                     "factor": factor_of(effect, parameter, value),
-                    "at_bound": bool(at_bound[j]),
+                    "at_bound": bool(held_back[j]),
                 }
                 for parameter, value, error in own
             ]
     return result
-
-
-def _start(now: Fitted) -> Fitted:
-    return Fitted.start(now.model, now.model.to_physical(now.x))
 
 
 def factor_of(effect: type[Effect], parameter: EffectParameter, value: float) -> float | None:
@@ -67,13 +66,14 @@ def factor_of(effect: type[Effect], parameter: EffectParameter, value: float) ->
     return value if parameter.null == 1.0 else 1.0 + value
 
 
-def standard_deviations(now: Fitted) -> torch.Tensor:
+def standard_deviations(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
     """Physical standard deviations of a fitted model's parameters, (n, P); zero where one is held or at a bound.
 
     Args:
         now: Fitted, with its Jacobian: of every second control step of what is trained on.
+        at_bound: Normalised values beyond this are at a bound.
     """
-    columns, error = free_columns(now), now.error
+    columns, error = free_columns(now, at_bound), now.error
     if error is None:
         raise ValueError("Error bars need a model that was fitted with keep_jacobian.")
     result = torch.zeros_like(now.x)
@@ -91,4 +91,4 @@ def _slope(now: Fitted) -> torch.Tensor:
     """Physical units by normalised ones, (n, P)."""
     model = now.model
     half = torch.where(model.log, (model.upper / model.lower.clamp(min=1e-300)).clamp(min=1.0).log(), 0.0) / 2
-    return torch.where(model.log, half * model.to_physical(now.x), (model.upper - model.lower) / 2)
+    return torch.where(model.log, half * now.physical, (model.upper - model.lower) / 2)

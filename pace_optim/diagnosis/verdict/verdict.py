@@ -10,21 +10,16 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.judging.acceptance import FIRST_RATIO, NEXT_RATIO
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.search.search import Outcome
+from pace_optim.diagnosis.judging.comparison import least_ratio
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import (
-    EXPLAINED,
-    UNKNOWN_RATIO,
     above_floor,
     counts,
     curves_in,
     near_floor,
     real_effects,
 )
-
-SHARE = 0.2
-"""Joints on which the effects found are what is missing must hold this part of the robot's error above the floor."""
 
 
 def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
@@ -38,9 +33,9 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
     explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
     if bool(outcome.final.model.has.any()):
         good = explained_joints(outcome, floor)
-        if float(excess[good].sum()) >= SHARE * float(excess.sum()):
+        if float(excess[good].sum()) >= outcome.cfg.verdict.share * float(excess.sum()):
             return "effect", explained
-    far = float((outcome.final_errors.mse.sqrt() / floor).max()) > UNKNOWN_RATIO
+    far = float((outcome.final_errors.mse.sqrt() / floor).max()) > outcome.cfg.judging.far
     if far or bool(curves_in(outcome.final.model).any()):
         return "unknown", explained
     return "nothing_missing", explained
@@ -58,23 +53,22 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
         floor: Of each joint, (n,) [rad].
     """
     excess, left = above_floor(outcome, floor)
-    enough = (left <= (1 - EXPLAINED) * excess) & real_effects(outcome, floor).any(dim=0)
+    enough = (left <= (1 - outcome.cfg.verdict.most) * excess) & real_effects(outcome, floor).any(dim=0)
     return counts(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
 
 
-def keep_on(outcome: Outcome, joints: torch.Tensor) -> None:
-    """Go back to the base model on all joints but these, (n,) bool."""
+def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:
+    """The outcome with the base model on all joints but these, (n,) bool."""
     model, base = outcome.final.model, outcome.base
     others = ~joints & model.has.any(dim=0)
     if not bool(others.any()):
-        return
+        return outcome
     for effect in model.effects:
         model = model.without_effect(effect, others)
     x, errors = outcome.final.x.clone(), outcome.final_errors
     x[others, : base.model.size] = base.x[others]
     square = torch.where(others, outcome.base_errors.square, errors.square)
-    outcome.final = replace(outcome.final, model=model, x=x)
-    outcome.final_errors = replace(errors, square=square)
+    return replace(outcome, final=replace(outcome.final, model=model, x=x), final_errors=replace(errors, square=square))
 
 
 def likes(outcome: Outcome) -> dict[str, list[str]]:
@@ -121,7 +115,7 @@ def ranking(
                 "effect": effect.name,
                 "round": depth + 1,
                 "added": bool(added) and decision == "effect",
-                **_told(this, effect, added, joint_names, first=depth == 0),
+                **_told(this, effect, added, joint_names, least_ratio(depth == 0, cfg=outcome.cfg.judging)),
             }
             is_best = any(own and own[0].effect is effect for own in this.trials)
             ratio = entry["validation_rmse_before"] / max(entry["validation_rmse_after"], 1e-12)
@@ -131,7 +125,7 @@ def ranking(
 
 
 def _told(
-    this: Round, effect: type[Effect], added: Sequence[int], joint_names: Sequence[str], first: bool
+    this: Round, effect: type[Effect], added: Sequence[int], joint_names: Sequence[str], least: float
 ) -> dict[str, Any]:
     """What a round tells of an effect: on the joints that have it in the end, or else where it counts, or anywhere."""
     own = [t for trials in this.trials for t in trials if t.effect is effect]
@@ -146,14 +140,14 @@ def _told(
         "validation_rmse_before": _rms(t.mse_before for t in shown),
         "validation_rmse_after": _rms(t.mse_after for t in shown),
         "significant": bool(good),
-        "evidence": _evidence(shown, effect, first),
+        "evidence": _evidence(shown, effect, least),
         "confounded_with": sorted(confounded),
         "screen_score": max(t.screen_score for t in own),
         "values": {joint_names[t.joint]: t.values for t in shown},
     }
 
 
-def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str:
+def _evidence(trials: Sequence[Trial], effect: type[Effect], least: float) -> str:
     before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
     strongest = max(trials, key=lambda t: t.ratio)
     blocks = f"t = {strongest.t:.1f} over blocks of up to one second"
@@ -161,7 +155,6 @@ def _evidence(trials: Sequence[Trial], effect: type[Effect], first: bool) -> str
     if after >= before:
         verb, why = "does not fall:", ""
     elif not strongest.significant:
-        least = FIRST_RATIO if first else NEXT_RATIO
         little = f", less than the {least:g} times that count" if before < least * after else ""
         why = little or f", too unevenly to count ({blocks})"
     return (

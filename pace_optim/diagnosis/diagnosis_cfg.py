@@ -1,0 +1,224 @@
+"""Every tuned number of a diagnosis, in one place; it is saved with what was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittingCfg:
+    """How models are fitted: Levenberg–Marquardt of each joint, from coarse to fine."""
+
+    stride: int = 2
+    """Only every so many control steps count in a fit and in screening."""
+    part: float = 0.7
+    """Refits begin on so much of each window."""
+    coarse: int = 8
+    """Iterations in windows at the control step, ..."""
+    fine: int = 3
+    """then in windows at the problem's physics step, ..."""
+    whole: int = 2
+    """then on whole recordings."""
+    rounds: int = 3
+    """At most so many times the coarse iterations while a model still falls; the base model's reference and a
+    trimmed fit are made again as often at most."""
+    again: int = 6
+    """Iterations where refits begin, and of a model that was changed or moves along a new reference."""
+    settle: int = 5
+    """Iterations of a model that goes on at its own physics step, or with values held or effects left out."""
+    behind: float = 2.0
+    """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
+    damping: float = 1e-3
+    """Of the first step, relative to the diagonal of JᵀJ."""
+    trials: tuple[float, ...] = (1.0, 30.0, 1e3)
+    """Multiples of the damping that are tried side by side; the next damping is a tenth of the one that was best."""
+    narrow: float = 1e-4
+    """Normalised step of the derivatives."""
+    wide: tuple[float, ...] = (3e-2, 1e-2)
+    """The same first where contacts and sticking make the error rough; the next is taken when one leads no further."""
+    enough: float = 3e-3
+    """A joint whose score falls by less than this part, in two iterations in a row, has converged."""
+    promised: float = 3e-4
+    """So has one whose linear model promises less than this part of the score."""
+    falls: float = 0.05
+    """A model still falls whose squared error has fallen by more than this part over the last ``rounds`` iterations."""
+    outlier: float = 3.0
+    """A trimmed fit leaves out windows whose RMSE is this many times the median."""
+    gain: float = 0.9
+    """The reference is renewed, or windows are left out, again where that lowered the error to less than this part."""
+    renewals: int = 4
+    """At most so many times: what was fitted along the motion of a wrong model gives a better one, and so on."""
+    at_bound: float = 0.998
+    """Normalised values beyond this are at a bound."""
+    thinned: float = 0.8
+    """With less than this part of the models still on their way, only those are simulated. Changes time alone."""
+    stiff_cost: float = 3.0
+    """What a stiff effect costs, as a multiple of another one, where processes share them. Changes time alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeginningCfg:
+    """The base model that everything is held against."""
+
+    moved: float = 0.02
+    """Where a normalised parameter has moved further than this the reference is computed again."""
+    away: float = 0.05
+    """A joint without neighbours is simulated along the measured motion unless it ends further from it than this (RMS)
+    [rad]: then gravity is not linear in between."""
+    near: float = 0.01
+    """With effects its reference is renewed unless it is this near (RMS) [rad]."""
+    late: float = 0.2
+    """A joint is late that is so many control steps later than the median, ..."""
+    scatters: float = 6.0
+    """and so many times the joints' scatter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidatesCfg:
+    """Which effects are refitted, and from where."""
+
+    folds: int = 5
+    """Of the cross-validation of the score test, ..."""
+    fold_s: float = 0.2
+    """and the length of its blocks [s]."""
+    explains: float = 0.03
+    """An effect that would explain less than this part of what is left is not refitted."""
+    of_robot: int = 6
+    """Effects refitted because they would explain most of the whole robot's error."""
+    of_joint: int = 4
+    """So many effects are refitted for each of so many worst joints."""
+    from_screening: int = 2
+    """How many of the best screened go on in any case, where refits began with all effects."""
+    beyond_screening: float = 50.0
+    """An error that is this many times the floor is beyond what screening can judge: refits begin with all effects."""
+    seen: float = 0.3
+    """With less than this part of an effect's amplitude left beside a base parameter, that one absorbs it."""
+    seen_step: float = 0.1
+    """Normalised step of that parameter: joints that stick make the error rough, and a narrow step sees that."""
+    usual_effort: float = 5.0
+    """Torque for which the probes' torques are meant [N m]; they are smaller on smaller drives."""
+    multiple: tuple[float, float] = (0.2, 20.0)
+    """A refit starts at the best multiple of a probe, between these."""
+    frictions: tuple[float, ...] = (-0.9, -0.5)
+    """Normalised armature and friction that far starts begin with too, with a quarter of the delay."""
+    points: int = 12
+    """Of an effect with more probes than this far starts look at some."""
+    independent_s: float = 0.4
+    """Errors of a wrong model that are further apart than this count as independent [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgingCfg:
+    """When one model of a joint is better than another, and when they are alike; ratios are of validation RMSE."""
+
+    block_s: float = 1.0
+    """Length of a block [s]; shorter where that gives fewer than ``blocks``, ..."""
+    shortest_s: float = 0.25
+    """but never below this: in less time neighbours are alike."""
+    blocks: int = 6
+    """Blocks wanted, ..."""
+    fewest: int = 4
+    """and how few show nothing."""
+    level: float = 0.02
+    """Chance of a false alarm over all that was tried."""
+    alike: float = 1.10
+    """Models up to this ratio apart are alike: the first effect must bring more, effects within it are told together,
+    and an error within it of the floor is at the floor."""
+    next_effect: float = 1.25
+    """What each further effect must bring."""
+    clear: float = 1.5
+    """A fall that is this large needs no more than t > ``clear_t``."""
+    clear_t: float = 2.0
+    """A fall may be there above this t, though it does not show it."""
+    as_good: float = 1.025
+    """A simpler model is as good up to this ratio: the effect with the fewest parameters is chosen, an older one goes
+    that the newest makes superfluous, joints share one value, and a way with fewer parameters is taken."""
+    weighed: float = 1.15
+    """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
+    far: float = 3.0
+    """A joint is far from the floor above this many times it: more is missing."""
+    near: float = 1.3
+    """Nearer to the floor than this a further effect could not bring as much as it must."""
+    comes_near: float = 3.0
+    """An effect comes near to another one up to this ratio apart."""
+    in_place: int = 3
+    """So many of those that came near are tried in place of a joint's effects."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictCfg:
+    """What is made of where the search ended."""
+
+    most: float = 0.5
+    """Effects that explain less than this part of the error above the floor are not what is missing. A curve says more
+    where it leaves less than this part of what they leave, an effect dominates above this share, and its size depends
+    on something more where this part of what is left would go with a size for each recording."""
+    nearly_all: float = 0.9
+    """Of effects that explain more than this part, sizes do not matter. A joint is held at the robot's delay where a
+    delay of its own takes away more than this part."""
+    uneven: float = 0.15
+    """Above this unevenness an effect is a proxy. Measured: up to 0.08 for the evenest effect among many others as
+    large together, 0.18 to 0.36 for proxies."""
+    share: float = 0.2
+    """Joints with effects that are what is missing must hold this part of the robot's error above the floor."""
+    reached: float = 0.998
+    """Quantile of a variable up to which the knots of a curve reach."""
+    worth_a_word: float = 0.1
+    """With less than this part explained a curve is not told of, nor drawn."""
+    duration: float = 10.0
+    """Of the recordings on the menu of next experiments [s]."""
+    factor: float = 1.5
+    """Of their proportional gain and of their load."""
+    clearly: float = 3.0
+    """Predictions that part by fewer times the noise than this are not told apart."""
+
+
+RULES = (
+    "add_to_group",
+    "look_ahead",
+    "add_pair",
+    "replace",
+    "drop",
+    "merge",
+    "drop_last",
+    "pool",
+    "trim",
+    "wide_steps",
+    "second_try",
+    "evidence",
+    "widen_bounds",
+    "far_starts",
+    "late_joints",
+    "curves",
+)
+"""Moves and rules of a diagnosis that can be switched off."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosisCfg:
+    """A diagnosis' numbers, and which of its moves are made."""
+
+    fitting: FittingCfg = field(default_factory=FittingCfg)
+    beginning: BeginningCfg = field(default_factory=BeginningCfg)
+    candidates: CandidatesCfg = field(default_factory=CandidatesCfg)
+    judging: JudgingCfg = field(default_factory=JudgingCfg)
+    verdict: VerdictCfg = field(default_factory=VerdictCfg)
+    off: tuple[str, ...] = ()
+    """Which of ``RULES`` are not made, for an ablation."""
+
+    def __post_init__(self) -> None:
+        """Check the names.
+
+        Raises:
+            ValueError: If a rule is unknown.
+        """
+        if unknown := [name for name in self.off if name not in RULES]:
+            raise ValueError(f"There is no rule {unknown[0]!r} to switch off. Available: {', '.join(RULES)}.")
+
+    def has(self, rule: str) -> bool:
+        """Whether a rule is in force."""
+        return rule not in self.off
+
+
+DEFAULT = DiagnosisCfg()
+"""As it is shipped."""

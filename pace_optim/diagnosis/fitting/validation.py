@@ -1,0 +1,84 @@
+"""Errors on the recordings that were not trained on, in blocks of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockErrors:
+    """Mean square errors of n joints in B blocks of validation, of one second where there are enough."""
+
+    square: torch.Tensor
+    """(B, n) [rad²]."""
+    weight: torch.Tensor
+    """Samples of each block, (B,)."""
+
+    @property
+    def mse(self) -> torch.Tensor:
+        """Of each joint, (n,) [rad²]."""
+        return (self.square * self.weight[:, None]).sum(dim=0) / self.weight.sum()
+
+
+def block_errors(
+    error: torch.Tensor, where: torch.Tensor, control_dt: float, *, cfg: JudgingCfg = DEFAULT.judging
+) -> BlockErrors:
+    """Cut errors into blocks.
+
+    Args:
+        error: (T, R, n) at every control step.
+        where: Which samples count, (T, R) bool.
+        control_dt: [s].
+        cfg: How long blocks are.
+    """
+    blocks = _blocks(where, control_dt, cfg)
+    return BlockErrors(
+        square=torch.stack([error[own, r].double().square().mean(dim=0) for r, own in blocks]),
+        weight=torch.tensor([len(own) for _, own in blocks], dtype=torch.float64),
+    )
+
+
+def check_long_enough(where: torch.Tensor, control_dt: float, *, cfg: JudgingCfg = DEFAULT.judging) -> None:
+    """See that recordings are long enough to judge by.
+
+    Args:
+        where: Which samples count, (T, R) bool.
+        control_dt: [s].
+        cfg: How long blocks are, and how many are needed.
+
+    Raises:
+        ValueError: If they are not.
+    """
+    if len(_blocks(where, control_dt, cfg)) < cfg.fewest:
+        raise ValueError(
+            f"What was kept for validation lasts {sum(_spans(where)) * control_dt:.2g} s, too short to judge a model "
+            f"by; expected {cfg.fewest * cfg.shortest_s:g} s or more. Record for longer, or fit again with further "
+            "recordings as --validation."
+        )
+
+
+def _blocks(where: torch.Tensor, control_dt: float, cfg: JudgingCfg) -> list[tuple[int, torch.Tensor]]:
+    """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
+    length = min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
+    steps = max(1, round(length / control_dt))
+    blocks = []
+    for r in range(where.shape[1]):
+        at = where[:, r].nonzero()[:, 0]
+        if not len(at):
+            continue
+        block = (at - at[0]) // steps
+        for b in range(int(block[-1]) + 1):
+            own = at[block == b]
+            if len(own) * 2 >= (block == 0).sum():
+                blocks.append((r, own))
+    return blocks
+
+
+def _spans(where: torch.Tensor) -> list[int]:
+    """Control steps from the first to the last sample of recordings that have any."""
+    found = (column.nonzero()[:, 0] for column in where.T)
+    return [int(at[-1] - at[0]) + 1 for at in found if len(at)]

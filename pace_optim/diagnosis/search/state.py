@@ -1,0 +1,162 @@
+"""What a search looks for and with what, and the branches that it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.decisions import Decision, Log, decision, unlogged
+from pace_optim.diagnosis.judging.some_joints import SomeJoints
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.search.one_round import try_effects
+from pace_optim.single_joint_model.problem import TwinProblem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Branch:
+    """A model on the way, and the rounds that led to it."""
+
+    problem: TwinProblem
+    """The joints along the motion of the robot with the model."""
+    now: Fitted
+    errors: BlockErrors
+    rounds: tuple[Round, ...] = ()
+
+    def squared_fall_with(self, effect: type[Effect]) -> float:
+        """By how much an effect lowered the squared error of the joints that chose it [rad²]."""
+        trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
+        return sum(trial.mse_before - trial.mse_after for trial in trials if trial.effect is effect)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Search:
+    """What is looked for, and the steps that every move is made of."""
+
+    effects: Sequence[type[Effect]]
+    """Candidates."""
+    effort: torch.Tensor
+    """Typical torque of each joint, (n,) [N m]."""
+    floor: torch.Tensor
+    """RMSE of each joint that no model can go below, (n,) [rad]."""
+    max_effects: int
+    """Most effects of a joint."""
+    fits: Fits
+    """Fits models."""
+    say: Callable[[str], None] = lambda _: None
+    """Shows how far it is."""
+    log: Log = unlogged
+    """Gets every decision."""
+    follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]] = lambda problem, now: (problem, now)
+    """Gives the joints along the motion of the robot with a model, and the model fitted there."""
+    try_effects: Callable[..., Round | None] = try_effects
+    """Tries what could be missing beside a model."""
+
+    @property
+    def cfg(self) -> DiagnosisCfg:
+        """The diagnosis' numbers."""
+        return self.fits.cfg
+
+    @property
+    def at_floor(self) -> torch.Tensor:
+        """Below this RMSE of each joint there is nothing to find, (n,) [rad]."""
+        return self.cfg.judging.alike * self.floor
+
+    @property
+    def tried_over_joints(self) -> int:
+        """How many candidates were tried, over all joints."""
+        return len(self.effects) * len(self.floor)
+
+    def far(self, errors: BlockErrors) -> torch.Tensor:
+        """Joints that are far from the floor, (n,) bool."""
+        return errors.mse.sqrt() > self.cfg.judging.far * self.floor
+
+    def tried(self, branch: Branch) -> Round | None:
+        """What could come next; ``None`` if there is nothing to try."""
+        cfg, depth, far = self.cfg, len(branch.rounds), self.far(branch.errors)
+        missed = torch.zeros(len(self.floor))
+        for each in branch.rounds:
+            missed += torch.tensor([chosen is None for chosen in each.chosen])
+        # how neighbours moved may have hidden it: joints far from the floor get a second attempt
+        open_joints = missed <= (far & cfg.has("second_try"))
+        # beside a joint that is far from the floor, another's last tenths may come from how that one moves
+        alone = depth == 0 and not bool(far.any())
+        open_joints &= branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.near) * self.at_floor
+        untried = [e for e in self.effects if bool((branch.now.model.allowed_joints(e) & open_joints).any())]
+        if depth == self.max_effects or not bool(open_joints.any()) or not untried:
+            return None
+        self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
+        part = SomeJoints(open_joints)
+
+        def log(own: Decision) -> None:
+            facts = own.facts | {"effect": depth + 1}
+            self.log(replace(own, joints=[part.indices[j] for j in own.joints], facts=facts))
+
+        found = self.try_effects(
+            self.fits,
+            part.of_problem(branch.problem),
+            part.of_fit(branch.now),
+            part.of_errors(branch.errors),
+            untried,
+            self.effort[open_joints],
+            self.floor[open_joints],
+            self.say,
+            log,
+            rough=bool(self._rough(branch.now, branch.errors.mse, cfg.judging.far).any()),
+        )
+        return None if found is None else part.round_of_all(found, branch.now)
+
+    def along_own_motion(self, branch: Branch, now: Fitted) -> Branch:
+        """A branch with another model, along the motion that the robot then has."""
+        problem, now = self.follow(branch.problem, now)
+        now, errors = self.settled(problem, now)
+        return replace(branch, problem=problem, now=now, errors=errors)
+
+    def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
+        """A model fitted to whole recordings, as well as it can be before another effect is sought; its errors."""
+        fits, near = self.fits, self.cfg.judging.near
+        if bool(self._rough(now, now.score, near).any()) and self.cfg.has("wide_steps"):
+            now = fits.over_wide_steps(problem, now)
+        if now.jacobian is None:  # it was fitted in windows
+            now = fits.to_whole(problem, [now])[0]
+        errors = fits.validation_errors(problem, [now])[0]
+        rough = self._rough(now, now.score, near)
+        if not bool(rough.any()) or not self.cfg.has("trim"):
+            return now, errors
+        if (trimmed := fits.trimmed(problem, now, rough)) is None:
+            return now, errors
+        other = fits.to_whole(problem, [trimmed])[0]
+        others = fits.validation_errors(problem, [other])[0]
+        better = others.mse < errors.mse
+        taken = dict.fromkeys(better.nonzero()[:, 0].tolist(), "trimmed")
+        self.log(decision("trim", rough.nonzero()[:, 0].tolist(), errors, {"trimmed": others}, taken))
+        return now.merged(other, better), replace(errors, square=torch.where(better, others.square, errors.square))
+
+    def _rough(self, now: Fitted, mse: torch.Tensor, times: float) -> torch.Tensor:
+        """Joints above so many times the floor, where contacts or springs may keep narrow derivatives back, (n,)."""
+        stiff = [has for effect, has in zip(now.model.effects, now.model.has, strict=True) if effect.is_stiff]
+        has_stiff = torch.stack(stiff).any(dim=0) if stiff else torch.zeros_like(self.floor, dtype=torch.bool)
+        return has_stiff & (mse.sqrt() > times * self.at_floor)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """Where a search ended."""
+
+    problem: TwinProblem
+    """The joints along the motion of the robot with the final model."""
+    base: Fitted
+    base_errors: BlockErrors
+    final: Fitted
+    final_errors: BlockErrors
+    unevenness: torch.Tensor
+    """Of the final model's effects, before joints share values, (effects, n)."""
+    rounds: Sequence[Round] = ()
+    cfg: DiagnosisCfg = DEFAULT
+    """The numbers that it was found with, and is judged by."""

@@ -1,0 +1,121 @@
+"""What a diagnosis found, in words and tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.beginning.data_check import DataCheck
+from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.verdict.free_curves import Curves
+from pace_optim.diagnosis.verdict.proxy_effects import stand_ins, varying
+from pace_optim.problem.problem import Problem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Findings:
+    """What the search on the twins found."""
+
+    outcome: Outcome
+    data: DataCheck
+    absorbed: dict[type[Effect], torch.Tensor]
+    """Effects that a base parameter absorbs, and on which joints (n,): these recordings would not show them there."""
+    verdict: str
+    explained: float
+    """Part of the error above the floor that the effects found explain."""
+    paying: list[str]
+    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
+    ``unknown`` all that lower the error, though they are not what is missing."""
+    shares: dict[type[Effect], float]
+    """How much of what they explain is due to each, in the same order."""
+    curves: Curves | None = None
+    """Which variable carries what is missing; ``None`` where the effects found leave little."""
+
+    @property
+    def free_form(self) -> list[str]:
+        """Those of them that are curves, where an effect is not known."""
+        names = {e.name for e in self.shares if e.free_form}
+        return [label for label in self.paying if label.partition("@")[0] in names]
+
+    @property
+    def added(self) -> list[str]:
+        """Those that are what is missing."""
+        return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
+
+
+def summary_of(found: Findings, problem: Problem) -> str:
+    """The verdict in a sentence or two."""
+    before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
+    after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
+    floor = 1e3 * float(found.data.floor.square().mean().sqrt())
+    about = (found.outcome, problem.joint_names, found.data.floor)
+    if found.verdict == "nothing_missing":
+        return (
+            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} mrad, the "
+            f"floor of noise and numerics {floor:.3g} mrad."
+        )
+    if found.verdict == "unknown":
+        text = (
+            f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
+            f"mrad, the floor {floor:.3g} mrad, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
+            "what lies between."
+        )
+        return " ".join([text, *stand_ins(*about), *varying(*about)])
+    all_of_it = "all of it" if found.free_form else "it"
+    summary = (
+        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} mrad "
+        f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
+    )
+    if after > found.outcome.cfg.judging.far * floor and not found.free_form:
+        summary += " Something else is missing too, which no known effect explains."
+    return " ".join([summary, *varying(*about)])
+
+
+def _what_pays(found: Findings) -> str:
+    """What lowers the error without being what is missing."""
+    if not found.paying:
+        return "the effects tried explain"
+    if len(found.free_form) == len(found.paying):
+        return f"a curve in its place, {', '.join(found.paying)}, explains"
+    curves = ", with a curve where none is known" if found.free_form else ""
+    return f"what pays{curves}, {', '.join(found.paying)}, explains"
+
+
+def _missing(found: Findings) -> str:
+    """The effects found; where there are several, what is due to each, and whether one of them stands out."""
+    if found.free_form:
+        return (
+            f"Missing: {', '.join(found.added)}. On other joints no known effect explains the error; a curve takes its "
+            f"place: {', '.join(found.free_form)}."
+        )
+    if len(found.added) < 2:
+        return f"Missing: {found.added[0]}."
+    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
+    if max(found.shares.values()) >= found.outcome.cfg.verdict.most:
+        return f"Missing: {', '.join(parts)}."
+    return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
+
+
+def ladder(found: Findings) -> list[dict[str, Any]]:
+    """Validation RMSE of all joints from the base model to the last effect [rad]."""
+    steps = [("base model", found.outcome.base_errors)]
+    if found.paying:
+        steps.append((" + ".join(found.paying), found.outcome.final_errors))
+    return [{"model": model, "validation_rmse": float(errors.mse.mean().sqrt())} for model, errors in steps]
+
+
+def by_joint(found: Findings, problem: Problem) -> dict[str, dict[str, Any]]:
+    """Of each joint its errors, floor and effects."""
+    outcome, model = found.outcome, found.outcome.final.model
+    return {
+        name: {
+            "validation_rmse_before": float(outcome.base_errors.mse[j].sqrt()),
+            "validation_rmse_after": float(outcome.final_errors.mse[j].sqrt()),
+            "floor": float(found.data.floor[j]),
+            "effects": [e.name for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])],
+        }
+        for j, name in enumerate(problem.joint_names)
+    }

@@ -1,0 +1,117 @@
+"""What a diagnosis decided can be decided again from its log, and every number that it decides by is in one place."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from diagnoses import errors_of, joint_alone, make_search, with_effects
+from test_looking_ahead import BOTH_LACK, NEIGHBOUR, STANDS_IN, searched, together
+
+from pace_actuators.effects import get_effect
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
+from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
+from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.diagnosis.search.moves import LAST, MOVES
+from pace_optim.diagnosis.search.pruning import drop_last
+from pace_optim.diagnosis.search.replay import replayed
+from pace_optim.diagnosis.search.state import Branch
+
+ROOT = Path(__file__).parents[1]
+DIAGNOSIS = ROOT / "pace_optim" / "diagnosis"
+LOGS = sorted((Path(__file__).parent / "decisions").glob("*.jsonl"))
+PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}
+"""Numbers of arithmetic and units: halves, squares, tenths, percent, milli."""
+GUARDS = {"_RIDGE", "_LEAST", "_MOST", "_POINTS"}
+"""Of the linear algebra, and of a grid over which a maximum is taken: none decides anything."""
+TELLING = {"_EFFECTS"}
+"""How much is printed."""
+
+
+@pytest.mark.parametrize("path", LOGS, ids=lambda path: path.stem)
+def test_decisions_of_whole_diagnoses_come_out_as_they_did(path):
+    decisions = read_decisions(path)
+    assert decisions
+    for decision in decisions:
+        assert replayed(decision) == decision.taken, decision.rule
+
+
+def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
+    log: list[Decision] = []
+    for joints in ((STANDS_IN,), (BOTH_LACK,), (NEIGHBOUR, together(1, 2), together(1, 2))):
+        searched(*joints, log=log.append)
+    path = tmp_path / "decisions.jsonl"
+    path.write_bytes(as_lines(log))
+    read = read_decisions(path)
+    assert {decision.rule for decision in read} == {"look_ahead", "add_pair", "add_to_group"}
+    for decision in read:
+        assert [bool(name) for name in replayed(decision)] == [bool(name) for name in decision.taken]
+
+
+def test_another_comparison_decides_otherwise():
+    model, values = JointModel.base(joint_alone().problem), joint_alone().truth_values
+    effects = [get_effect(name) for name in ("stribeck_friction", "torque_gain")]
+    now = with_effects(model, values, (effects[0], [True], [1.0, 0.1]), (effects[1], [True], [0.1]))
+    left = {effects[0]: errors_of(1.2e-3, roll=1), effects[1]: errors_of(3e-3, roll=1), None: errors_of(1e-3)}
+    log: list[Decision] = []
+    search = make_search(lambda of: left[of.tried], log=log.append)
+    drop_last(search, Branch(problem=joint_alone().twins, now=now, errors=left[None]))
+    first = log[0]
+    assert first.taken == ["stribeck_friction"] == replayed(first)  # 1.2 times is less than a further effect must bring
+    lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1.1, clear=1.1))
+    assert replayed(first, lenient) == [None]
+
+
+def test_every_rule_can_be_switched_off_and_no_other():
+    assert {*MOVES, *LAST} - {"add"} <= set(RULES)
+    assert not DiagnosisCfg(off=("pool",)).has("pool") and DiagnosisCfg().has("pool")
+    with pytest.raises(ValueError, match=r"no rule 'pol'.*pool"):
+        DiagnosisCfg(off=("pol",))
+
+
+def numbers(path: Path) -> list[str]:
+    """Numbers of a file that are neither arithmetic nor guards against a division by zero."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in tree.body:  # constants with a name that says what they are
+        if isinstance(node, ast.Assign):
+            names = {n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)}
+            if names <= GUARDS | TELLING:
+                node.value = ast.Constant(value=0)
+    for node in ast.walk(tree):  # axes
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "permute":
+            node.args = []
+    found = [n for n in ast.walk(tree) if isinstance(n, ast.Constant) and type(n.value) in (int, float)]
+    return [f"{path.name}:{n.lineno}: {n.value}" for n in found if n.value not in PLAIN and abs(n.value) > 1e-8]
+
+
+def test_every_tuned_number_is_in_the_configuration():
+    files = [path for path in DIAGNOSIS.rglob("*.py") if path.name not in ("diagnosis_cfg.py", "settings.py")]
+    assert [each for path in files for each in numbers(path)] == []
+
+
+def test_every_tuned_number_is_documented():
+    tree = ast.parse((DIAGNOSIS / "diagnosis_cfg.py").read_text(encoding="utf-8"))
+    for part in (node for node in tree.body if isinstance(node, ast.ClassDef)):
+        for node, after in zip(part.body, part.body[1:], strict=False):
+            if isinstance(node, ast.AnnAssign) and part.name != "DiagnosisCfg":
+                assert isinstance(after, ast.Expr), node.target.id
+
+
+def test_whoever_is_given_numbers_passes_them_on():
+    """A default left in force somewhere would decide by other numbers than those that are saved."""
+    given, calls = {}, []
+    for path in DIAGNOSIS.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                arguments = [*node.args.args, *node.args.kwonlyargs]
+                names = [a.arg for a in arguments if a.arg in ("cfg", "at_bound", "beyond")]
+                if names and path.name != "replay.py":
+                    given[node.name] = [a.arg for a in arguments].index(names[0])
+            elif isinstance(node, ast.Call):
+                calls.append((path.name, getattr(node.func, "attr", getattr(node.func, "id", "")), node))
+    for path, name, call in calls:
+        if name in given and name not in ("__init__", "Fits"):
+            passed = [k.arg for k in call.keywords]
+            count = len(call.args) + (isinstance(call.func, ast.Attribute) and name in ("at_bounds", "judged", "beats"))
+            assert {"cfg", "at_bound", "beyond"} & set(passed) or count > given[name], f"{path}:{call.lineno}: {name}"
