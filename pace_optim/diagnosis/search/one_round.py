@@ -11,7 +11,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.evidence import log_evidence
 from pace_optim.diagnosis.candidates.multistart import far_starts
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
@@ -145,7 +145,7 @@ def beyond_bounds(
     fitted: Sequence[Fitted],
     refit: Callable[[list[Fitted]], list[Fitted]],
     say: Callable[[str], None],
-    at_bound: float,
+    at_bound: float = DEFAULT.fitting.at_bound,
 ) -> list[Fitted]:
     """The fits, those again that an effect's bound holds back, with bounds as wide as physics allows.
 
