@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from diagnoses import errors_of, joint_alone, make_search, with_effects
-from test_looking_ahead import BOTH_LACK, NEIGHBOUR, STANDS_IN, searched, together
+from test_search_moves import BOTH_LACK, NEIGHBOUR, STANDS_IN, searched, together
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg

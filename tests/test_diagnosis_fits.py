@@ -13,7 +13,7 @@ from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.beginning import base_fit
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import check_data
-from pace_optim.diagnosis.candidates.multistart import far_starts
+from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
@@ -187,7 +187,7 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     model = JointModel.base(bench.problem)
     heavy[:, BASE.index("armature")] = model.upper[:, BASE.index("armature")]
     coarse, now = bench.twins.with_physics_dt(DT), Fitted.start(model, heavy)
-    starts = far_starts(FITS, coarse, now, [STRIBECK, get_effect("joint_elasticity")])
+    starts = multistart(FITS, coarse, now, [STRIBECK, get_effect("joint_elasticity")])
     stiff = [start.tried.name for start in starts[1:]]
     assert starts[0].tried is STRIBECK and stiff == ["joint_elasticity"] * len(probe_points(starts[1].tried))
     slots = [Slot(model=model, rows=1), *(Slot(model=start.model, rows=1) for start in starts)]

@@ -13,7 +13,7 @@ import torch
 from diagnoses import joint_alone
 
 from pace_actuators.effects import Effect, get_effect
-from pace_optim.diagnosis.candidates.multistart import far_starts
+from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.fitting import processes
 from pace_optim.diagnosis.fitting.fits import Fits
@@ -178,7 +178,7 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
             for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
         fits = Fits().side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
-        return screen(Fits(), bench.twins, base, effects, effort), fits, far_starts(Fits(), bench.twins, base, effects)
+        return screen(Fits(), bench.twins, base, effects, effort), fits, multistart(Fits(), bench.twins, base, effects)
 
     probes, fits, far = found()
     monkeypatch.setattr(processes, "available_processors", lambda: 1)

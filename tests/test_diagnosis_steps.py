@@ -22,7 +22,7 @@ from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Outcome
 from pace_optim.diagnosis.telling import next_experiment
 from pace_optim.diagnosis.telling.next_experiment import distances, menu, next_experiments, rivals_of
-from pace_optim.diagnosis.verdict.proxy_effects import stand_ins
+from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -70,8 +70,8 @@ def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effec
         unevenness=even,
     )
     assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
-    stuck_one = f"At a bound, so that it stands in for something else: {effect.name} (servo)."
-    assert stand_ins(far, ["servo"], floor) == ([stuck_one] if stuck else [])
+    stuck_one = f"{effect.name} (servo) is at a bound, so it is probably a proxy for another effect."
+    assert proxies(far, ["servo"], floor) == ([stuck_one] if stuck else [])
     assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
     two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [0.8]))
     two = replace(far, final=two, unevenness=even.repeat(2, 1))

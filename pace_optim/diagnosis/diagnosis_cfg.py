@@ -37,13 +37,10 @@ class FittingCfg:
     wide: tuple[float, ...] = (3e-2, 1e-2)
     """The same first where contacts and sticking make the error rough; the next is taken when one leads no further."""
     enough: float = 3e-3
-    """A joint whose score falls by less than this part, in two iterations in a row, has converged."""
-    promised: float = 3e-4
-    """So has one whose linear model promises less than this part of the score."""
+    """A joint whose score falls by less than this part, in two iterations in a row, has converged; so has one whose
+    linear model promises less than a tenth of it."""
     falls: float = 0.05
     """A model still falls whose squared error has fallen by more than this part over the last ``rounds`` iterations."""
-    outlier: float = 3.0
-    """A trimmed fit leaves out windows whose RMSE is this many times the median."""
     gain: float = 0.9
     """The reference is renewed, or windows are left out, again where that lowered the error to less than this part."""
     renewals: int = 4
@@ -135,12 +132,12 @@ class JudgingCfg:
     that the newest makes superfluous, joints share one value, and a way with fewer parameters is taken."""
     weighed: float = 1.15
     """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
-    far: float = 3.0
-    """A joint is far from the floor above this many times it: more is missing."""
     near: float = 1.3
     """Nearer to the floor than this a further effect could not bring as much as it must."""
-    comes_near: float = 3.0
-    """An effect comes near to another one up to this ratio apart."""
+    far: float = 3.0
+    """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
+    to this ratio apart, a window is an outlier above this many times the median, and predictions part clearly above
+    this many times the noise."""
     in_place: int = 3
     """So many of those that came near are tried in place of a joint's effects."""
 
@@ -169,8 +166,6 @@ class VerdictCfg:
     """Of the recordings on the menu of next experiments [s]."""
     factor: float = 1.5
     """Of their proportional gain and of their load."""
-    clearly: float = 3.0
-    """Predictions that part by fewer times the noise than this are not told apart."""
 
 
 RULES = (
@@ -187,7 +182,7 @@ RULES = (
     "second_try",
     "evidence",
     "widen_bounds",
-    "far_starts",
+    "multistart",
     "late_joints",
     "curves",
 )

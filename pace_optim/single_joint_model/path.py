@@ -28,7 +28,7 @@ _SPAN = 0.02
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Feel:
+class JointLoad:
     """What each joint feels in the interval after a control step: (T, R, n) each."""
 
     inertia: torch.Tensor
@@ -38,13 +38,13 @@ class Feel:
     load: torch.Tensor
     """The same without what the other joints' accelerations do: what a robot's drives are told of their load [N m]."""
 
-    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Feel:
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
         """The same change of each."""
-        return Feel(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
+        return JointLoad(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
 
-    def less(self, other: Feel, times: torch.Tensor) -> Feel:
+    def less(self, other: JointLoad, times: torch.Tensor) -> JointLoad:
         """This less a multiple of another."""
-        return Feel(
+        return JointLoad(
             inertia=self.inertia - times * other.inertia,
             torque=self.torque - times * other.torque,
             load=self.load - times * other.load,
@@ -57,10 +57,10 @@ class ReferencePath:
 
     position: torch.Tensor
     """(T, R, n) [rad]."""
-    feel: Feel
+    feel: JointLoad
     stiffness: torch.Tensor
     """Derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
-    model_effects: dict[tuple[str, str], Feel]
+    model_effects: dict[tuple[str, str], JointLoad]
     """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
     columns: torch.Tensor
     """The joints' degrees of freedom in the model, (n,)."""
@@ -250,7 +250,7 @@ def _feel(
     q: torch.Tensor,
     v: torch.Tensor,
     a: torch.Tensor,
-) -> Feel:
+) -> JointLoad:
     """Inertia of each joint, and the torque that the rest of the robot leaves on it, -(bias_j + Σ_{k≠j} M_jk a_k)."""
     steps, count, n = q.shape
     own_block = np.ix_(columns, columns)
@@ -270,7 +270,7 @@ def _feel(
             inertia[k, r] = diagonal
             load[k, r] = -data.qfrc_bias[columns]
             torque[k, r] = load[k, r] - (own @ accelerations[k] - diagonal * accelerations[k])
-    return Feel(inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load))
+    return JointLoad(inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load))
 
 
 def _stiffness(
@@ -309,8 +309,8 @@ def _change(
     parameter: str,
     now: torch.Tensor,
     motion: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    whole: Feel,
-) -> Feel:
+    whole: JointLoad,
+) -> JointLoad:
     """What a unit of a parameter of an effect on the model changes of each joint's own feel.
 
     Measured between what the joint has, ``now`` (n,), and null, or where it has null, a probe.

@@ -1,4 +1,4 @@
-"""Where to start a refit when the base model is far off: its parameters then stand in for what is missing."""
+"""Where to start a refit when the base model is far off: its parameters are then proxies for what is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
-def far_starts(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
+def multistart(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
     Of a stiff one, the best point of each probe: the error at a point says little of where it leads, as another
@@ -35,7 +35,7 @@ def far_starts(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[
 
 
 def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[list[Fitted]]:
-    """:func:`far_starts` in one process."""
+    """:func:`multistart` in one process."""
     cfg = fits.cfg
     bases = _bases(now, cfg.candidates.frictions)
     slots, values = [], []

@@ -1,4 +1,4 @@
-"""Which effects could explain what is left: the score test through the simulation."""
+"""Which effects could explain the residual: a score test through the simulation."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ class Fits:
         for _ in range(cfg.rounds):
             rmse = self.window_rmse(problem.in_windows(), now)
             median = rmse.median(dim=0).values
-            kept = (rmse <= cfg.outlier * median) | ~joints
+            kept = (rmse <= self.cfg.judging.far * median) | ~joints
             if bool(kept.all()) or not bool(((median < cfg.gain * best) & joints).any()):
                 break
             best = median

@@ -117,7 +117,7 @@ class LevenbergMarquardt:
             x, hessian, gradient = self.x[j, at], self._hessian[j][at[:, None], at], self._gradient[j][at]
             move = bounded_step(x, hessian, gradient, self._cfg.damping) - x if len(at) else x
             promised = -float(2 * gradient @ move + move @ hessian @ move)
-            result[j] = promised < self._cfg.promised * float(self.score[j])
+            result[j] = promised < self._cfg.enough / 10 * float(self.score[j])
         return result
 
     def result(self) -> Fitted:

@@ -90,4 +90,4 @@ class Round:
 def near_trials(trials: Sequence[Trial], chosen: type[Effect], *, cfg: JudgingCfg = DEFAULT.judging) -> list[Trial]:
     """Trials of a joint that came near to the chosen effect, best first."""
     best = next(t.mse_after for t in trials if t.effect is chosen)
-    return [t for t in trials if t.effect is not chosen and within(t.mse_after, best, cfg.comes_near)]
+    return [t for t in trials if t.effect is not chosen and within(t.mse_after, best, cfg.far)]

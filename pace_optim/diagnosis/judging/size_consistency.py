@@ -1,4 +1,4 @@
-"""Whether an effect has the same size in every recording: what stands in for something else mostly does not."""
+"""Whether an effect has the same size in every recording: a proxy mostly does not."""
 
 from __future__ import annotations
 

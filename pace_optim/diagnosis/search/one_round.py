@@ -9,7 +9,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.evidence import log_evidence
-from pace_optim.diagnosis.candidates.multistart import far_starts
+from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
@@ -110,7 +110,7 @@ def _begin(
     if not begin:
         return {}, probes
     say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
-    begun = _begun(fits, problem, now, probes, begin, far and fits.cfg.has("far_starts"))
+    begun = _begun(fits, problem, now, probes, begin, far and fits.cfg.has("multistart"))
     if wide:
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
     # where nothing is listed no effect does better than the base parameters alone
@@ -214,7 +214,7 @@ def _begun(
         ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
         starts += [_start(now, effect, [best[k] for best in ranked], cfg.candidates) for k in range(len(ranked[0]))]
     if far:
-        starts = _neighbours_together([*starts, *far_starts(fits, coarse, now, effects)])
+        starts = _neighbours_together([*starts, *multistart(fits, coarse, now, effects)])
     result: dict[type[Effect] | None, Fitted] = {}
     for each in fits.side_by_side(coarse, starts, cfg.fitting.again, part=cfg.fitting.part):
         best = result.setdefault(each.tried, each)

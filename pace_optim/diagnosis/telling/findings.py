@@ -11,7 +11,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.free_curves import Curves
-from pace_optim.diagnosis.verdict.proxy_effects import stand_ins, varying
+from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
 from pace_optim.problem.problem import Problem
 
 
@@ -63,7 +63,7 @@ def summary_of(found: Findings, problem: Problem) -> str:
             f"mrad, the floor {floor:.3g} mrad, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
             "what lies between."
         )
-        return " ".join([text, *stand_ins(*about), *varying(*about)])
+        return " ".join([text, *proxies(*about), *varying(*about)])
     all_of_it = "all of it" if found.free_form else "it"
     summary = (
         f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} mrad "

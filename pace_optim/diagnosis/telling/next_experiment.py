@@ -71,13 +71,13 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
         return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
     predictions = [each for pair in pairs for each in _predictions(problem, pair, noise, outcome.cfg.verdict)]
     result = []
-    clear = [each for each in predictions if each.times >= outcome.cfg.verdict.clearly]
+    clear = [each for each in predictions if each.times >= outcome.cfg.judging.far]
     while clear:
         best = _most_telling(clear)
         result.append(_sentence(best, problem))
         told = [each.pair for each in best]
         clear = [each for each in clear if each.pair not in told]
-    seen = [each.pair for each in predictions if each.times >= outcome.cfg.verdict.clearly]
+    seen = [each.pair for each in predictions if each.times >= outcome.cfg.judging.far]
     for pair in [pair for pair in pairs if pair not in seen]:
         count = sum(each.pair is pair for each in predictions)
         text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."

@@ -27,7 +27,7 @@ def near_floor(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
 
 
 def real_effects(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    """Effects that do not stand in for something else, (effects, n) bool."""
+    """Effects that are no proxies, (effects, n) bool."""
     model = outcome.final.model
     return model.has & ~curves_in(model) & ~_at_bounds(outcome) & ~_uneven(outcome, floor)
 
@@ -37,7 +37,7 @@ def curves_in(model: JointModel) -> torch.Tensor:
     return model.has & torch.tensor([effect.free_form for effect in model.effects], dtype=torch.bool)[:, None]
 
 
-def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+def counts_as_missing(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Effects that count as missing, (effects, n) bool: no curves, no smoothing of friction where it hardly shows."""
     model = outcome.final.model
     smooths = torch.tensor([effect.smooths_friction for effect in model.effects], dtype=torch.bool)[:, None]
@@ -45,12 +45,12 @@ def counts(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     return model.has & ~curves_in(model) & ~(smooths & hardly_shows)
 
 
-def stand_ins(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
-    """Effects that stand in for something else, and what shows it: a sentence each."""
+def proxies(outcome: Outcome, names: Sequence[str], floor: torch.Tensor) -> list[str]:
+    """Effects that are proxies for something else, and what shows it: a sentence each."""
     stuck, uneven = (_said(outcome, names, which) for which in (_at_bounds(outcome), _uneven(outcome, floor)))
     return [
-        *([f"At a bound, so that it stands in for something else: {stuck}."] if stuck else []),
-        *([f"Of another size in each recording, so that it stands in for something else: {uneven}."] if uneven else []),
+        *([f"{stuck} is at a bound, so it is probably a proxy for another effect."] if stuck else []),
+        *([f"{uneven} needs a different value in each recording, so it is probably a proxy."] if uneven else []),
     ]
 
 

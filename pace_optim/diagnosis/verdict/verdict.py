@@ -15,7 +15,7 @@ from pace_optim.diagnosis.judging.comparison import least_ratio
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import (
     above_floor,
-    counts,
+    counts_as_missing,
     curves_in,
     near_floor,
     real_effects,
@@ -44,7 +44,7 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
 def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 
-    They explain at least half of the error above the floor, and not all of them stand in for something else. Near the
+    They explain at least half of the error above the floor, and not all of them are proxies. Near the
     floor it does not matter how. How friction is smoothed at standstill is not missing where it makes less of an error
     than would be a finding of its own.
 
@@ -54,7 +54,7 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """
     excess, left = above_floor(outcome, floor)
     enough = (left <= (1 - outcome.cfg.verdict.most) * excess) & real_effects(outcome, floor).any(dim=0)
-    return counts(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
+    return counts_as_missing(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
 
 
 def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:

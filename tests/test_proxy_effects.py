@@ -19,13 +19,13 @@ from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import stand_ins, varying
+from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
 
 SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")
 FLOOR, YES = torch.tensor([1e-4]), torch.tensor([True])
-SAID = "Of another size in each recording, so that it stands in for something else: parallel_spring (servo)."
+SAID = "parallel_spring (servo) needs a different value in each recording, so it is probably a proxy."
 
 
 @pytest.fixture(scope="module")
@@ -87,14 +87,14 @@ def test_parameters_at_a_bound_do_not_count(run):
 
 def test_it_is_not_what_is_missing_unless_it_explains_nearly_all(run):
     far = ended(run.problem, 5e-3)
-    assert verdict(far, FLOOR)[0] == "unknown" and stand_ins(far, ["servo"], FLOOR) == [SAID]
+    assert verdict(far, FLOOR)[0] == "unknown" and proxies(far, ["servo"], FLOOR) == [SAID]
     assert verdict(ended(run.problem, 2e-3), FLOOR)[0] == "effect"
     assert verdict(ended(run.problem, 5e-3, friction=True), FLOOR)[0] == "effect"  # beside another that does not differ
 
 
 def test_an_effect_that_leaves_little_once_its_size_may_differ_is_there_and_depends_on_something(run):
     right = ended(run.problem, 5e-3, noise=0.3)
-    assert verdict(right, FLOOR)[0] == "effect" and stand_ins(right, ["servo"], FLOOR) == []
+    assert verdict(right, FLOOR)[0] == "effect" and proxies(right, ["servo"], FLOOR) == []
     told = "Its size differs between recordings, so it depends on something more: parallel_spring (servo)."
     assert varying(right, ["servo"], FLOOR) == [told] and varying(ended(run.problem, 5e-3), ["servo"], FLOOR) == []
     found = Findings(
