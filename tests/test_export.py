@@ -13,6 +13,8 @@ from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import load_env_cfg
 from pace_optim.export import FORMATS, export
+from pace_optim.export.mjlab_native import mjlab_actuator
+from pace_optim.export.plain_drive import PlainDrive
 
 ROOT = Path(__file__).parents[1]
 
@@ -118,6 +120,31 @@ def test_the_json_is_plain_and_complete(result):
     for name in content["parameters"]:
         assert set(content["parameters"][name]) == set(JOINTS)
     assert content["parameters"]["armature"]["LF_HAA"] == drives.parameters["armature"]["LF_HAA"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "left_out"),
+    [
+        ({"saturation_effort": 140.0, "velocity_limit": 8.5}, "DcMotorActuatorCfg", ()),
+        ({}, "IdealPdActuatorCfg", ()),
+        ({"effort_limit": np.inf}, "IdealPdActuatorCfg", ("effort_limit",)),
+        ({"stiffness": 0.0}, "IdealPdActuatorCfg", ()),
+        ({"run_dt": 0.0}, "BuiltinPositionActuatorCfg", ()),
+        ({"run_dt": 0.0, "stiffness": 0.0}, "BuiltinVelocityActuatorCfg", ("stiffness",)),
+    ],
+)
+def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out):
+    no_line = {"saturation_effort": np.inf, "velocity_limit": np.inf}
+    drive = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0, "run_dt": DT} | no_line | changes
+    plain = PlainDrive(**drive, encoder_bias=0.01, delay_s=3.4 * DT)
+    made: dict = {}
+    classes = {kind: lambda **fields: made.update(fields)}  # another class is a NameError
+    eval(mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain), classes)
+    given = {name: value for name, value in drive.items() if np.isfinite(value) and name != "run_dt"}
+    joint = {"armature": 0.055, "frictionloss": 0.32, "viscous_damping": 0.45}
+    expected = {name: value for name, value in (given | joint).items() if name not in left_out}
+    names, delay = {"target_names_expr": ("LF_HFE",)}, {"delay_min_lag": 3, "delay_max_lag": 3}
+    assert made == expected | names | delay
 
 
 @pytest.mark.parametrize("fmt", FORMATS)

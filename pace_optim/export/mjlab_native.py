@@ -22,7 +22,7 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     plain, notes = plain_drives(drives)
     notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
     classes = sorted({_class(drive) for drive in plain.values()})
-    rows = [f"    {_class(drive)}({_fields(drives, joint, drive)})," for joint, drive in plain.items()]
+    rows = [f"    {mjlab_actuator(drives, joint, drive)}," for joint, drive in plain.items()]
     bias = [f"    {joint!r}: {-drive.encoder_bias:.10g}," for joint, drive in plain.items() if drive.encoder_bias]
     body = [
         f'"""Drives identified with {drives.task}, for mjlab 1.6 alone: {drives.path.parent.name}.',
@@ -48,6 +48,11 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     ]
     functions = inspect.getsource(mjlab_native_template).split(_START)[1]
     return "\n".join(body) + "\n" + functions, notes
+
+
+def mjlab_actuator(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> str:
+    """The call that makes a joint's actuator, by the class of mjlab that holds this kind of drive."""
+    return f"{_class(drive)}({_fields(drives, joint, drive)})"
 
 
 def _class(drive: PlainDrive) -> str:
