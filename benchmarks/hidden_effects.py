@@ -2,6 +2,8 @@
 
 python benchmarks/hidden_effects.py --cases effects,clean --seeds 5 --workers 2
 python benchmarks/hidden_effects.py --table
+
+Each case's decisions lie beside its recordings: python benchmarks/decisions.py reads them.
 """
 
 from __future__ import annotations
@@ -53,6 +55,7 @@ def main() -> None:
     parser.add_argument("--robot", choices=tuple(ROBOTS), default="bench")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
+    parser.add_argument("--off", nargs="+", default=[], metavar="RULE", help="rules to switch off")
     parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
     parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")
     parser.add_argument("--table", action="store_true", help="only print what the results say")
@@ -68,6 +71,7 @@ def main() -> None:
                 args.folder / f"{args.robot}_{args.recordings}",
                 physics_dt=args.physics_dt,
                 max_effects=args.max_effects,
+                off=tuple(args.off),
             )
         except ValueError as error:
             sys.exit(f"error: {error}")

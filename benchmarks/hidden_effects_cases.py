@@ -18,9 +18,11 @@ import torch
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.beginning.base_fit import fit_base
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.judging.decisions import Decision, as_lines
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import start_values
 from pace_optim.diagnosis.verdict.verdict import ranking
@@ -53,6 +55,8 @@ class Job:
     """Of the model [s]."""
     max_effects: int = 3
     """How many effects the diagnosis may add."""
+    off: tuple[str, ...] = ()
+    """Rules of the diagnosis that are switched off."""
 
 
 def make_jobs(
@@ -109,8 +113,12 @@ def run_case(job: Job) -> dict[str, Any]:
     problem, truth = _load(job, job.case)
     made = time.perf_counter()
     middle = problem.space.to_physical(problem.space.start)
-    found = search_effects(problem, middle, candidate_effects(), job.max_effects)
+    decisions: list[Decision] = []
+    cfg = DiagnosisCfg(off=job.off)
+    found = search_effects(problem, middle, candidate_effects(), job.max_effects, cfg=cfg, log=decisions.append)
     diagnosed = time.perf_counter()
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    job.folder.with_name(f"{job.case.name}.jsonl").write_bytes(as_lines(decisions))
     outcome = found.outcome
     base, final = outcome.base, outcome.final
     true_effects = [get_effect(name) for name in truth["effects"] if name in library_effects()]

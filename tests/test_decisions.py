@@ -1,17 +1,21 @@
 """What a diagnosis decided can be decided again from its log, and every number that it decides by is in one place."""
 
 import ast
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from diagnoses import errors_of, joint_alone, make_search, with_effects
-from test_search_moves import BOTH_LACK, NEIGHBOUR, STANDS_IN, searched, together
+from diagnoses import errors_of, make_search, with_effects
+from test_search_moves import BOTH_LACK, NEIGHBOUR, STANDS_IN, base_model, searched, together
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+
+from decisions import table
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.search.moves import LAST, MOVES
 from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.replay import replayed
@@ -48,14 +52,22 @@ def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
         assert [bool(name) for name in replayed(decision)] == [bool(name) for name in decision.taken]
 
 
+def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
+    log: list[Decision] = []
+    searched(BOTH_LACK, log=log.append)
+    lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1e9))
+    rows = table({"one": log, "two": log}, lenient).splitlines()
+    assert rows[2] == "| add_pair | 2 | 2 | 2 of 2 | 2 |"
+
+
 def test_another_comparison_decides_otherwise():
-    model, values = JointModel.base(joint_alone().problem), joint_alone().truth_values
+    model = base_model()
     effects = [get_effect(name) for name in ("stribeck_friction", "torque_gain")]
-    now = with_effects(model, values, (effects[0], [True], [1.0, 0.1]), (effects[1], [True], [0.1]))
+    now = with_effects(model, 0 * model.upper, (effects[0], [True], [1.0, 0.1]), (effects[1], [True], [0.1]))
     left = {effects[0]: errors_of(1.2e-3, roll=1), effects[1]: errors_of(3e-3, roll=1), None: errors_of(1e-3)}
     log: list[Decision] = []
     search = make_search(lambda of: left[of.tried], log=log.append)
-    drop_last(search, Branch(problem=joint_alone().twins, now=now, errors=left[None]))
+    drop_last(search, Branch(problem=None, now=now, errors=left[None]))
     first = log[0]
     assert first.taken == ["stribeck_friction"] == replayed(first)  # 1.2 times is less than a further effect must bring
     lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1.1, clear=1.1))

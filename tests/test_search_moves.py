@@ -82,12 +82,10 @@ class InWorld(FakeFits):
         return self.errors(problem, models)
 
 
-def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
-    """Where a search ends, and in which world."""
-    world, n = World(*joints), len(joints)
-    fits = InWorld(world.errors, off=("replace", "drop", "merge", "drop_last", "trim", "wide_steps"))
+def base_model(n=1):
+    """The base model of joints that nobody simulates."""
     bounds = torch.ones(n, len(BASE)).double()
-    model = JointModel(
+    return JointModel(
         effects=(),
         has=torch.zeros(0, n, dtype=torch.bool),
         lower=-bounds,
@@ -95,8 +93,15 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
         log=torch.zeros(len(BASE), dtype=torch.bool),
         slides=torch.zeros(n, dtype=torch.bool),
     )
+
+
+def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
+    """Where a search ends, and in which world."""
+    world, n = World(*joints), len(joints)
+    fits = InWorld(world.errors, off=("replace", "drop", "merge", "drop_last", "trim", "wide_steps"))
+    model = base_model(n)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
-    base, candidates = Fitted.start(model, 0 * bounds), [ELASTICITY, MOUNT, GAIN, SPRING]
+    base, candidates = Fitted.start(model, 0 * model.upper), [ELASTICITY, MOUNT, GAIN, SPRING]
     problem = SimpleNamespace(on_joints=lambda joints: SimpleNamespace(joints=joints))
     search = Search(
         effects=candidates,
