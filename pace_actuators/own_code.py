@@ -21,6 +21,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
+from pace_actuators.files import file_at
 from pace_actuators.trusted_code import is_trusted, trust
 
 CodeRecord = Mapping[str, Mapping[str, str]]
@@ -185,6 +186,8 @@ def _import_file(file: Path) -> ModuleType:
 
 
 def _import_name(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise ImportError("it is no module's name")
     top = name.partition(".")[0]
     spec, here = PathFinder.find_spec(top), str(Path.cwd())
     if spec is None and (spec := PathFinder.find_spec(top, [here])) is not None:
@@ -224,8 +227,8 @@ def _forget(name: str) -> None:
 def _verified(entry: Mapping[str, str], where: str, hint: str) -> bytes:
     file = Path(entry["file"])
     try:
-        content = file.read_bytes()
-    except OSError:
+        content = file_at(file, "").read_bytes()
+    except (OSError, ValueError):
         raise ValueError(f"{where} was made with {file}, which has gone. Put it back, or name it: {hint}.") from None
     if digest_of(content) != entry["sha256"]:
         raise ValueError(

@@ -12,7 +12,7 @@ from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
-from pace_envs.indexing import EnvIds, JointIds, assign, find_names, indices, pick, zeros_like
+from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, pick, zeros_like
 from pace_envs.joint_layout import JointLayout
 from pace_envs.link_model import LinkModel
 from pace_envs.model_file import read_model_file
@@ -104,6 +104,11 @@ class Articulation:
         return self._sim.num_envs
 
     @property
+    def _shape(self) -> tuple[int, int]:
+        """Of a value for each joint of each environment."""
+        return self.num_envs, self.num_joints
+
+    @property
     def is_fixed_base(self) -> bool:
         """Whether the base is held in place."""
         return self._layout.root is None
@@ -182,8 +187,8 @@ class Articulation:
 
         The passive joints of closed chains go where they close them, from where they are.
         """
-        self._write(self._sim.qpos, self._layout.qpos_columns, position, joint_ids, env_ids)
-        self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids)
+        self._write(self._sim.qpos, self._layout.qpos_columns, position, joint_ids, env_ids, "the position")
+        self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids, "the velocity")
         if self._loops is not None:
             rows = slice(None) if env_ids is None else self._sim.resolve_env_ids(env_ids)
             self._sim.qpos[rows], self._sim.qvel[rows] = self._loops.closed(self._sim.qpos[rows], self._sim.qvel[rows])
@@ -239,9 +244,10 @@ class Articulation:
     ) -> None:
         """Set position targets [rad]; they reach the drives with :meth:`write_data_to_sim`."""
         if joint_ids is None and env_ids is None:
-            self.data.joint_pos_target.copy_(target)
+            values = checked_values(target, self._shape, "the position target")
+            self.data.joint_pos_target.copy_(torch.as_tensor(values))
         else:
-            assign(self.data.joint_pos_target, indices(env_ids), indices(joint_ids), target)
+            assign(self.data.joint_pos_target, indices(env_ids), indices(joint_ids), target, "the position target")
 
     def set_joint_velocity_target(
         self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
@@ -249,13 +255,13 @@ class Articulation:
         """Set velocity targets [rad/s]."""
         if self.data.joint_vel_target is None:
             self.data.joint_vel_target = zeros_like(self.data.joint_pos_target)
-        assign(self.data.joint_vel_target, indices(env_ids), indices(joint_ids), target)
+        assign(self.data.joint_vel_target, indices(env_ids), indices(joint_ids), target, "the velocity target")
 
     def set_joint_effort_target(self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None) -> None:
         """Set feed-forward efforts [N m]."""
         if self.data.joint_effort_target is None:
             self.data.joint_effort_target = zeros_like(self.data.joint_pos_target)
-        assign(self.data.joint_effort_target, indices(env_ids), indices(joint_ids), target)
+        assign(self.data.joint_effort_target, indices(env_ids), indices(joint_ids), target, "the effort target")
 
     def write_data_to_sim(self) -> None:
         """Run the drives on the present targets and state, and apply their torques."""
@@ -480,11 +486,12 @@ class Articulation:
     def _write_parameter(
         self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
     ) -> None:
+        value = value if isinstance(value, torch.Tensor) else checked_values(value, self._shape, name)
         tensor = self._sim.tensor(value)
         bad = ~((tensor >= 0) & tensor.isfinite())
         if bool(bad.any()):
             raise ValueError(f"{name} is {tensor[bad][0].item():g}, expected a finite number >= 0.")
-        self._write(self._sim.expand(field), self._layout.dof_columns, tensor, joint_ids, env_ids)
+        self._write(self._sim.expand(field), self._layout.dof_columns, tensor, joint_ids, env_ids, name)
         self._sim.constants_changed()
         for actuator in self.actuators.values():  # their torque law may depend on it
             if actuator.changes_passive or actuator.effects is not None:
@@ -503,8 +510,9 @@ class Articulation:
         value: torch.Tensor | float,
         joint_ids: JointIds,
         env_ids: EnvIds,
+        what: str = "the value",
     ) -> None:
-        assign(field, indices(env_ids), columns[indices(joint_ids)], value)
+        assign(field, indices(env_ids), columns[indices(joint_ids)], value, what)
 
     def _refresh(self) -> None:
         if not self._layout.side_by_side:

@@ -32,17 +32,55 @@ def zeros_like(tensor: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(tensor)
 
 
+def checked_values(value: Any, shape: tuple[int, int], what: str) -> torch.Tensor | float:
+    """A value for every environment and joint: the one rule by which values are spread over them.
+
+    A number is everybody's; of a tensor, each axis is as long as wanted or 1, and (joints,) is (1, joints).
+
+    Args:
+        value: What the user gives.
+        shape: Number of environments and of joints.
+        what: Its name, for messages.
+
+    Raises:
+        ValueError: If it is no number and no tensor, or its shape is another.
+    """
+    if isinstance(value, bool | int | float):
+        return value
+    if not isinstance(value, torch.Tensor):
+        raise ValueError(
+            f"{what} is a {type(value).__module__}.{type(value).__qualname__}, expected a number or a torch.Tensor of "
+            f"shape {shape} (environments, joints). Convert it: torch.as_tensor(value)."
+        )
+    found = tuple(value.shape)
+    fits = len(found) <= 2 and all(n in (1, m) for n, m in zip(found[::-1], shape[::-1], strict=False))
+    if not fits:
+        raise ValueError(
+            f"{what} has the shape {found}, expected {shape} (environments, joints), where either may be 1."
+        )
+    if value.is_complex():
+        raise ValueError(f"{what} holds complex numbers, expected real ones.")
+    return value
+
+
 def assign(
     field: torch.Tensor,
     rows: torch.Tensor | slice,
     columns: torch.Tensor | slice,
     value: torch.Tensor | float,
+    what: str = "the value",
 ) -> None:
-    """``field[rows][:, columns] = value`` for any mix of slices and indices."""
+    """``field[rows][:, columns] = value`` for any mix of slices and indices, spread by :func:`checked_values`."""
+    shape = (_count(rows, field.shape[0]), _count(columns, field.shape[1]))
+    value = checked_values(value, shape, what)
     if isinstance(rows, slice) or isinstance(columns, slice):
         field[rows, columns] = torch.as_tensor(value, dtype=field.dtype, device=field.device)
     else:
         field[rows[:, None], columns[None, :]] = torch.as_tensor(value, dtype=field.dtype, device=field.device)
+
+
+def _count(ids: torch.Tensor | slice, length: int) -> int:
+    return len(range(length)[ids]) if isinstance(ids, slice) else len(ids)
 
 
 def find_names(

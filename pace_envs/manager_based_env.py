@@ -76,6 +76,7 @@ class ManagerBasedEnv(gym.Env):
             raise ValueError(f"decimation is {cfg.decimation!r}, expected an integer >= 1.")
         self.cfg = cfg
         self.render_mode = render_mode
+        self._closed = False
         self.scene = InteractiveScene(cfg.scene, cfg.sim)
         self.sim = self.scene.sim
         self._generator = torch.Generator(self.device)
@@ -163,6 +164,8 @@ class ManagerBasedEnv(gym.Env):
         Returns:
             Observations of all environments by group, and extras.
         """
+        self._check_open()
+        super().reset(seed=seed)
         if seed is not None:
             self.seed(seed)
         ids = torch.arange(self.num_envs, device=self.device)[self.sim.rows(env_ids)]
@@ -180,13 +183,18 @@ class ManagerBasedEnv(gym.Env):
 
         Returns:
             Observations by group, and extras.
+
+        Raises:
+            ValueError: If the action is no tensor of that shape or not finite, or the environment is closed.
         """
+        self._check_action(action)
         self.simulate(action)
         self.event_manager.apply("interval", dt=self.step_dt)
         return self.observation_manager.compute(), self.extras
 
     def simulate(self, action: torch.Tensor) -> None:
         """Only the physics of a step: take the action and advance all environments by ``step_dt``."""
+        self._check_open()
         self.action_manager.process_action(action)
         for _ in range(self.cfg.decimation):
             self.action_manager.apply_action()
@@ -211,6 +219,7 @@ class ManagerBasedEnv(gym.Env):
 
     def render(self) -> np.ndarray | None:
         """A picture of environment 0, (height, width, 3) uint8; ``None`` without a render mode."""
+        self._check_open()
         if self.render_mode != "rgb_array":
             return None
         if self._renderer is None:
@@ -219,8 +228,20 @@ class ManagerBasedEnv(gym.Env):
             self._renderer = OffscreenRenderer(self.sim)
         return self._renderer.render()
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ValueError("The environment is closed. Make another one.")
+
+    def _check_action(self, action: Any) -> None:
+        """Refuse what no robot can follow, before anything has moved."""
+        self._check_open()
+        if isinstance(action, torch.Tensor) and action.device.type == "cpu" and not bool(action.isfinite().all()):
+            place = (~action.isfinite()).nonzero()[0].tolist()
+            raise ValueError(f"The action is not finite, first at {place} (environment, entry). Nothing has moved.")
+
     def close(self) -> None:
-        """Release the simulations and the renderer."""
+        """Release the simulations and the renderer; nothing can be done with the environment then."""
+        self._closed = True
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

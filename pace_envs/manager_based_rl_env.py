@@ -125,7 +125,11 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
 
         Returns:
             Observations by group; reward (num_envs,); terminated and truncated (num_envs,) bool; extras.
+
+        Raises:
+            ValueError: If the action is no tensor of that shape or not finite, or the environment is closed.
         """
+        self._check_action(action)
         self.extras = {}
         self.simulate(action)
         if self.masks_resets:

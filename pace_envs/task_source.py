@@ -134,7 +134,11 @@ class EnvironmentRecord:
 
     def load_cfg(self, where: str, task: str | None = None) -> Any:
         """A fresh configuration of the environment; relative paths begin where the run was started."""
-        cfg = load_env_cfg(self.use(where, task))
+        known = self.use(where, task)
+        try:
+            cfg = load_env_cfg(known)
+        except ValueError as error:  # what the record says, unless the user names another
+            raise ValueError(str(error) if task is not None else f"{where}: {error}") from None
         path = Path(cfg.scene.robot.mjcf_path)
         if self.folder and not path.is_absolute() and not path.is_file():
             cfg.scene.robot.mjcf_path = Path(self.folder) / path

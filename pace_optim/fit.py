@@ -199,6 +199,8 @@ def _load(settings: FitSettings, env_cfg: Any) -> Problem:
     if not bool((problem.space.upper > problem.space.lower).any()):
         raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
     try_out(problem)
+    if settings.device != "cpu":
+        problem.for_search(settings.device).make_env(1).close()
     if settings.optimizer == "cmaes":  # the others choose how much they simulate at once
         check_size(problem, settings.num_envs)
     return problem

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import os
 import pickle
@@ -145,14 +146,39 @@ def mutate_file(path: Path, rng: random.Random, marker: Path) -> str:
         return mutate_bytes(path, rng, marker)
     suffix = path.suffix
     if suffix == ".json":
-        tree, what = mutate_tree(json.loads(path.read_text()), rng)
+        tree = json.loads(path.read_text())
+        if "environment" in tree and rng.random() < 0.15:
+            return _forge(path, tree, rng)
+        tree, what = mutate_tree(tree, rng)
         path.write_text(json.dumps(tree))
         return what
     if suffix == ".pt":
         return _mutate_tensors(path, rng, marker)
     if suffix == ".npz":
         return _mutate_npz(path, rng)
+    if suffix == ".mjb":
+        return mutate_bytes(path, rng, marker)
     return _mutate_text(path, rng)
+
+
+def _forge(path: Path, tree: dict[str, Any], rng: random.Random) -> str:
+    """A record that fits code which nobody named: the file's own folder brings the code and its digest along."""
+    code = path.parent / "helper.py"
+    code.write_bytes((_folder_of_trap(path) / "trap.py").read_bytes())
+    name = rng.choice(("helper", str(code), "trap"))
+    file = str(code) if rng.random() < 0.5 else os.path.relpath(code, _folder_of_trap(path))
+    record = {"file": file, "sha256": hashlib.sha256(code.read_bytes()).hexdigest()}
+    tree["environment"] = {**tree["environment"], "module": name, "code": {name: record}}
+    where = tree.get("settings", tree)
+    where["effects"] = [f"{name}:Effect"]
+    if rng.random() < 0.5:
+        where["task"] = tree["environment"]["task"] = f"{name}:Task"
+    path.write_text(json.dumps(tree))
+    return f"a forged record of {name}"
+
+
+def _folder_of_trap(path: Path) -> Path:
+    return next(folder for folder in path.parents if (folder / "trap.py").exists())
 
 
 def _mutate_tensors(path: Path, rng: random.Random, marker: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import runpy
 import shutil
@@ -72,6 +73,26 @@ def cfg():
 register_task("Arm-v0", cfg)
 """
 
+_MAP = """[joints.shoulder]
+dof_pos = {from = "m1 pos", unit = "deg", sign = -1, gear_ratio = 9.0, offset = 0.1}
+des_dof_pos = {from = "m1 cmd", unit = "deg", sign = -1, gear_ratio = 9.0, offset = 0.1}
+[joints.elbow]
+dof_pos = {from = "m2 pos", unit = "rad"}
+des_dof_pos = {from = "m2 cmd", unit = "rad"}
+[facts]
+stiffness = 8.0
+[time]
+column = "t_ms"
+unit = "ms"
+"""
+
+_URDF = """<robot name="swing"><link name="base"/>
+<link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.4"/>
+<inertia ixx="2e-3" iyy="2e-3" izz="4e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="6" velocity="9"/><dynamics damping="0.1" friction="0.05"/></joint></robot>
+"""
+
 TRAP = 'open({path!r}, "a").write("executed")\n'
 """A module that says that it was imported: nothing may import it that nobody named."""
 
@@ -107,6 +128,9 @@ def build(folder: Path, *, quick: bool = False) -> Path:
     (folder / "arm.py").write_text(_MODULE)
     (folder / "arm.xml").write_text(_MODEL)
     (folder / "trap.py").write_text(TRAP.format(path=str(folder.parent / "executed")))
+    (folder / "arm.urdf").write_text(_URDF)
+    (folder / "map.toml").write_text(_MAP)
+    (folder / "log.csv").write_text(_log())
     with contextlib.chdir(folder):
         for output in ("a.npz", "b.csv", "c.pt"):
             _must(
@@ -141,6 +165,16 @@ def build(folder: Path, *, quick: bool = False) -> Path:
         for events in [*Path().rglob("events.out.*"), *Path(TRAINING).rglob("policy*")]:
             events.unlink()
     return folder
+
+
+def _log(samples: int = 600) -> str:
+    """A log of another program, in milliseconds and degrees of the motor."""
+    rows = ["t_ms,m1 pos,m1 cmd,m2 pos,m2 cmd"]
+    for k in range(samples):
+        target = 0.3 * math.sin(0.02 * k)
+        motor = -9.0 * math.degrees(target - 0.1)
+        rows.append(f"{2.5 * k:.1f},{0.97 * motor:.4f},{motor:.4f},{0.97 * target:.6f},{target:.6f}")
+    return "\n".join(rows) + "\n"
 
 
 def _diagnose_and_train() -> None:
@@ -219,6 +253,16 @@ COMMANDS: dict[str, tuple[str, Sequence[str], Sequence[str]]] = {
     "collect": ("data_collection", ("--task", TASK, "--duration", "0.5", "--output", "new/d.npz", "--no_plot"),
                 ("arm.xml",)),
     "list": ("list_envs", (), ()),
+    "fit log": ("fit", ("--task", TASK, "--data", "log.csv", "--columns", "map.toml", "--optimizer", "cmaes",
+                        "--num_envs", "4", "--max_iteration", "1", "--log_dir", "new"), ("log.csv", "map.toml")),
+    "fit code": ("fit", ("--task", TASK, "--data", "a.npz", "--optimizer", "cmaes", "--num_envs", "4",
+                         "--max_iteration", "1", "--log_dir", "new"), ("arm.py",)),
+    "import": ("import_log", ("log.csv", "--columns", "map.toml", "--output", "new.csv"), ("log.csv", "map.toml")),
+    "import guessed": ("import_log", ("log.csv", "--write_map", "guessed.toml"), ("log.csv",)),
+    "new robot": ("new_robot", ("arm.xml", "--output", "mine.py"), ("arm.xml",)),
+    "new robot urdf": ("new_robot", ("arm.urdf", "--output", "mine.py"), ("arm.urdf",)),
+    "page": ("replay", (RUN, "--viewer", "none"), tuple(f"{RUN}/{name}" for name in (
+        "model.mjb", "best_trajectory.pt", "result.json"))),
 }  # fmt: skip
 
 

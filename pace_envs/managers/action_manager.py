@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from pace_envs.indexing import checked_values
 from pace_envs.managers.manager_base import term_items
 
 if TYPE_CHECKING:
@@ -80,18 +81,15 @@ class ActionManager:
         return self._terms[name]
 
     def process_action(self, action: torch.Tensor) -> None:
-        """Take an action, (num_envs, total_action_dim).
+        """Take an action, (num_envs, total_action_dim), where either may be 1 (:func:`checked_values`).
 
         Raises:
-            ValueError: If its shape is wrong.
+            ValueError: If it is no tensor, or its shape is wrong.
         """
-        if action.shape != self.action.shape:
-            raise ValueError(
-                f"The action has shape {tuple(action.shape)}, expected {tuple(self.action.shape)} "
-                "(num_envs, total_action_dim)."
-            )
+        shape = (self.action.shape[0], self.action.shape[1])
+        checked = torch.as_tensor(checked_values(action, shape, "the action"))
         self.prev_action.copy_(self.action)
-        self.action.copy_(action)
+        self.action.copy_(checked)
         start = 0
         for term, size in zip(self._terms.values(), self._sizes, strict=True):
             term.process_actions(self.action[:, start : start + size])

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from pace_actuators.files import read_json, refuse
+from pace_envs.task_source import file_digest
 from pace_optim.run.history import History
 from pace_optim.run.result import FitResult
 from pace_optim.run.tensors import read_bounds, read_trajectory
@@ -48,6 +49,8 @@ class RunData:
     bounds: dict[str, tuple[float, float]]
     """Lower and upper bound by label ``<parameter>/<joint>``, physical."""
     settings: dict[str, Any]
+    model_digest: str | None
+    """SHA-256 of ``model.mjb`` as the fit wrote it; ``None`` in runs of earlier versions."""
     new: Mapping[str, Any]
     """Content of JSON files that are about to be written, by name."""
 
@@ -78,6 +81,7 @@ class RunData:
             recordings=tuple(_recording(content) for content in trajectory.get("recordings", [])),
             bounds=read_bounds(folder),
             settings=settings.get("settings", {}),
+            model_digest=settings.get("model"),
             new=new or {},
         )
 
@@ -90,10 +94,17 @@ class RunData:
         path = self.folder / "model.mjb"
         if not path.is_file():
             return None
+        if self.model_digest not in (None, file_digest(path)):  # MuJoCo's reader checks less than it would have to
+            refuse(path, "is not the model that the fit wrote", "Remove it, or fit again.")
+        said: list[str] = []
+        mujoco.set_mju_user_warning(said.append)  # it would go to a file in the present folder
         try:
             return mujoco.MjModel.from_binary_path(str(path))
         except ValueError as error:
-            raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({error}). Remove it.") from error
+            why = said[0] if said else str(error)
+            raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({why}). Remove it.") from error
+        finally:
+            mujoco.set_mju_user_warning(None)
 
     def model(self) -> mujoco.MjModel:
         """The compiled model that the run was made with.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import file_at
 from pace_optim.recording.keys import FACTS, JOINT_SERIES, did_you_mean, listed
 from pace_optim.terminal.atomic import write_atomically
 
@@ -57,6 +58,9 @@ class ColumnMap:
     """Facts of the recording: stiffness, added_mass, ..."""
 
 
+_CURE = "Give --columns a column map, as pace import writes it."
+
+
 def read_map(path: Path) -> ColumnMap:
     """Read a column map.
 
@@ -64,10 +68,8 @@ def read_map(path: Path) -> ColumnMap:
         ValueError: If it is no such map; the message names the key.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file. Give --columns a column map, as pace import writes it.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = tomllib.loads(file_at(path, _CURE).read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: is not TOML ({error}). Correct it.") from None
     _check_keys(path, "the map", content, ("time", "joints", "facts"))
     joints = _table(path, "joints", content.get("joints", {}))

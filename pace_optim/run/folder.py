@@ -13,6 +13,7 @@ import torch
 
 from pace_actuators.files import checked, json_text, refuse, write_atomically, write_json, write_tensors, writing
 from pace_actuators.files.writing import Writer
+from pace_envs.task_source import file_digest
 from pace_optim.run.history import History
 from pace_optim.run.resolved import resolved, write_model
 from pace_optim.terminal.arrays import read_arrays
@@ -95,9 +96,15 @@ class RunFolder:
             inputs: SHA-256 of each other file that was read; ``None`` where there was none.
             environment: Where the environment comes from.
         """
-        content = {"settings": settings, "environment": environment, "digests": digests, "inputs": inputs}
-        write_json(self.path / "settings.json", {**content, "resolved": resolved(problem)})
         write_model(problem, self.path / "model.mjb")
+        content: dict[str, Any] = {
+            "settings": settings,
+            "environment": environment,
+            "digests": digests,
+            "inputs": inputs,
+        }
+        content |= {"model": file_digest(self.path / "model.mjb"), "resolved": resolved(problem)}
+        write_json(self.path / "settings.json", content)
         write_tensors(
             self.path / "config.pt",
             {
