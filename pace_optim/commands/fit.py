@@ -1,5 +1,6 @@
 """Identify a robot's drives from recordings."""
 
+import os
 import sys
 
 import torch
@@ -14,6 +15,8 @@ from pace_optim.terminal.options import add_common_options, add_device_option, a
 
 _WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless", "--device")
 """Options that a resumed run takes; it has the others from its start."""
+_LARGE = 50e6
+"""Files that take a while to read [bytes]."""
 
 
 def main() -> None:
@@ -42,6 +45,12 @@ def main() -> None:
     parser.add_argument("--epsilon", type=float, help="stop at this relative spread of a generation's scores")
     parser.add_argument("--sigma", type=float, help="initial standard deviation of the search, normalised")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--max_duration",
+        type=float,
+        metavar="S",
+        help="fit at most so much of each recording, where it moves the joints most (default: what can be)",
+    )
     parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
     parser.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
     parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
@@ -58,6 +67,8 @@ def main() -> None:
     args = take_common_options(vars(parser.parse_args()))
     del args["headless"]
 
+    if large := [path for path in (*args["data"], *args["validation"]) if _is_large(path)]:
+        print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     asked = args.pop("device")
     processes, device = join(asked or "cpu")
@@ -76,3 +87,7 @@ def main() -> None:
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
     print(f"run: {folder}")
+
+
+def _is_large(path: str) -> bool:
+    return os.path.isfile(path) and os.path.getsize(path) > _LARGE

@@ -19,10 +19,11 @@ from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.recordings import read_all
+from pace_optim.problem.recordings import read_all, tell_on_stderr
 from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
+from pace_optim.recording.parts import affordable
 
 DELAY_MODES = ("command", "effort")
 
@@ -118,6 +119,7 @@ def load_problem(
     env_cfg: Any = None,
     columns: str | Path | None = None,
     strict: bool = False,
+    max_duration: float | None = None,
 ) -> Problem:
     """Read and check everything that a fit needs.
 
@@ -132,6 +134,8 @@ def load_problem(
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
+        max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
+            as a fit can afford.
 
     Raises:
         ValueError: If anything does not fit.
@@ -159,6 +163,10 @@ def load_problem(
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
     recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
+    space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
+    recordings, held_out = affordable(
+        [recordings, held_out], control_dt, _columns(space, trees), max_duration, tell_on_stderr
+    )
     refuse_open_loops(env, [*recordings, *held_out])
     recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     problem = Problem(
@@ -166,13 +174,19 @@ def load_problem(
         plain_cfg=plain,
         env_cfg=cfg,
         dataset=make_dataset(recordings, held_out),
-        space=ParameterSpace.of(cfg.sim2real),
-        trees=independent_trees(env),
+        space=space,
+        trees=trees,
         delay_mode=next(iter(drives)).delay_mode,
         control_dt=control_dt,
     )
     env.close()
     return problem
+
+
+def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:
+    """Parameters whose derivatives take a simulation each: those of one tree are perturbed beside those of others."""
+    owners = space.owners(trees)
+    return max((owners.count(i) for i in range(len(trees))), default=0) + owners.count(None)
 
 
 def _configured(

@@ -93,6 +93,8 @@ class Recording:
     """What a user should know about this recording, in plain sentences."""
     source: str = ""
     """Path of the file."""
+    part_of: str = ""
+    """Name of the recording that this is a part of; empty: it is whole."""
 
     @property
     def num_samples(self) -> int:

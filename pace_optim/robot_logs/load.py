@@ -162,6 +162,8 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
         near = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
         raise ValueError(f"{path}: no such file. There are in {folder}: {listed(near)}. Correct the path.")
     suffix = path.suffix.lower()
+    if not (path.is_dir() or path.is_file()):
+        raise ValueError(f"{path}: is neither a file nor a folder. Correct the path.")
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             yield read_rosbag(path)

@@ -135,6 +135,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
         env_cfg=env_cfg,
         columns=settings.columns,
         strict=settings.strict,
+        max_duration=settings.max_duration,
     )
 
 

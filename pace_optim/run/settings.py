@@ -73,6 +73,9 @@ class FitSettings:
     strict: bool = False
     """Whether one recording that cannot be used refuses all, instead of being set aside."""
 
+    max_duration: float | None = None
+    """How much of each recording is fitted at most, where it moves the joints most [s]; ``None``: as much as can be."""
+
     device: str = "cpu"
     """Where the search simulates: ``cpu``, or a GPU as ``cuda:0``; the rest runs on the processor, in float64."""
 
@@ -91,7 +94,7 @@ class FitSettings:
             value = getattr(self, name)
             if value is not None and value < lowest:
                 raise ValueError(f"{name} is {value}, expected at least {lowest}.")
-        for name in ("epsilon", "sigma", "physics_dt"):
+        for name in ("epsilon", "sigma", "physics_dt", "max_duration"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")

@@ -62,7 +62,7 @@ def check_consistency(
     """
     trained = problem.dataset.trained()
     problem = replace(problem, dataset=problem.dataset.select(trained))
-    if len(trained) < 2:
+    if len(trained) < 2 or any(recording.part_of for recording in problem.dataset.recordings):
         return Consistency()
     fits = []
     for r in range(len(trained)):
