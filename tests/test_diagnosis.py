@@ -177,7 +177,7 @@ def test_a_search_flushes_denormal_numbers_and_puts_the_processors_setting_back(
         raise KeyboardInterrupt
 
     module = sys.modules["pace_optim.diagnosis.diagnose"]  # the package has a function of this name
-    monkeypatch.setattr(module, "check_long_enough", lambda *_: None)
+    monkeypatch.setattr(module, "check_long_enough", lambda *_, **__: None)
     monkeypatch.setattr(module, "fit_base", first_step)
     problem = SimpleNamespace(dataset=SimpleNamespace(validation=None), control_dt=DT)
     try:
