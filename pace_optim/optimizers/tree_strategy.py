@@ -83,8 +83,8 @@ class TreeStrategy:
 
     def ask(self) -> np.ndarray:
         """Candidates of the next generation, normalised, (population_size, len(entries))."""
-        self._asked = self._strategy.ask()
-        return into_unit_box(np.asarray(self._asked))
+        self._asked = self._strategy.ask_geno()
+        return into_unit_box(self._asked)
 
     def tell(self, scores: np.ndarray, shown: np.ndarray) -> None:
         """Take the scores of the generation that was asked for last.
@@ -93,7 +93,9 @@ class TreeStrategy:
             scores: [rad²], (population_size,).
             shown: What was simulated, where it differs from what :meth:`ask` gave, (population_size, len(entries)).
         """
-        self._strategy.tell(self._asked, scores)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of its clock, which its own ask would have started
+            self._strategy.tell(list(self._asked), scores, check_points=False)  # they are its own: none is clipped
         i = int(scores.argmin())
         if scores[i] < self.best_score:
             self.best_score, self.best_x = float(scores[i]), shown[i].copy()
