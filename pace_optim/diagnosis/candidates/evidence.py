@@ -37,7 +37,7 @@ def log_evidence(
         e = Σ_i b_i S_i + ε,   b_i ~ N(0, ρ²),   ε ~ N(0, s²) for each of N independent samples.
 
     A model that lacks the main effect needs a large b for it, which makes ρ large for all. With λ = s² / (N ρ²), w the
-    eigenvalues of <S_i S_j>, c = <S e> along them, and p numbers of the effect,
+    eigenvalues of <S_i S_j>, c = <S e> along them, and p parameters of the effect,
 
         q = <e²> - Σ c² / (w + λ),   log evidence = max_λ -½ (N log q + Σ log(1 + w / λ) + p log N)
 

@@ -78,7 +78,7 @@ def _screened(
 def absorbed_effects(
     fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
 ) -> dict[type[Effect], torch.Tensor]:
-    """Effects that a base parameter takes up, and on which joints (n,): these recordings would not show them there.
+    """Effects that a base parameter absorbs, and on which joints (n,): these recordings would not show them there.
 
     Args:
         fits: Fits models.
@@ -99,7 +99,7 @@ def absorbed_effects(
     probes, changes, _ = simulated_probes(fits, problem, now, suspects, effort, beside)
     jacobian = free_columns(now, fits.cfg.fitting.at_bound)
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
-        at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it takes up nothing
+        at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it absorbs nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
     result = {effect: now.model.free[:, BASE.index(effect.absorbed_by)].clone() for effect in suspects}
     for (effect, _), change in zip(probes, changes[len(takers) :], strict=True):

@@ -28,7 +28,7 @@ def advise(
             "another proportional gain (stiffness in the recording)."
         )
     result += [
-        f"{effect.name} would not show in these recordings: the {effect.absorbed_by} takes it up. What would tell "
+        f"{effect.name} would not show in these recordings: the {effect.absorbed_by} absorbs it. What would tell "
         f"them apart: {effect.separates}."
         for effect in absorbed
     ]
