@@ -11,7 +11,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
+from pace_optim.diagnosis.model.labels import found_effects
 from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_model import reference_path, twin_problem
@@ -55,7 +55,7 @@ class ReferenceUpdate:
 
     def away(self, twins: TwinProblem, now: Fitted) -> float:
         """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""
-        problem = twins.coarse().with_effects(labels(now.model, twins.joint_names))
+        problem = twins.coarse().with_effects(found_effects(now.model, twins.joint_names))
         rollout, sampled = problem.evaluator().rollout(1), problem.dataset.sampled
         rollout.start(self._values(problem, now)[None], sampled)
         square = torch.zeros(())
@@ -71,7 +71,7 @@ class ReferenceUpdate:
 
     def path(self, now: Fitted) -> ReferencePath:
         """The motion of the whole robot with a model."""
-        problem = self.problem.with_effects(labels(now.model, self.problem.joint_names))
+        problem = self.problem.with_effects(found_effects(now.model, self.problem.joint_names))
         changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
         return reference_path(problem, self._values(problem, now), changing)
 

@@ -1,4 +1,4 @@
-"""The effects of a model in the words of the command line."""
+"""The effects of a model as configurations, and in the words of the command line."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.model.model import JointModel
 
 
-def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
-    """The effects found as ``fit.py --effects`` takes them.
+def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[EffectCfg]:
+    """The effects that joints have.
 
     Args:
         model: The model that has them.
@@ -25,9 +25,14 @@ def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[E
         everywhere = len(own) == len(joint_names)
         cfg = EffectCfg(
             effect=effect.name,
-            joint_names_expr=".*" if effect.shared or everywhere else own,
+            joint_names_expr=".*" if effect.shared or everywhere else "|".join(own),
             shared=effect.shared or effect in model.shared,
             wide=bool(model.is_wide(effect).any()),
         )
-        result.append(cfg.label)
+        result.append(cfg)
     return result
+
+
+def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
+    """The same as ``fit.py --effects`` takes them."""
+    return [cfg.label for cfg in found_effects(model, joint_names, order)]

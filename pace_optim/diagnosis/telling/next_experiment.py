@@ -11,7 +11,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
+from pace_optim.diagnosis.model.labels import found_effects
 from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.excitation import make_excitation
@@ -168,7 +168,7 @@ def distances(problem: Problem, pair: Rivals, recordings: Sequence[Recording]) -
     data = make_dataset(recordings, train_fraction=1)
     errors = []
     for fitted in pair.models:
-        own = replace(problem.with_effects(labels(fitted.model, problem.joint_names)), dataset=data)
+        own = replace(problem.with_effects(found_effects(fitted.model, problem.joint_names)), dataset=data)
         values = own.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
         errors.append(own.evaluator().residuals(values[None], data.sampled).error[0][..., pair.joints])
     return (errors[0] - errors[1]).square().mean(dim=(0, 2)).sqrt()
