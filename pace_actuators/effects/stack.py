@@ -275,10 +275,16 @@ class EffectStack:
             s.armature = s.base_armature
             self.run("armature")
         self.run("friction")
+        self._only_brakes()
         self.run("transmission")
+        self._only_brakes()
+        return s.effort.clone()
+
+    def _only_brakes(self) -> None:
+        """Friction drives nothing, neither the joint nor a motor that a transmission parts from it."""
+        s = self.state
         torch.clamp(s.friction, min=0.0, out=s.friction)
         torch.clamp(s.viscous_friction, min=0.0, out=s.viscous_friction)
-        return s.effort.clone()
 
     def observation_lag(self, time: torch.Tensor) -> torch.Tensor | None:
         """How late the samples of a recording are [s], (num_envs, num_joints); ``None`` if no effect says so.

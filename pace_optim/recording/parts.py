@@ -18,8 +18,8 @@ from pace_actuators.memory import check_memory
 from .data import Recording
 from .keys import MEASURED_SERIES
 
-_NUMBERS = 40_000_000
-"""Derivatives that a fit keeps unless it is told otherwise: 0.3 GB."""
+_NUMBERS = 20_000_000
+"""Derivatives that a fit keeps unless it is told otherwise: 0.16 GB."""
 _COPIES = 4
 """Arrays of that size that there are at once."""
 _LENGTH = 5.0
