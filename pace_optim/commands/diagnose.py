@@ -38,7 +38,12 @@ def main() -> None:
     options = take_common_options(vars(parser.parse_args()))
 
     torch.set_num_threads(1)  # many small tensors
-    diagnosis = diagnose(DiagnosisSettings(**options), on_verdict=_tell)
+    run_and_tell(DiagnosisSettings(**options))
+
+
+def run_and_tell(settings: DiagnosisSettings) -> None:
+    """Diagnose; print the verdict before the robot is fitted again, and the folder of the last run at the end."""
+    diagnosis = diagnose(settings, on_verdict=_tell)
     for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
         print(f"report: {Path(run) / 'report.html'}")
     print(f"run: {diagnosis.runs[-1]}")

@@ -5,6 +5,8 @@ import sys
 
 import torch
 
+from pace_optim.commands.diagnose import run_and_tell
+from pace_optim.diagnosis import DiagnosisSettings
 from pace_optim.fit import fit, help_fit, resume
 from pace_optim.problem.problem import DELAY_MODES
 from pace_optim.problem.processes import join
@@ -13,7 +15,7 @@ from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
 
-_WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--headless", "--device")
+_WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--diagnose", "--headless", "--device")
 """Options that a resumed run takes; it has the others from its start."""
 _LARGE = 50e6
 """Files that take a while to read [bytes]."""
@@ -63,9 +65,13 @@ def main() -> None:
     )
     parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
     parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
+    parser.add_argument(
+        "--diagnose", action="store_true", help="then find out what the model lacks, as pace diagnose does with the run"
+    )
     parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
     args = take_common_options(vars(parser.parse_args()))
     del args["headless"]
+    then_diagnose = args.pop("diagnose")
 
     if large := [path for path in (*args["data"], *args["validation"]) if _is_large(path)]:
         print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while
@@ -86,7 +92,11 @@ def main() -> None:
         result, folder = fit(FitSettings(**args, device=device), processes=processes)
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
-    print(f"run: {folder}")
+    if then_diagnose and "interrupted" not in result.stop_reasons:
+        print(flush=True)
+        run_and_tell(DiagnosisSettings(run=folder))
+    else:
+        print(f"run: {folder}")
 
 
 def _is_large(path: str) -> bool:

@@ -147,6 +147,7 @@ def least_squares(
 
     Each iteration simulates, in one batch, every start's trial steps at several dampings, and beside the favoured
     trial the perturbed vectors for its Jacobian: where the favoured trial wins, the next Jacobian is already there.
+    A step that is expected to gain less than the tolerance is the last one, and is tried without them.
 
     Args:
         evaluator: Simulates.
@@ -170,6 +171,8 @@ def least_squares(
         for descent in running:
             trials = descent.trials()
             neighbours, step = perturbed(trials[0], colouring)
+            if descent.expected_gain(trials[0]) < cfg.score_tolerance * descent.score:  # its last step: no derivatives
+                neighbours = neighbours[:0]
             batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
             steps.append(step)
         every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)), where)
@@ -203,7 +206,7 @@ def _advance(
 
     Args:
         descent: Changed in place.
-        batch: Normalised vectors: the favoured trial, its neighbours, the other trials.
+        batch: Normalised vectors: the favoured trial, its neighbours (none before its last step), the other trials.
         residuals: Theirs.
         step: The neighbours' signed steps.
         colouring: Which entries were perturbed together.
@@ -216,7 +219,7 @@ def _advance(
             descent.score = float(scores[0])
         descent.jacobian = jacobian(residuals, step, colouring)
     else:
-        rows = [0, *range(1 + len(colouring.colours), len(batch))]
+        rows = [0, *range(len(batch) - len(_DAMPING_TRIALS) + 1, len(batch))]
         best = int(scores[rows].argmin())
         gain = descent.score - float(scores[rows[best]])
         expected = descent.expected_gain(batch[0])
@@ -226,7 +229,8 @@ def _advance(
             descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
             descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[best] / 10.0)
             # the favoured trial's neighbours were simulated beside it
-            descent.jacobian = jacobian(residuals, step, colouring) if best == 0 else None
+            looked = len(batch) > len(_DAMPING_TRIALS)
+            descent.jacobian = jacobian(residuals, step, colouring) if looked and best == 0 else None
             if moved < cfg.step_tolerance:
                 descent.stop_reason = "converged"
         else:
