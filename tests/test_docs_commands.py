@@ -17,7 +17,7 @@ FENCE = re.compile(r"^```(?:bash|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 IN_TEXT = re.compile(r"`((?:pace|(?:python )?scripts/)[^`]*)`")
 A_RUN = re.compile(r"\$\(ls[^)]*\)|logs/pace/\w+/(?:<\w+>|\d\d_\d\d_\d\d_\S+|\*)|\bRUN\b")
 """What stands for the folder of an identification's run."""
-SHORT = {"diagnose": "--only --effects quadratic_friction --max_effects 1 --physics_dt 0.0025 --no_refit"}
+SHORT = {"diagnose": "--only --effects quadratic_friction --max_effects 1 --physics_dt 0.00125 --no_refit"}
 """What makes a command short that would try everything."""
 ELSEWHERE = ("train", "play")
 """Commands of a walking robot; with ``--replay`` they are of a run."""
@@ -35,19 +35,24 @@ def taken_apart(line: str) -> tuple[str, list[str]]:
     """Script and words of a command line."""
     words = shlex.split(A_RUN.sub("RUN", line))
     words = words[1:] if words[0] in ("python", "pace") else words
+    if "--task" in words:  # the run knows its own
+        del words[words.index("--task") : words.index("--task") + 2]
+    words = ["DATA" if word.endswith((".csv", ".npz")) else word.replace("RUN/result.json", "RUN") for word in words]
     return Path(words[0]).stem.replace("-", "_"), words[1:]
 
 
 def documented() -> list[str]:
     """The commands of all pages that are of an identification's run, each once."""
     found = dict.fromkeys(line for page in PAGES for line in commands_of(page.read_text(encoding="utf-8")))
-    return [line for line in found if taken_apart(line)[0] not in ELSEWHERE or "--replay" in line]
+    lines = [line for line in found if taken_apart(line)[0] not in ELSEWHERE or "--replay" in line]
+    return list({str(taken_apart(line)): line for line in lines}.values())
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A fit of another's robot, straight from its model file, in a folder that is left."""
     folder = write_robot(tmp_path_factory.mktemp("project"))
+    (folder / "data" / "swing.json").write_text('{"stiffness": 8.0, "damping": 0.3}')
     words = ("--task", "swing.xml", "--data", "data/swing.csv", "--optimizer", "least_squares", "--no_consistency")
     done = run_script("fit", *words, cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -66,10 +71,8 @@ def test_commands_are_found():
 @pytest.mark.parametrize("line", documented())
 def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_path):
     script, words = taken_apart(line)
-    if "--task" in words:  # the run knows its own
-        del words[words.index("--task") : words.index("--task") + 2]
-    data = run.parents[3] / "data" / "swing.csv"
-    words = [str(data) if word.endswith((".csv", ".npz")) else word.replace("RUN", str(run)) for word in words]
+    places = {"RUN": str(run), "DATA": str(run.parents[3] / "data" / "swing.csv")}
+    words = [places.get(word, word) for word in words]
     done = run_script(script, *words, *SHORT.get(script, "").split(), cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     if "--output" in words:

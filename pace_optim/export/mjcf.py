@@ -35,7 +35,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     cfg = load_identified_cfg(drives)
     source = Path(cfg.scene.robot.mjcf_path)
     cfg.scene.num_envs = 1
-    cfg.sim.dt, cfg.decimation = drives.at.control_dt, 1
+    cfg.sim.dt, cfg.decimation = drives.at.physics_dt, round(drives.at.control_dt / drives.at.physics_dt)
     plain = ManagerBasedRLEnv(cfg)
     use_identified(cfg, drives.path)
     env = ManagerBasedRLEnv(cfg)
