@@ -48,10 +48,11 @@ class ProgressLine:
         self._latest = (elapsed, steps)
         seconds, own_steps = elapsed - self._phase_began[0], steps - self._phase_began[1]
         left = seconds / max(1, done) * (total - done)
+        at_most = f"{left:.0f} s" if left < 600 else f"{left / 60:.0f} min"
         text = (
             f"{phase} [{'#' * filled}{'.' * (20 - filled)}] {done}/{total}  best {best:.3e} rad²"
             + ("" if spread is None else f"  spread {spread:.2g}")
-            + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {left:.0f} s left"
+            + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {at_most} left"
         )
         if self._live:
             self.say(text)
