@@ -29,6 +29,7 @@ class Bench:
     load_mass: float = 1.0
     load_length: float = 0.2
     noise: float = 1e-4
+    drive_dt: float = CONTROL_DT
     stated: dict[str, float] = field(default_factory=dict)
 
 
@@ -54,6 +55,8 @@ def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, 
         reading = q - bench.bias + bench.noise * rng.normal()
         seen[k], speed = reading, v
         for part in range(per_step):
+            if part and part % round(bench.drive_dt / STEP) == 0:
+                reading, speed = q - bench.bias, v
             at = max(0, k * per_step + part - late) // per_step
             arrived = {name: float(values[at]) for name, values in commands.items()}
             asked = kp * (arrived.get("des_dof_pos", 0.0) - reading) + bench.kd * (

@@ -55,6 +55,9 @@ def main() -> None:
     )
     parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
     parser.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
+    parser.add_argument(
+        "--drive_dt", type=float, metavar="S", help="time between two runs of the drives' own controllers (PD loops)"
+    )
     parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
     parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")
     parser.add_argument(

@@ -115,6 +115,7 @@ def load_problem(
     validation: Sequence[str | Path] = (),
     delay_mode: str | None = None,
     physics_dt: float | None = None,
+    drive_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
     env_cfg: Any = None,
     columns: str | Path | None = None,
@@ -129,6 +130,7 @@ def load_problem(
         validation: Recordings that are never trained on; none keeps the last 30 % of each recording for that.
         delay_mode: ``"command"`` or ``"effort"``; ``None`` keeps the configuration's.
         physics_dt: A finer physics step under the same control rate [s].
+        drive_dt: Time between two runs of the drives' own controllers [s]; ``None`` keeps the configuration's.
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
@@ -150,6 +152,8 @@ def load_problem(
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
+        if drive_dt is not None:
+            drive.drive_dt, drive.implicit = drive_dt, False
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.max_delay < longest:
             raise ValueError(

@@ -131,6 +131,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
         validation=settings.validation,
         delay_mode=settings.delay_mode,
         physics_dt=settings.physics_dt,
+        drive_dt=settings.drive_dt,
         effects=settings.effects,
         env_cfg=env_cfg,
         columns=settings.columns,
