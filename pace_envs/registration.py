@@ -145,10 +145,15 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
     return PaceVectorEnv(make_env(num_envs=num_envs, **kwargs))
 
 
-def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
+def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float, name: str = "physics_dt") -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
     The finer steps are Runge-Kutta's.
+
+    Args:
+        cfg: The environment; it is changed.
+        physics_dt: The finer step [s].
+        name: What asks for it, for the message.
 
     Raises:
         ValueError: If the present time step is no multiple of the finer one.
@@ -156,7 +161,7 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float) -> None:
     ratio = round(cfg.sim.dt / physics_dt) if physics_dt > 0 else 0
     if ratio < 1 or abs(ratio * physics_dt - cfg.sim.dt) > 1e-9:
         raise ValueError(
-            f"physics_dt is {physics_dt:g} s, expected a whole fraction of the time step {cfg.sim.dt:g} s, "
+            f"{name} is {physics_dt:g} s, expected a whole fraction of the time step {cfg.sim.dt:g} s, "
             f"such as {cfg.sim.dt / 5:g}."
         )
     if ratio == 1:

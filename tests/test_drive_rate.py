@@ -26,6 +26,11 @@ def test_a_fast_loop_is_simulated_at_its_own_rate(tmp_path):
     assert rmse[bench.drive_dt] < 0.2 * rmse[None]
 
 
+def test_a_rate_that_does_not_divide_the_time_step_is_refused_by_its_name():
+    with pytest.raises(ValueError, match="drive_dt is 0.0007 s, expected a whole fraction"):
+        load_problem(BENCH, env_cfg=env_cfg(), drive_dt=0.0007)
+
+
 def test_a_rate_that_is_no_time_is_refused():
     with pytest.raises(ValueError, match="drive_dt is 0"):
         FitSettings(task=BENCH, drive_dt=0.0)

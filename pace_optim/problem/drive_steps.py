@@ -56,7 +56,7 @@ def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
     """
     own = [drive.drive_dt for drive in cfg.scene.robot.actuators.values() if drive.drive_dt is not None]
     if own and min(own) < cfg.sim.dt * (1 - 1e-9):
-        set_physics_dt(cfg, min(own))
+        set_physics_dt(cfg, min(own), "drive_dt")
     if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
         cfg.scene.num_envs = 1
         env = ManagerBasedRLEnv(cfg)
