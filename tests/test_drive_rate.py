@@ -27,7 +27,7 @@ def test_a_fast_loop_is_simulated_at_its_own_rate(tmp_path):
 
 
 def test_a_rate_that_does_not_divide_the_time_step_is_refused_by_its_name():
-    with pytest.raises(ValueError, match="drive_dt is 0.0007 s, expected a whole fraction"):
+    with pytest.raises(ValueError, match=r"drive_dt is 0\.0007 s, expected a whole fraction"):
         load_problem(BENCH, env_cfg=env_cfg(), drive_dt=0.0007)
 
 
