@@ -18,7 +18,7 @@ from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.other_starts import other_valleys, scattered
-from pace_optim.optimizers.refine import refine
+from pace_optim.optimizers.refine import BEGINNING, refine
 from pace_optim.optimizers.search import RefiningPays, agree_to_stop, search
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
@@ -51,7 +51,7 @@ _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
 
 _SCATTERED = 2
-"""Of the other starts that are tried where the only one ended far above the noise, those anywhere in the bounds."""
+"""Of the other starts that are tried where the first one ended far above the noise, those anywhere in the bounds."""
 
 _NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
@@ -154,7 +154,7 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     settings, history, line_generation = start
     settings = replace(settings, device=device)
     problem = _load(settings, load_env_cfg(settings.task) if path is None else Run.open(Path(path), task).load_cfg())
-    searcher = problem.for_search(device).training_evaluator()
+    searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes)
     optimizer.restore(history, line_generation)
     search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
@@ -174,6 +174,13 @@ def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes
         start=problem.space.start,
         processes=processes,
     )
+
+
+def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
+    """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
+    if settings.optimizer == "hybrid":
+        problem = problem.on_beginnings(BEGINNING)
+    return problem.training_evaluator()
 
 
 def _load(settings: FitSettings, env_cfg: Any) -> Problem:
@@ -234,8 +241,7 @@ class _Fit:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
-        coarse = problem.for_search(settings.device)
-        self.searcher = self.evaluator if coarse is problem else coarse.training_evaluator()
+        self.searcher = make_searcher(problem.for_search(settings.device), settings)
         self.assessor: Evaluator = problem.evaluator()
         self.processes = processes or Processes()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
@@ -245,8 +251,8 @@ class _Fit:
         self.descents: list[Descent] = []
         self._steps_before = 0
         self._search_stop: list[str] = []
-        self._searched = 0
-        """Other starts that were tried and ended no lower."""
+        self._searched = False
+        """Whether other starts were tried and none ended lower."""
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
@@ -282,26 +288,24 @@ class _Fit:
         self.descents = Descent.restore(checkpoint)
 
     def _optimize(self) -> Outcome:
-        if self.optimizer is None or self.descents:
-            self.processes.agree(None)  # there is nothing to share: the others may go
+        """Least squares from the prior; where that ends far above the noise, from elsewhere: the hybrid searches."""
+        if self.optimizer is not None and self.settings.optimizer == "cmaes":
+            self._search(self.optimizer)
+            return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
+        if self.settings.start is not None:
+            self.processes.agree(None)  # there is nothing to share: the others may go; so below
+            return self._refine_from(as_vector(self.problem, self.settings.start))
         if not self.descents:
-            if self.settings.start is not None and self.optimizer is None:
-                return self._refine_from(as_vector(self.problem, self.settings.start))
-            starts = [self.problem.space.start]
-            if self.optimizer is not None:
-                starts = self._search(self.optimizer) + starts
-                self._search_stop = self.optimizer.stop_reasons
-                if self.settings.optimizer == "cmaes":
-                    return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
-            self.descents = [Descent(x=start) for start in starts]
+            self.descents = [Descent(x=self.problem.space.start)]
             self._write_checkpoint()
         found, *others = self.descents
-        if self.settings.optimizer == "least_squares" and others:  # resumed while it tried other starts
-            self._try_other_starts(found, others)
+        if others:  # resumed
+            self.processes.agree(None)
         else:
-            self.descents = refine(self.evaluator, self.colouring, self.descents, self._after_iteration)
-            if self.settings.optimizer == "least_squares" and len(self.descents) == 1:
-                self._try_other_starts(self.descents[0])
+            self.descents = [found] = refine(self.evaluator, self.colouring, [found], self._after_iteration)
+            others = self._elsewhere(found)
+        if others:
+            self._try_others(found, others)
         return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
 
     def _refine_from(self, x: torch.Tensor) -> Outcome:
@@ -309,26 +313,31 @@ class _Fit:
         self.descents = least_squares(self.evaluator, self.colouring, [x], _NEAR, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
 
-    def _try_other_starts(self, found: Descent, begun: Sequence[Descent] = ()) -> None:
-        """Where the only start ended far above the noise, refine a few others: it may be a wrong valley.
-
-        Args:
-            found: Where it ended.
-            begun: The others, as far as an interrupted run had come.
-        """
+    def _elsewhere(self, found: Descent) -> list[Descent]:
+        """Other starts, where a descent ended far above the noise: it may be in a wrong valley."""
         rmse = (found.score / len(self.problem.joint_names)) ** 0.5
         times = times_noise(self.problem, rmse)
         if times is None or times < FAR_ABOVE_NOISE:
-            return
+            self.processes.agree(None)
+            return []
+        self.progress.say(f"{times:.3g} times the noise: looking for other starts")
         space = self.problem.space
-        vectors = [*other_valleys(space, found.x), *scattered(space, _SCATTERED, self.settings.seed)]
-        starts = list(begun) or [Descent(x=x) for x in vectors]
-        self.progress.say(f"{times:.3g} times the noise: trying {len(vectors)} other starts")
-        others = refine(
-            self.evaluator, self.colouring, starts, lambda descents: self._after_iteration([found, *descents])
+        if self.optimizer is None:
+            self.processes.agree(None)
+            vectors = [*other_valleys(space, found.x), *scattered(space, _SCATTERED, self.settings.seed)]
+        else:
+            vectors = [self._search(self.optimizer), *other_valleys(space, self.optimizer.best)]
+        return [Descent(x=x) for x in vectors]
+
+    def _try_others(self, found: Descent, others: Sequence[Descent]) -> None:
+        """Refine other starts, as far as an interrupted run had not done it yet."""
+        self.descents = [found, *others]
+        self._write_checkpoint()
+        ends = refine(
+            self.evaluator, self.colouring, others, lambda descents: self._after_iteration([found, *descents])
         )
-        self.descents = sorted([found, *others], key=lambda d: d.score)
-        self._searched = len(vectors) if self.descents[0] is found else 0
+        self.descents = sorted([found, *ends], key=lambda d: d.score)
+        self._searched = self.descents[0] is found
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
@@ -336,8 +345,8 @@ class _Fit:
     def _write_mean(self, optimizer: CMAESOptimizer) -> None:
         self.folder.write_mean(optimizer.generation, self.problem.space.to_physical(optimizer.mean))
 
-    def _search(self, optimizer: CMAESOptimizer) -> list[torch.Tensor]:
-        """Run CMA-ES; for the hybrid, until refining pays. Returns starts for the refinement, the best first."""
+    def _search(self, optimizer: CMAESOptimizer) -> torch.Tensor:
+        """Run CMA-ES; for the hybrid, until refining pays. Returns the best, which the hybrid has refined a little."""
         probe = RefiningPays(self.searcher, self.colouring) if self.settings.optimizer == "hybrid" else None
 
         def after_generation(_: CMAESOptimizer) -> None:
@@ -353,9 +362,9 @@ class _Fit:
         self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
+        self._search_stop = optimizer.stop_reasons
         self._write_mean(optimizer)
-        best = optimizer.best if probe is None or probe.refined is None else probe.refined
-        return [best, *other_valleys(self.problem.space, optimizer.best)]
+        return optimizer.best if probe is None or probe.refined is None else probe.refined
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history

@@ -7,7 +7,6 @@ from dataclasses import replace
 import torch
 
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.refine import beginning
 from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.processes import join
@@ -22,7 +21,7 @@ def main() -> None:
     processes, _ = join("cpu")
     problem = load_problem("Pace-TestBench-v0")
     evaluator = problem.training_evaluator()
-    where = beginning(evaluator.dataset, 0.1)
+    where = evaluator.dataset.beginning(0.1)
     optimizer = CMAESOptimizer(problem.space, 9, problem.env_cfg.sim2real.cmaes, processes=processes)
 
     def after_generation(_: CMAESOptimizer) -> None:

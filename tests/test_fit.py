@@ -261,6 +261,7 @@ def same_result(resumed, whole):
         ("hybrid", "_after_iteration", 1),
         ("hybrid", "_after_iteration", 2),
         ("hybrid", "_after_iteration", 4),
+        ("hybrid", "_after_iteration", 12),  # while it refines what the search has found
         ("least_squares", "_after_iteration", 1),
         ("least_squares", "_after_iteration", 4),
     ],
@@ -326,7 +327,7 @@ def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp
     def at_once(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_module, "search", at_once)
+    monkeypatch.setattr(fit_module, "refine", at_once)
     result, folder = run(tmp_path, recordings["clean"])
     assert result.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
 

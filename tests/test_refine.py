@@ -6,7 +6,7 @@ from problems import make_problem, normalised
 
 from pace_optim.optimizers.jacobian import colour, jacobian, perturbed
 from pace_optim.optimizers.least_squares import Descent, least_squares
-from pace_optim.optimizers.refine import beginning, refine
+from pace_optim.optimizers.refine import BEGINNING, refine
 from pace_optim.recording.dataset import make_dataset
 
 
@@ -26,7 +26,7 @@ def centre(problem):
 
 def test_the_beginning_is_the_first_quarter_of_the_training_samples(problem):
     dataset = make_dataset(problem.dataset.recordings, train_fraction=0.7)
-    chosen, count = beginning(dataset), int(dataset.train.sum())
+    chosen, count = dataset.beginning(BEGINNING), int(dataset.train.sum())
     assert not bool((chosen & ~dataset.train).any())
     assert int(chosen.sum()) == -(-count // 4)
     assert bool(chosen[: int(chosen.sum())].all())

@@ -10,9 +10,10 @@ import torch
 from pace_optim.optimizers.jacobian import Colouring, jacobian, perturbed
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
-from pace_optim.recording.dataset import Dataset
 
-_COARSE_PART = 0.25
+BEGINNING = 0.25
+"""The part of each recording on which most of the way is gone."""
+
 _COARSE = LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
 _DAMPING_AFTER_COARSE = 1e-5
 _ANOTHER_VALLEY = 0.02
@@ -49,7 +50,8 @@ def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequ
 
     Ends that are far worse than the best, or next to it, are left out.
     """
-    ends = [d.x for d in least_squares(evaluator, colouring, starts, _COARSE, where=beginning(evaluator.dataset))]
+    where = evaluator.dataset.beginning(BEGINNING)
+    ends = [d.x for d in least_squares(evaluator, colouring, starts, _COARSE, where=where)]
     candidates = torch.stack([*ends, *starts])
     neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
     residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))
@@ -66,9 +68,3 @@ def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequ
             around = torch.cat([residuals.error[:1], residuals.error[len(candidates) :]])
             descent.jacobian = jacobian(replace(residuals, error=around), step, colouring)
     return kept[: len(starts)]
-
-
-def beginning(dataset: Dataset, part: float = _COARSE_PART) -> torch.Tensor:
-    """The first part of each recording's training samples, (T, R) bool."""
-    order = dataset.train.cumsum(dim=0)
-    return dataset.train & (order <= (part * dataset.train.sum(dim=0)).ceil())

@@ -107,6 +107,10 @@ class Problem:
         """An evaluator of candidates on the recordings that are trained on."""
         return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space)
 
+    def on_beginnings(self, part: float) -> Problem:
+        """The same, trained on the first part of what each recording trains on."""
+        return replace(self, dataset=replace(self.dataset, train=self.dataset.beginning(part)))
+
 
 def load_problem(
     task: str,

@@ -105,6 +105,11 @@ class Dataset:
         """Indices of the recordings that have samples to train on."""
         return self.train.any(dim=0).nonzero()[:, 0].tolist()
 
+    def beginning(self, part: float) -> torch.Tensor:
+        """The first part of each recording's training samples, (T, R) bool."""
+        order = self.train.cumsum(dim=0)
+        return self.train & (order <= (part * self.train.sum(dim=0)).ceil())
+
     def last_step(self, where: torch.Tensor) -> int:
         """Control steps up to and including the last true entry of a (T, R) mask."""
         steps = where.any(dim=1).nonzero()

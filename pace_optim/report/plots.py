@@ -116,7 +116,7 @@ def _errors(series: Mapping[str, np.ndarray], j: int) -> str:
 
 
 def plot_scores(history: History, *, title: str = "", make_figure: Callable[..., Figure] = Figure) -> Figure:
-    """Draw the score over the iterations, search first and refinement after it; the axis above counts simulated steps.
+    """Draw the score over the iterations of search and refinement; the axis above counts simulated steps.
 
     Args:
         history: What happened.
@@ -125,24 +125,20 @@ def plot_scores(history: History, *, title: str = "", make_figure: Callable[...,
     """
     figure = make_figure(figsize=(9.0, 5.0), layout=_tight_layout())
     axes = figure.add_subplot()
-    searched, refined = len(history.search_best), len(history.refine_best)
-    search = np.arange(1, searched + 1)
-    refine = searched + np.arange(1, refined + 1)
-    mark = "o" if searched + refined < 60 else None
-    if searched:
+    search, refine = history.places()
+    mark = "o" if len(search) + len(refine) < 60 else None
+    if search:
         axes.plot(search, history.search_mean, color=_TARGET, lw=1.2, label="search, mean of the generation")
         axes.plot(search, history.search_best, color=_MEASURED, lw=1.8, marker=mark, ms=3, label="search, best so far")
-    if refined:
+    if refine:
         axes.plot(refine, history.refine_best, color=_SIMULATED, lw=1.8, marker=mark, ms=3, label="refinement, best")
-    if searched and refined:
-        axes.axvline(searched + 0.5, color="0.6", lw=0.8, ls=":")
-    if searched + refined:
+    if search or refine:
         axes.set_yscale("log", nonpositive="mask")
         axes.legend(frameon=False, fontsize=9)
-        _steps_above(axes, [*history.search_steps, *history.refine_steps])
+        _steps_above(axes, sorted([*history.search_steps, *history.refine_steps]))
     else:
         axes.text(0.5, 0.5, "no iteration was recorded", ha="center", va="center", transform=axes.transAxes)
-    axes.set_xlabel("iteration (generations, then iterations of the refinement)" if refined else "generation")
+    axes.set_xlabel("iteration (generations of the search, iterations of the refinement)" if refine else "generation")
     axes.set_ylabel("score [rad²]")
     axes.grid(**_GRID)
     axes.spines["right"].set_visible(False)

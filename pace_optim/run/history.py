@@ -10,7 +10,7 @@ from pace_actuators.files import checked, read_json
 
 @dataclass(kw_only=True)
 class History:
-    """What happened: the search by generations, then the refinement by iterations."""
+    """What happened: generations of the search, iterations of the refinement; either may come first."""
 
     search_best: list[float] = field(default_factory=list)
     """Best score so far after each generation [rad²]."""
@@ -36,6 +36,13 @@ class History:
         """
         cure = "Fit again, or go on with the run: it is written anew."
         return checked(cls, read_json(path, cure), path, cure)
+
+    def places(self) -> tuple[list[int], list[int]]:
+        """Which of all iterations, counted from 1 by simulated steps, those of the search and of the refinement are."""
+        search = [(steps, 0, i) for i, steps in enumerate(self.search_steps)]
+        refine = [(steps, 1, i) for i, steps in enumerate(self.refine_steps)]
+        place = {entry: number for number, entry in enumerate(sorted(search + refine), start=1)}
+        return [place[entry] for entry in search], [place[entry] for entry in refine]
 
     def to_dict(self) -> dict[str, list]:
         """For a JSON file."""

@@ -28,18 +28,18 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
     return rmse / noise if rmse and noise > 0 else None
 
 
-def far_end(times: float | None, rmse: float, optimizer: str, searched: int) -> list[str]:
+def far_end(times: float | None, rmse: float, optimizer: str, searched: bool) -> list[str]:
     """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
 
     Args:
         times: Its error as a multiple of the noise.
         rmse: Its error [rad].
         optimizer: What ended there.
-        searched: How many other starts ended no lower.
+        searched: Whether other starts were tried, and none ended lower.
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
-    others = f" {searched} other starts ended no lower." if searched else ""
+    others = " Other starts ended no lower." if searched else ""
     search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
     return [
         f"The error of {1e3 * rmse:.3g} mrad is {times:.3g} times the measurement noise: physics is missing, a fact of "

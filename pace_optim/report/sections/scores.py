@@ -11,10 +11,9 @@ def scores(run: RunData) -> Section | None:
     history = run.history
     if history is None or not (history.search_best or history.refine_best):
         return None
-    searched, refined = len(history.search_best), len(history.refine_best)
-    search, refine = list(range(1, searched + 1)), list(range(searched + 1, searched + refined + 1))
+    search, refine = history.places()
     axes = {
-        "Iterations": (search, refine, "generations of the search, then iterations of the refinement"),
+        "Iterations": (search, refine, "generations of the search and iterations of the refinement"),
         "Simulated steps": (history.search_steps, history.refine_steps, "simulated steps"),
         "Time": (history.search_time_s, history.refine_time_s, "time [s]"),
     }
@@ -24,7 +23,7 @@ def scores(run: RunData) -> Section | None:
         ("refinement, best", history.refine_best, "var(--simulated)", False),
     ]
     curves = [curve for curve in curves if curve[1]]
-    mode = "lines+markers" if searched + refined < 80 else "lines"
+    mode = "lines+markers" if len(search) + len(refine) < 80 else "lines"
     data = [
         {
             "type": "scatter",
