@@ -21,7 +21,7 @@ DOWNSTREAM = {
 FLOORS = {
     "pace_optim": (
         ["terminal", "recording", "excitation"],
-        ["robot_logs", "plant", "export"],
+        ["robot_logs", "plant", "export", "measured_effort"],
         ["problem"],
         ["optimizers", "single_joint_model"],
         ["uncertainty"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.drive_steps import check_loops, of_joints, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
@@ -45,6 +46,8 @@ class Problem:
     """Control step [s]."""
     device: str = "cpu"
     """Where environments are built."""
+    measured: MeasuredDrives = field(default_factory=MeasuredDrives)
+    """What the recordings' torques say of the drives."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -171,6 +174,11 @@ def load_problem(
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
     recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
+    measured = _read_torques(env, [*recordings, *held_out], control_dt)
+    told = list(measured.recordings)
+    recordings, held_out = told[: len(recordings)], told[len(recordings) :]
+    for each in (plain, cfg):
+        _narrow_delay(each, measured)
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), max_duration, tell_on_stderr
@@ -186,9 +194,32 @@ def load_problem(
         trees=trees,
         delay_mode=next(iter(drives)).delay_mode,
         control_dt=control_dt,
+        measured=measured,
     )
     env.close()
     return problem
+
+
+def _read_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording], control_dt: float) -> MeasuredDrives:
+    """What the recordings' torques say of the drives."""
+    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
+    low, high = sim2real.bounds_params[-1].tolist()
+    return read_drives(
+        recordings,
+        {name: of_joints(env, name) for name in ("stiffness", "damping", "effort_limit")},
+        delay_bounds=(low, high),
+        delay_mode=next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode,
+        control_dt=control_dt,
+        slides=sim2real.slide_joints,
+    )
+
+
+def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:
+    """Seek the delay where the recordings' torques have it."""
+    if measured.delay_bounds is not None:
+        bounds = cfg.sim2real.bounds_params.clone()
+        bounds[-1] = bounds.new_tensor(measured.delay_bounds)
+        cfg.sim2real.bounds_params = bounds
 
 
 def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:

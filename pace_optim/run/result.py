@@ -45,6 +45,8 @@ class FitResult(DriveResult):
     """The training error as a multiple of the measurement noise."""
     std_means_nothing: bool = False
     """Whether the fit ended so far above the noise that its error bars say nothing."""
+    measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What the torque in the recordings says of each drive, by joint and recording."""
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -186,7 +188,9 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
+        measured_drive=problem.measured.to_dict(),
         notes=list(problem.env_cfg.sim2real.notes)
+        + list(problem.measured.notes)
         + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
         drive=drive_in_force(problem),
         **facts,

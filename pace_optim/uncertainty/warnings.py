@@ -40,6 +40,7 @@ def fit_warnings(
     """
     change = _change_at_half_the_step(problem, physical, rmse)
     return [
+        *problem.measured.warnings,
         *_overfit(rmse, change),
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),

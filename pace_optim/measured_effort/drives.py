@@ -1,0 +1,175 @@
+"""From the laws of single joints to the facts of a robot's drives: what is taken, and what contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pace_optim.recording import Recording
+
+from .law import APART, SURE, MeasuredLaw, has_offset, read_law
+from .words import contradiction, delay_sentence, line_of_joint
+
+FOLLOWS = 0.9
+"""A torque of which the law explains less is not that of this law: a current with much else in it, or another unit."""
+_OF_THE_LAW = ("stiffness", "damping")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredDrives:
+    """What the torques of some recordings say of the drives."""
+
+    recordings: tuple[Recording, ...] = ()
+    """The recordings with the facts that were taken from their torques."""
+    laws: Mapping[str, Mapping[str, MeasuredLaw]] = field(default_factory=dict)
+    """By joint and recording."""
+    taken: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """Joints on which a fact (field of ``Drive``) was taken in every recording, by the fact."""
+    delay_bounds: tuple[float, float] | None = None
+    """Between what all torques have the delay of commands [control steps]; ``None`` where they do not say it."""
+    notes: tuple[str, ...] = ()
+    """What was read, a line for each joint."""
+    warnings: tuple[str, ...] = ()
+    """What contradicts what is stated."""
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """The laws for a JSON file, by joint and recording."""
+        drop = ("joint",)
+        return {
+            joint: {name: {k: v for k, v in asdict(law).items() if k not in drop} for name, law in laws.items()}
+            for joint, laws in self.laws.items()
+        }
+
+
+def read_drives(
+    recordings: Sequence[Recording],
+    configured: Mapping[str, np.ndarray],
+    *,
+    delay_bounds: tuple[float, float],
+    delay_mode: str,
+    control_dt: float,
+    unknown: Collection[str] = (),
+    slides: Collection[str] = (),
+) -> MeasuredDrives:
+    """Read the law of every joint in every recording that has its torque, and take what nobody stated.
+
+    Args:
+        recordings: On the control grid.
+        configured: Gains and limits where a recording states none, by field, (n,).
+        delay_bounds: Between what the delay is sought [control steps].
+        delay_mode: What the drives delay.
+        control_dt: Control step [s].
+        unknown: Facts that recordings state and that are not to be believed.
+        slides: Joints that slide.
+    """
+    laws: dict[str, dict[str, MeasuredLaw]] = {}
+    changed: list[Recording] = []
+    warnings: dict[str, str] = {}
+    taken_in: list[dict[str, set[str]]] = []
+    for recording in recordings:
+        own = {j: law for j in range(recording.num_joints) if (law := read_law(recording, j, delay_bounds[1]))}
+        for law in own.values():
+            laws.setdefault(law.joint, {})[recording.name] = law
+        good = {j: law for j, law in own.items() if follows(law)}
+        new, taken, said = _with_facts(recording, good, configured, unknown, slides)
+        for key, text in said:
+            warnings.setdefault(key, f"{recording.name}: {text}")
+        changed.append(new)
+        taken_in.append(taken)
+    every = [law for by_recording in laws.values() for law in by_recording.values() if follows(law)]
+    bounds, sentence = _delay(every, delay_bounds, delay_mode, control_dt)
+    lines = [line_of_joint(list(by.values()), follows, control_dt, j in slides) for j, by in laws.items()]
+    return MeasuredDrives(
+        recordings=tuple(changed),
+        laws=laws,
+        taken={
+            fact: frozenset.intersection(*(frozenset(t.get(fact, ())) for t in taken_in))
+            for fact in {f for t in taken_in for f in t}
+        },
+        delay_bounds=bounds,
+        notes=(*lines, *([sentence] if sentence else [])),
+        warnings=tuple(warnings.values()),
+    )
+
+
+def follows(law: MeasuredLaw) -> bool:
+    """Whether a torque is that of a PD law."""
+    return law.r_squared >= FOLLOWS and law.stiffness >= 0 and law.damping >= 0
+
+
+def _with_facts(
+    recording: Recording,
+    laws: Mapping[int, MeasuredLaw],
+    configured: Mapping[str, np.ndarray],
+    unknown: Collection[str],
+    slides: Collection[str],
+) -> tuple[Recording, dict[str, set[str]], list[tuple[str, str]]]:
+    """A recording with what its torques say and nobody stated; what was taken; and what contradicts, with a key."""
+    facts: dict[str, np.ndarray] = {}
+    taken: dict[str, set[str]] = {}
+    said: list[tuple[str, str]] = []
+    for fact in (*_OF_THE_LAW, "effort_limit"):
+        stated = getattr(recording.drive, fact)
+        holds = stated is not None and fact not in unknown
+        values = np.array(configured[fact] if stated is None else stated, dtype=np.float64, copy=True)
+        for j, law in laws.items():
+            value, std = _value(law, fact)
+            if value is None:
+                continue
+            if apart(value, std, float(values[j])):
+                text = contradiction(law, fact, float(values[j]), value, std, holds, law.joint in slides)
+                said.append((f"{fact} {law.joint} {values[j]:.3g}", text))
+            if not holds:
+                values[j] = value
+                taken.setdefault(fact, set()).add(law.joint)
+        if fact in taken:
+            facts[fact] = values
+    changed = replace(recording, drive=replace(recording.drive, **facts)) if facts else recording
+    return _with_feed_forward(changed, laws), taken, said
+
+
+def _value(law: MeasuredLaw, fact: str) -> tuple[float | None, float]:
+    """What a torque says of a fact, with its standard deviation."""
+    if fact == "effort_limit":
+        return law.limit, 0.0
+    return (getattr(law, fact), law.std[fact]) if fact in law.std else (None, 0.0)
+
+
+def apart(value: float, std: float, stated: float) -> bool:
+    """Whether a value contradicts what is stated."""
+    if not np.isfinite(stated):
+        return False
+    return abs(value - stated) > max(SURE * std, APART * abs(stated))
+
+
+def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw]) -> Recording:
+    """The commanded torques as the drives take them, with the constant ones that no command says."""
+    shape = (recording.num_samples - 1) * recording.sample_stride + 1, recording.num_joints
+    effort = np.zeros(shape) if recording.command_effort is None else recording.command_effort.copy()
+    changed = False
+    for j, law in laws.items():
+        if law.feed_forward is not None and apart(law.feed_forward, law.std["feed_forward"], 1.0):
+            effort[:, j] *= law.feed_forward
+            changed = True
+        if has_offset(law):
+            effort[:, j] += law.offset
+            changed = True
+    return replace(recording, command_effort=effort) if changed else recording
+
+
+def _delay(
+    laws: Sequence[MeasuredLaw], bounds: tuple[float, float], delay_mode: str, control_dt: float
+) -> tuple[tuple[float, float] | None, str]:
+    """Where the delay lies by all torques [control steps], and what is to be said of it."""
+    known = [law for law in laws if law.stiffness > 0 or law.feed_forward is not None]
+    if not known:
+        return None, ""
+    low = max(bounds[0], *(law.delay - law.resolution for law in known))
+    high = min(bounds[1], *(law.delay + law.resolution for law in known))
+    late = all(law.feedback_lag > 0 and abs(law.delay) < law.resolution for law in known)
+    used = delay_mode == "command" and low < high and not late
+    span = (min(law.delay for law in known), max(law.delay for law in known))
+    return (low, high) if used else None, delay_sentence(span, (low, high), used, late, delay_mode, control_dt)
