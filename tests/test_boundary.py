@@ -176,6 +176,6 @@ def test_a_file_that_exists_is_not_replaced_by_a_simulation_unless_asked_to(tmp_
     words = ("--task", BENCH, "--duration", "0.5", "--no_plot", "--output", "leg.csv")
     (tmp_path / "leg.json").write_text("measured")
     done = run_script("data_collection", *words, cwd=tmp_path)
-    assert done.returncode == 2 and "leg.json exists, and may be a measurement" in done.stderr, done.stderr
+    assert done.returncode == 2 and "leg.json exists, and may be yours" in done.stderr, done.stderr
     assert (tmp_path / "leg.json").read_text() == "measured" and not (tmp_path / "leg.csv").exists()
     assert run_script("data_collection", *words, "--overwrite", cwd=tmp_path).returncode == 0

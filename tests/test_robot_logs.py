@@ -420,7 +420,7 @@ def test_import_writes_what_it_understood_and_the_map_reproduces_the_guess(tmp_p
     assert status == 0 and "hip current A: a current" in said.out and "400 values at 250 Hz" in said.out
     first = load_recording("leg.csv")
     status, said = call("log.csv", "--output", "leg.csv", "--columns", "map.toml")
-    assert status == 2 and "leg.csv is there already" in said.err
+    assert status == 2 and "leg.csv, leg.json exist, and may be yours" in said.err
     status, _ = call("log.csv", "--output", "leg.csv", "--columns", "map.toml", "--overwrite")
     again = load_recording("leg.csv")
     assert status == 0 and np.array_equal(first.dof_pos, again.dof_pos)

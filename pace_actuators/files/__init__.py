@@ -1,5 +1,6 @@
 """Reading files so that what is wrong with them is said by file and key, and writing them whole or not at all."""
 
+from pace_actuators.files.keeping import refuse_place, refuse_taken
 from pace_actuators.files.reading import file_at, read_json, read_tensors
 from pace_actuators.files.schema import checked, refuse
 from pace_actuators.files.writing import (
@@ -20,6 +21,8 @@ __all__ = [
     "read_json",
     "read_tensors",
     "refuse",
+    "refuse_place",
+    "refuse_taken",
     "remove_leftovers",
     "replacing",
     "write_atomically",

@@ -40,6 +40,7 @@ def replacing(path: Path) -> Iterator[Path]:
         OSError: If it cannot be written; its ``filename`` is the path.
     """
     remove_leftovers(path.parent)
+    _refuse_other(path)
     temporary = path.with_name(f".{path.stem[:40]}.0.{os.getpid()}.tmp{path.suffix}")
     try:
         with naming(path):
@@ -80,8 +81,7 @@ def writing(files: Mapping[Path, Writer]) -> Iterator[None]:
     try:
         for number, (path, write) in enumerate(files.items()):
             remove_leftovers(path.parent)
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            _refuse_other(path)
             made[path] = temporary = path.with_name(f".{path.name[:40]}.{number}.{os.getpid()}.tmp")
             with naming(path), temporary.open("wb") as file:
                 write(file)
@@ -95,6 +95,14 @@ def writing(files: Mapping[Path, Writer]) -> Iterator[None]:
         for temporary in made.values():
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def _refuse_other(path: Path) -> None:
+    """Let a file take the place of nothing but a file: a device, such as /dev/null, would be gone for all."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is a device or a pipe, expected a file", str(path))
 
 
 def _put_in_place(made: Mapping[Path, Path]) -> None:

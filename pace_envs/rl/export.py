@@ -13,6 +13,14 @@ from pace_actuators.files import write_together
 from pace_envs.mdp import JointPositionAction
 from pace_envs.rl.runner import PaceOnPolicyRunner
 
+EXPORTED = "exported"
+"""Folder of a training's run that its policy is exported to."""
+
+
+def exported_files(folder: Path) -> list[Path]:
+    """The files of an exported policy."""
+    return [folder / name for name in ("policy.pt", "policy.onnx", "policy.json")]
+
 
 def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
     """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``policy.json`` (observations, joints, targets, rate).
@@ -36,8 +44,7 @@ def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
         network = onnx.load_model(Path(made, "policy.onnx")).SerializeToString()  # the weights inside
     text = json.dumps(_describe(runner), indent=2) + "\n"
     folder.mkdir(parents=True, exist_ok=True)
-    files = {"policy.pt": policy, "policy.onnx": network, "policy.json": text.encode()}
-    write_together({folder / name: content for name, content in files.items()})
+    write_together(dict(zip(exported_files(folder), (policy, network, text.encode()), strict=True)))
 
 
 def _describe(runner: PaceOnPolicyRunner) -> dict[str, Any]:

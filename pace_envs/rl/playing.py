@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pace_actuators.files import refuse_taken
 from pace_envs.rendering import OffscreenRenderer
 from pace_envs.rl.evaluation import Evaluation, evaluate
-from pace_envs.rl.export import export_policy
+from pace_envs.rl.export import EXPORTED, export_policy, exported_files
 from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, find_checkpoint
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rl.training import EditCfg, load_cfg, make_env
@@ -57,6 +58,9 @@ class PlaySettings:
     export: str | None = None
     """Folder for the policy as TorchScript and ONNX."""
 
+    overwrite: bool = False
+    """Whether the film and the exported files may replace files that exist."""
+
     device: str = "cpu"
     """Where it walks: ``cpu``, or a GPU as ``cuda:0``; wherever it was trained."""
 
@@ -69,7 +73,11 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
     """
     if settings.video is not None:
         check_video_path(settings.video)
+        refuse_taken([settings.video], option="--video", overwrite=settings.overwrite)
     path = find_checkpoint(settings.checkpoint)
+    if settings.export is not None:
+        files, trained = exported_files(Path(settings.export)), exported_files(path.parent / EXPORTED)
+        refuse_taken(files, option="--export", overwrite=settings.overwrite, own=trained)
     run = _run_settings(path, settings)
     try:
         cfg = load_cfg(run, edit)

@@ -132,5 +132,8 @@ def latest_checkpoint(folder: Path) -> Path:
     """
     found = {int(m[1]): p for p in folder.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", p.name))}
     if not found:
-        raise ValueError(f"{folder} holds no checkpoint model_<iteration>.pt.")
+        raise ValueError(
+            f"{folder} holds no checkpoint: expected model_0.pt, with which a training begins, or a later "
+            "model_<iteration>.pt. Put one back, or train anew."
+        )
     return found[max(found)]

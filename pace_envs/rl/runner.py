@@ -139,7 +139,7 @@ def _check_optimizer(optimizer: torch.optim.Optimizer, before: list[dict[str, An
             for key, value in optimizer.state.get(parameter, {}).items():
                 if isinstance(value, torch.Tensor) and value.shape not in ((), parameter.shape):
                     raise ValueError(f"the optimizer's {key} has the shape {tuple(value.shape)}")
-                if not isinstance(value, torch.Tensor) or value.isnan().any():
+                if not isinstance(value, torch.Tensor) or not value.isfinite().all():
                     raise ValueError(f"the optimizer's {key} is no number")
 
 

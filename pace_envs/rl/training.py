@@ -16,7 +16,7 @@ from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
-from pace_envs.rl.export import export_policy
+from pace_envs.rl.export import EXPORTED, export_policy
 from pace_envs.rl.run_folder import (
     IDENTIFIED_FILE,
     SETTINGS_FILE,
@@ -171,7 +171,7 @@ def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | No
     with told_of_lost_processes():
         runner.learn(left, init_at_random_ep_len=True)
     if folder is not None:
-        export_policy(runner, folder / "exported")
+        export_policy(runner, folder / EXPORTED)
     if runner.is_distributed:
         dist.destroy_process_group()
     env.close()

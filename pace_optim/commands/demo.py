@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from pace_actuators.files import refuse_taken
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
@@ -14,14 +15,17 @@ from pace_optim.report import write_report
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_overwrite_option
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
 PHYSICS_DT = 0.00125  # [s], as in the diagnosis: then the ladder shows what the effect does, and not the step
+LOG_DIR = Path("logs/demo")
+"""Its own folder: what it recorded there before is replaced."""
 MOTIONS = {"train": ("chirp", "ramp", "steps"), "validation": ("multisine",)}
 
 
-def record(effect: str, joints: str, duration: float, seed: int, folder: Path) -> dict[str, list[str]]:
+def record(effect: str, joints: str, duration: float, seed: int, folder: Path, overwrite: bool) -> dict[str, list[str]]:
     """Recordings to fit and, of another kind, to validate on, by a simulator that shares no code with ours."""
     cfgs = {
         motion: CollectionCfg(
@@ -33,11 +37,13 @@ def record(effect: str, joints: str, duration: float, seed: int, folder: Path) -
             effect_joints=joints,
             noise=NOISE,
             output=folder / f"{motion}.npz",
-            overwrite=True,
+            overwrite=overwrite,
         )
         for motions in MOTIONS.values()
         for motion in motions
     }
+    outputs = [cfg.output for cfg in cfgs.values() if cfg.output is not None]
+    refuse_taken(outputs, option="--log_dir", overwrite=overwrite)  # all of them, before one is written
     with ProcessPoolExecutor() as pool:
         made = dict(zip(cfgs, pool.map(collect, cfgs.values()), strict=True))
     return {part: [str(made[motion].recordings[0]) for motion in motions] for part, motions in MOTIONS.items()}
@@ -50,12 +56,20 @@ def main() -> None:
     parser.add_argument("--effect_joints", default=".*KFE", metavar="REGEX", help="where (default: the knees)")
     parser.add_argument("--seed", type=int, default=0, help="of the hidden parameters and the noise")
     parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="of each recording (default 6)")
-    parser.add_argument("--log_dir", type=Path, default=Path("logs/demo"), help="where all goes (default logs/demo)")
+    parser.add_argument("--log_dir", type=Path, default=LOG_DIR, help="where all goes (default logs/demo)")
+    add_overwrite_option(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
 
     print(f"1. Record: a simulated ANYmal D whose {args.effect_joints} have {args.effect}.", flush=True)
-    files = record(args.effect, args.effect_joints, args.duration, args.seed, args.log_dir)
+    files = record(
+        args.effect,
+        args.effect_joints,
+        args.duration,
+        args.seed,
+        args.log_dir,
+        args.overwrite or args.log_dir == LOG_DIR,
+    )
     print("2. Fit the base model, which does not have it.", flush=True)
     result, base = fit(
         FitSettings(

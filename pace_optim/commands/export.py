@@ -2,9 +2,10 @@
 
 import sys
 
+from pace_actuators.files import refuse_taken
 from pace_optim.export import FORMATS, export
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
 
 
 def main() -> None:
@@ -18,9 +19,12 @@ def main() -> None:
     parser.add_argument("--format", required=True, choices=tuple(FORMATS), help="what to write")
     parser.add_argument("--joints_only", action="store_true", help="mjcf: leave the actuators as they were")
     parser.add_argument("--output", metavar="FILE", help="where (default: standard output)")
+    add_overwrite_option(parser)
     add_common_options(parser, run=True)
     options = take_common_options(vars(parser.parse_args()))
     output = options["output"]
+    if output is not None:
+        refuse_taken([output], option="--output", overwrite=options["overwrite"])
     exported = export(options["result"], options["format"], joints_only=options["joints_only"], task=options["task"])
     if output is None:
         print(exported.text, end="")

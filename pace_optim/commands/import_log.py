@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pace_optim.recording import SUFFIXES, save_recording
-from pace_optim.robot_logs import ColumnMap, Robot, is_log, load_recordings, read_map, understood, write_map
+from pace_actuators.files import refuse_taken
+from pace_optim.recording import SUFFIXES, save_recording, written_files
+from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, write_map
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
 
 
 def main() -> None:
@@ -24,7 +25,7 @@ def main() -> None:
     parser.add_argument("--columns", metavar="MAP", help="column map (.toml); without it, it is guessed")
     parser.add_argument("--output", metavar="FILE", help="recording to write (.csv, .npz, .pt); episodes get numbers")
     parser.add_argument("--write_map", metavar="MAP", help="write the map that was used, to correct it")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    add_overwrite_option(parser)
     args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
 
     path = Path("+".join(args.log))
@@ -40,14 +41,16 @@ def main() -> None:
         if len(each) > 1:
             print(f"  {len(each)} episodes")
         parts = [(one.recording, one.columns) for one in each]
+    targets = _targets(Path(args.output), len(parts)) if args.output else []
+    files = [file for target in targets for file in written_files(target)]
+    refuse_taken(files, option="--output", overwrite=args.overwrite)
     if args.write_map and parts[0][1] is not None:
-        _write_map(Path(args.write_map), parts[0][1], args.overwrite)
+        refuse_taken([args.write_map], option="--write_map", overwrite=args.overwrite)
+        write_map(Path(args.write_map), parts[0][1])
+        print(f"map: {args.write_map}", file=sys.stderr)
     if not args.output:
         print("nothing written: --output FILE writes the recording")
         return
-    targets = _targets(Path(args.output), len(parts))
-    if there := [str(target) for target in targets if target.exists() and not args.overwrite]:
-        raise ValueError(f"{there[0]} is there already. Choose another --output, or give --overwrite.")
     for (recording, _), target in zip(parts, targets, strict=True):
         save_recording(target, recording)
         print(f"recording: {target} ({recording.num_samples} samples, {recording.duration:.4g} s)")
@@ -66,13 +69,6 @@ def _robot(task: str | None) -> Robot:
     known = Robot(joint_names=tuple(robot.joint_names), limits=np.array(robot.data.joint_pos_limits))
     env.close()
     return known
-
-
-def _write_map(path: Path, columns: ColumnMap, overwrite: bool) -> None:
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path} is there already. Choose another --write_map, or give --overwrite.")
-    write_map(path, columns)
-    print(f"map: {path}", file=sys.stderr)
 
 
 def _targets(path: Path, count: int) -> list[Path]:

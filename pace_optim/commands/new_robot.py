@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from pace_actuators.files import write_atomically
+from pace_actuators.files import refuse_taken, write_atomically
 from pace_envs.from_model.writing import configuration_text
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_overwrite_option
 
 
 def main() -> None:
@@ -15,11 +16,11 @@ def main() -> None:
     )
     parser.add_argument("model", metavar="MODEL", help="model file, .xml or .urdf")
     parser.add_argument("--output", required=True, type=Path, metavar="FILE.py", help="Python file to write")
+    add_overwrite_option(parser)
     args = parser.parse_args()
     if args.output.suffix != ".py" or not args.output.stem.isidentifier():
         raise ValueError(f"--output {args.output}: expected a name that Python can import, such as my_robot.py.")
-    if args.output.exists():
-        raise ValueError(f"{args.output} exists and may hold your edits. Choose another --output, or delete it.")
+    refuse_taken([args.output], option="--output", overwrite=args.overwrite)
     text, task, cfg = configuration_text(args.model, args.output)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(args.output, lambda file: file.write(text.encode()))

@@ -11,7 +11,12 @@ if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
 from pace_optim.run.training_replay import replay_in_training  # noqa: E402
 from pace_optim.terminal.cli import make_parser  # noqa: E402
-from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options  # noqa: E402
+from pace_optim.terminal.options import (  # noqa: E402
+    add_common_options,
+    add_device_option,
+    add_overwrite_option,
+    take_common_options,
+)
 
 
 def main() -> None:
@@ -31,6 +36,7 @@ def main() -> None:
     parser.add_argument("--video", metavar="FILE", help="film of the first robot, .mp4 or .gif; without a screen too")
     parser.add_argument("--viewer", action="store_true", help="open a window instead")
     parser.add_argument("--export", metavar="DIR", help="write the policy as TorchScript and ONNX")
+    add_overwrite_option(parser)
     parser.add_argument("--identified", metavar="FILE", help="walk on the drives of this fit: its result.json")
     parser.add_argument(
         "--replay",

@@ -8,14 +8,14 @@ import matplotlib
 import torch
 from matplotlib.figure import Figure
 
-from pace_actuators.files import write_together
+from pace_actuators.files import refuse_taken, write_together
 from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.run.find import find_mean, find_run
 from pace_optim.run.history import History
 from pace_optim.run.replay import replay
 from pace_optim.run.tensors import read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
 
 
 def main() -> None:
@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--output", metavar="DIR", help="write PNG files there instead of showing windows")
     parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
     parser.add_argument("--headless", action="store_true", help="show nothing; without --output, write to the run")
+    add_overwrite_option(parser)
     add_common_options(parser, run=True)
     args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
     both = not (args.plot_trajectory or args.plot_score)
@@ -65,6 +66,8 @@ def main() -> None:
         return
     output = Path(args.output) if args.output else run
     files = {output / f"{name}.png": png(figure) for name, figure in figures.items()}
+    own = [run / path.name for path in files]
+    refuse_taken(files, option="--output", overwrite=args.overwrite, own=own)
     output.mkdir(parents=True, exist_ok=True)
     write_together(files)
     for path in files:

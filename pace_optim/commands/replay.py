@@ -5,10 +5,12 @@ import sys
 import webbrowser
 from pathlib import Path
 
+from pace_actuators.files import refuse_taken
 from pace_optim.report.motion import motions_of
 from pace_optim.report.replay_page import write_replay
 from pace_optim.report.run_data import RunData
 from pace_optim.terminal.cli import make_parser
+from pace_optim.terminal.options import add_overwrite_option
 
 VIEWERS = ("browser", "mujoco", "none")
 
@@ -22,10 +24,13 @@ def main() -> None:
     parser.add_argument("run", metavar="RUN", help="folder of a run, as fit.py prints it")
     parser.add_argument("--viewer", choices=VIEWERS, default="browser", help="where to show it (default browser)")
     parser.add_argument("--output", type=Path, metavar="FILE", help="the page (default: replay.html in RUN)")
+    add_overwrite_option(parser)
     parser.add_argument("--recording", metavar="NAME", help="what MuJoCo's viewer shows (default: the worst)")
     parser.add_argument("--speed", type=float, default=1.0, help="of MuJoCo's viewer, 1 is real time")
     args = parser.parse_args()
 
+    own = Path(args.run) / "replay.html"
+    refuse_taken([args.output or own], option="--output", overwrite=args.overwrite, own=[own])
     page = write_replay(args.run, args.output)
     print(f"replay: {page}")
     if args.viewer == "browser" and not webbrowser.open(page.resolve().as_uri()):

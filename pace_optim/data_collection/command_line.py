@@ -12,7 +12,7 @@ from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
 from pace_optim.terminal.cli import Parser, make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
 
 from .cfg import CollectionCfg
 
@@ -90,7 +90,7 @@ def make_collection_parser() -> Parser:
     encoder.add_argument("--noise", type=float, default=0.0, metavar="RAD", help="standard deviation (default 0)")
     encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
     files = parser.add_argument_group("files")
-    files.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    add_overwrite_option(files)
     files.add_argument("--positions_only", action="store_true", help="leave dof_vel out: half the size")
     files.add_argument(
         "--export_command", type=Path, metavar="FILE.csv", help="write time and targets alone, to play on a robot"

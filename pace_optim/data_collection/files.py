@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pace_optim.recording import SUFFIXES
+from pace_actuators.files import refuse_place, refuse_taken
+from pace_optim.recording import SUFFIXES, written_files
 
 from .cfg import CollectionCfg
 
@@ -55,14 +56,9 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     paths = [path for file in files for path in (file.recording, file.command, file.plot) if path]
     if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
-    csv = [file.recording for file in files if file.recording is not None and file.recording.suffix.lower() == ".csv"]
-    facts = [path.with_suffix(".json") for path in csv]
+    recordings = [path for file in files if file.recording for path in written_files(file.recording)]
     truth = [truth_file(cfg, robot_name)] if cfg.effects else []
-    if not cfg.overwrite and (there := [str(path) for path in (*paths, *facts, *truth) if path.exists()]):
-        raise ValueError(
-            f"{', '.join(there)} {'exist' if len(there) > 1 else 'exists'}, and may be a measurement. Choose another "
-            "--output, or replace what is there with --overwrite."
-        )
+    refuse_taken(dict.fromkeys((*paths, *recordings, *truth)), option="--output", overwrite=cfg.overwrite)
     return files
 
 
@@ -80,12 +76,8 @@ def _part(path: Path | None, name: str, count: int) -> Path | None:
 def _check(option: str, path: Path | None, suffixes: Sequence[str]) -> None:
     if path is None:
         return
-    if path.is_dir():
-        raise ValueError(f"{option} {path}: is a folder; expected a file. Add a file's name.")
+    refuse_place(path, option=option)
     if path.suffix.lower() not in suffixes:
         raise ValueError(
             f"{option} {path}: found the suffix '{path.suffix}'; expected {' or '.join(suffixes)}. Rename the file."
         )
-    obstacle = next((parent for parent in path.parents if parent.exists()), None)
-    if obstacle is not None and not obstacle.is_dir():
-        raise ValueError(f"{option} {path}: {obstacle} is a file, not a folder. Choose another place.")

@@ -7,7 +7,7 @@
 
 from .conform import conform_recording, with_columns
 from .data import Drive, Load, Recording, validation_start
-from .files import SUFFIXES, load_recording, save_recording, without_fact_files
+from .files import SUFFIXES, load_recording, save_recording, without_fact_files, written_files
 
 __all__ = [
     "SUFFIXES",
@@ -20,4 +20,5 @@ __all__ = [
     "validation_start",
     "with_columns",
     "without_fact_files",
+    "written_files",
 ]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_actuators.files import read_tensors, write_atomically
+from pace_actuators.files import read_tensors, write_atomically, writing
 from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
@@ -58,6 +58,11 @@ def without_fact_files(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     ]
 
 
+def written_files(path: Path) -> list[Path]:
+    """The files that ``save_recording`` writes for a path."""
+    return [path, path.with_suffix(".json")] if path.suffix.lower() == ".csv" else [path]
+
+
 def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
     """Write a recording in the format of the path's suffix; a CSV's facts go to a JSON file of the same stem.
 
@@ -71,8 +76,14 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
     facts = _facts_of(recording)
     if suffix == ".csv":
         text = json.dumps(facts, indent=2).encode()
-        write_atomically(path.with_suffix(".json"), lambda file: file.write(text))
-        write_atomically(path, lambda file: write_csv(file, series, recording.joint_names))
+        table, facts_file = written_files(path)
+        with writing(
+            {
+                facts_file: lambda file: file.write(text),
+                table: lambda file: write_csv(file, series, recording.joint_names),
+            }
+        ):
+            pass
     elif suffix == ".npz":
         if "added_mass" in facts:
             facts["added_mass"] = json.dumps(facts["added_mass"])

@@ -60,6 +60,11 @@ def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
+def add_overwrite_option(parser: argparse._ActionsContainer) -> None:
+    """Of every command that writes where the user says; ``refuse_taken`` is what asks."""
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+
+
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that reads recordings."""
     parser.add_argument(
