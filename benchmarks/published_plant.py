@@ -16,7 +16,9 @@ CONTROL_DT = 0.0025
 NOISE = 1e-4
 """Of the encoders [rad or m]."""
 LATE = 0.004
-"""Of the command [s]."""
+"""Of the command [s]; a PD loop at the control rate sees it at its next call."""
+ROTOR = 0.004
+"""Where the file has no armature: at least this at the joint [kg m²], as a humanoid's smallest geared drives."""
 SETTLE = 1.0
 """Time at rest before the recording [s]."""
 HIDDEN = ("stribeck", "quadratic", "offset")
@@ -31,6 +33,8 @@ class Truth:
     viscous_friction: np.ndarray
     friction: np.ndarray
     encoder_bias: np.ndarray
+    delay: float = LATE
+    """Of the command, as the drives see it [s]."""
     hidden: str | None = None
     """The effect that the model lacks."""
     hidden_on: tuple[str, ...] = ()
@@ -118,7 +122,7 @@ def draw_truth(plant: Plant, joints: tuple[str, ...], kp: np.ndarray, amplitude:
     critical = 2 * np.sqrt(np.maximum(kp, 1e-3) * plant.inertia)
     return Truth(
         joints=joints,
-        armature=rng.uniform(0.7, 1.5, n) * np.where(armature > 0, armature, 0.3 * plant.inertia),
+        armature=rng.uniform(0.7, 1.5, n) * np.where(armature > 0, armature, rotor(plant)),
         viscous_friction=rng.uniform(0.7, 1.5, n) * np.where(damping > 0, damping, 0.1 * critical),
         friction=rng.uniform(0.05, 0.15, n) * kp * amplitude,
         encoder_bias=rng.uniform(-1, 1, n) * np.where(slide, 0.001, 0.02),
@@ -143,8 +147,10 @@ def record(path: Path, command: Path, step: float | None, seed: int, hidden: str
     plant = Plant(path, joints, step)
     amplitude = np.ptp(target, axis=0) / 2
     own = plant.actuators_of()
-    kp, kd = np.array([pair[2:] for pair in own]).T if own else stated_gains(plant, amplitude)
+    kp, kd = np.array([pair[2:] for pair in own]).T if own else stated_gains(plant)
     truth = draw_truth(plant, joints, kp, amplitude, seed)
+    if not own:
+        truth = replace(truth, delay=float(np.ceil(LATE / CONTROL_DT - 1e-6) * CONTROL_DT))
     if hidden:
         two = tuple(joints[i] for i in np.argsort(-amplitude * kp)[:2])
         truth = replace(truth, hidden=hidden, hidden_on=two)
@@ -158,10 +164,16 @@ def record(path: Path, command: Path, step: float | None, seed: int, hidden: str
     return recording, truth
 
 
-def stated_gains(plant: Plant, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gains where the file has none: 3 Hz and a damping ratio of 0.5 for the joint's own inertia."""
-    kp = (2 * np.pi * 3) ** 2 * plant.inertia
-    return kp, np.sqrt(kp * plant.inertia)
+def rotor(plant: Plant) -> np.ndarray:
+    """Armature where the file has none, (n,) [kg m²]."""
+    return np.maximum(ROTOR, 0.3 * plant.inertia)
+
+
+def stated_gains(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Gains where the file has none: 3 Hz and critical damping for the inertia at the joint: it stays in its range."""
+    inertia = plant.inertia + rotor(plant)
+    kp = (2 * np.pi * 3) ** 2 * inertia
+    return kp, 2 * np.sqrt(kp * inertia)
 
 
 def simulate(

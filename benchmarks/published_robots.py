@@ -101,6 +101,7 @@ def run(args: argparse.Namespace) -> None:
                 "wall_s": wall,
                 "processor_s": used,
                 "delay_ms": 1e3 * result["delay_s"],
+                "delay_truth_ms": 1e3 * truth.delay,
                 "rmse_mrad": 1e3 * result["rmse"]["train"]["all"],
                 "validation_mrad": 1e3 * result["rmse"]["validation"]["all"],
                 "errors": errors(result, truth),
@@ -147,7 +148,8 @@ def table(rows: list[dict]) -> str:
         said = "" if found is None else f"{kind} on {' '.join(found['truth'])}: {found['verdict']} {found['added']}"
         lines.append(
             f"| {row['robot']} | {row['joints']} | {fit['wall_s']:.0f} ({fit['processor_s']:.0f}) | "
-            f"{fit['rmse_mrad']:.3g} / {fit['validation_mrad']:.3g} | {fit['delay_ms']:.3f} | {' | '.join(cells)} | "
+            f"{fit['rmse_mrad']:.3g} / {fit['validation_mrad']:.3g} | "
+            f"{fit['delay_ms']:.3f} of {fit['delay_truth_ms']:.3g} | {' | '.join(cells)} | "
             f"{left} | {said} | {'' if found is None else format(found['wall_s'], '.0f')} |"
         )
     return "\n".join(lines)

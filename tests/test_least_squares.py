@@ -63,6 +63,19 @@ def test_the_last_digits_are_reached_whatever_the_size_of_the_gradient():
     assert best.score <= 1e-18
 
 
+def test_near_the_end_derivatives_are_kept_and_a_step_costs_its_trials_only():
+    told = record()
+    problem = make_problem(dataclasses.replace(told, dof_pos=np.roll(told.dof_pos, 5, axis=0)))  # fits nothing exactly
+    evaluator, sizes = problem.evaluator(), []
+    simulate = evaluator.residuals
+    evaluator.residuals = lambda physical, where=None: (sizes.append(len(physical)), simulate(physical, where))[1]
+    best = refine(problem, evaluator=evaluator)[0]
+    neighbours = len(colour(problem.space, problem.trees, problem.joint_names).colours)
+    assert sizes[-2:] == [4, 4] and sizes[0] == 1 + neighbours
+    again = refine(problem, best.x)[0]  # its derivatives are those at the end
+    assert again.score > (1 - 1e-5) * best.score
+
+
 # ---------------------------------------------------------------- bounds
 
 

@@ -69,7 +69,7 @@ def perturbed(x: torch.Tensor, colouring: Colouring) -> tuple[torch.Tensor, torc
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Jacobian:
-    """The residuals at x and their derivatives, block by block."""
+    """The residuals at x and derivatives there or near it, block by block."""
 
     residuals: Residuals
     """Of x alone, m = 1."""
@@ -105,9 +105,8 @@ class Jacobian:
 
 def jacobian(residuals: Residuals, step: torch.Tensor, colouring: Colouring) -> Jacobian:
     """The Jacobian from the residuals of x (row 0) and of :func:`perturbed` (the rows after it)."""
-    at = Residuals(error=residuals.error[:1], where=residuals.where, step=residuals.step)
     columns = residuals.error[1 : 1 + len(colouring.colours)] - residuals.error[:1]
     for column, entries in zip(columns, colouring.colours, strict=True):
         for entry in entries:
             column[..., list(colouring.joints[entry])] /= step[entry]
-    return Jacobian(residuals=at, columns=columns, colouring=colouring)
+    return Jacobian(residuals=residuals.rows(0, 1), columns=columns, colouring=colouring)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -17,6 +17,8 @@ _DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
 _STALLED = 3
 _CREEPING = 4
 _SMALLEST_DAMPING = 1e-9
+_NEAR = 1e-2
+"""A step that is expected to lower the score by less than this part of it hardly changes the derivatives."""
 
 
 @dataclass(kw_only=True)
@@ -56,7 +58,9 @@ class Descent:
     damping: float = 1e-3
     """Levenberg–Marquardt damping, relative to the diagonal of JᵀJ."""
     jacobian: Jacobian | None = None
-    """At x; ``None`` until it is known."""
+    """Residuals at x, and derivatives at ``jacobian_x``; ``None`` until they are known."""
+    jacobian_x: torch.Tensor | None = None
+    """Where the derivatives were taken, normalised (size,)."""
     stop_reason: str | None = None
     iteration: int = 0
     stalled: int = 0
@@ -78,12 +82,31 @@ class Descent:
                 iteration=int(iteration),
                 stalled=int(stalled),
                 scores=history,
+                jacobian_x=torch.as_tensor(jacobian_x),
                 lost_jacobian=bool(known) and not stop,
             )
-            for x, (score, damping, iteration, stalled, known), stop, history in zip(
-                checkpoint["descent_x"], checkpoint["descent_state"], checkpoint["descent_stop"], scores, strict=True
+            for x, jacobian_x, (score, damping, iteration, stalled, known), stop, history in zip(
+                checkpoint["descent_x"],
+                checkpoint["descent_jacobian_x"],
+                checkpoint["descent_state"],
+                checkpoint["descent_stop"],
+                scores,
+                strict=True,
             )
         ]
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether the derivatives are those at x."""
+        return self.jacobian_x is not None and torch.equal(self.jacobian_x, self.x)
+
+    def looks_around(self, trial: torch.Tensor, cfg: LeastSquaresCfg) -> bool:
+        """Whether the derivatives at a trial step are worth simulating beside it: where much is expected of it."""
+        return self.jacobian is None or (self.stalled == 0 and self.expected_gain(trial) >= _NEAR * self.score)
+
+    def look(self, x: torch.Tensor, residuals: Residuals, step: torch.Tensor, colouring: Colouring) -> None:
+        """Take the derivatives at x from its residuals (row 0) and its neighbours'."""
+        self.jacobian, self.jacobian_x = jacobian(residuals, step, colouring), x.clone()
 
     def trials(self) -> torch.Tensor:
         """Steps at several dampings, the favoured first, (trials, size)."""
@@ -147,7 +170,8 @@ def least_squares(
 
     Each iteration simulates, in one batch, every start's trial steps at several dampings, and beside the favoured
     trial the perturbed vectors for its Jacobian: where the favoured trial wins, the next Jacobian is already there.
-    A step that is expected to gain less than the tolerance is the last one, and is tried without them.
+    Steps that are expected to gain little are tried without them, and the derivatives are kept as long as such steps
+    gain (the chord method): near the end a step then costs as much as its trials.
 
     Args:
         evaluator: Simulates.
@@ -171,15 +195,14 @@ def least_squares(
         for descent in running:
             trials = descent.trials()
             neighbours, step = perturbed(trials[0], colouring)
-            if descent.expected_gain(trials[0]) < cfg.score_tolerance * descent.score:  # its last step: no derivatives
+            if not descent.looks_around(trials[0], cfg):
                 neighbours = neighbours[:0]
             batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
             steps.append(step)
         every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)), where)
         start = 0
         for descent, batch, step in zip(running, batches, steps, strict=True):
-            part = Residuals(error=every.error[start : start + len(batch)], where=every.where, step=every.step)
-            _advance(descent, batch, part, step, colouring, cfg)
+            _advance(descent, batch, every.rows(start, start + len(batch)), step, colouring, cfg)
             start += len(batch)
         _drop_hopeless(descents, cfg)
         if on_iteration is not None:
@@ -188,10 +211,14 @@ def least_squares(
 
 
 def _find_jacobian(descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None) -> None:
-    """Compute the Jacobian at x again, beside the descent's iterations."""
-    neighbours, step = perturbed(descent.x, colouring)
-    residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([descent.x[None], neighbours])), where)
-    descent.jacobian, descent.lost_jacobian = jacobian(residuals, step, colouring), False
+    """Compute the Jacobian again, beside the descent's iterations."""
+    seen = descent.x if descent.jacobian_x is None else descent.jacobian_x
+    neighbours, step = perturbed(seen, colouring)
+    batch = torch.cat([seen[None], neighbours, descent.x[None]])
+    residuals = evaluator.residuals(evaluator.space.to_physical(batch), where)
+    there = jacobian(residuals.rows(0, len(batch) - 1), step, colouring)
+    descent.jacobian = replace(there, residuals=residuals.rows(len(batch) - 1, len(batch)))
+    descent.jacobian_x, descent.lost_jacobian = seen, False
 
 
 def _advance(
@@ -217,25 +244,31 @@ def _advance(
     if descent.jacobian is None:  # the only trial is x itself
         if not np.isfinite(descent.score):
             descent.score = float(scores[0])
-        descent.jacobian = jacobian(residuals, step, colouring)
+        descent.look(batch[0], residuals, step, colouring)
     else:
         rows = [0, *range(len(batch) - len(_DAMPING_TRIALS) + 1, len(batch))]
         best = int(scores[rows].argmin())
         gain = descent.score - float(scores[rows[best]])
         expected = descent.expected_gain(batch[0])
         descent.stalled = 0 if gain > cfg.score_tolerance * descent.score else descent.stalled + 1
+        fresh, looked = descent.is_fresh, len(batch) > len(_DAMPING_TRIALS)
         if gain > 0:
             moved = float((batch[rows[best]] - descent.x).abs().max())
             descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
             descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[best] / 10.0)
-            # the favoured trial's neighbours were simulated beside it
-            looked = len(batch) > len(_DAMPING_TRIALS)
-            descent.jacobian = jacobian(residuals, step, colouring) if looked and best == 0 else None
+            if descent.jacobian is not None and not looked:
+                descent.jacobian = replace(descent.jacobian, residuals=residuals.rows(rows[best], rows[best] + 1))
+            elif best == 0:  # its neighbours were simulated beside it
+                descent.look(batch[0], residuals, step, colouring)
+            else:
+                descent.jacobian = None
             if moved < cfg.step_tolerance:
                 descent.stop_reason = "converged"
-        else:
+        elif fresh:
             descent.damping *= 1e3
-        if expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED:
+        else:
+            descent.jacobian = None
+        if expected < cfg.score_tolerance * descent.score or (fresh and descent.stalled >= _STALLED):
             descent.stop_reason = "converged"
     descent.scores.append(descent.score)
     if descent.stop_reason is None and _creeps(descent.scores, cfg.creep_tolerance):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.optimizers.jacobian import Colouring, jacobian, perturbed
+from pace_optim.optimizers.jacobian import Colouring, perturbed
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
 
@@ -66,5 +66,5 @@ def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequ
     for descent in kept:
         if torch.equal(descent.x, ends[0]):
             around = torch.cat([residuals.error[:1], residuals.error[len(candidates) :]])
-            descent.jacobian = jacobian(replace(residuals, error=around), step, colouring)
+            descent.look(descent.x, replace(residuals, error=around), step, colouring)
     return kept[: len(starts)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,6 +29,10 @@ class Residuals:
     """Where there is a sample, (K, R) bool."""
     step: torch.Tensor
     """Control step of each of the K steps, (K,)."""
+
+    def rows(self, begin: int, end: int) -> Residuals:
+        """Those of some of the candidates."""
+        return replace(self, error=self.error[begin:end])
 
     @property
     def score(self) -> torch.Tensor:

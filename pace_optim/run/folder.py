@@ -50,6 +50,7 @@ _CHECKPOINT = {
     "search_stop": ("U", 1),
     "simulated_steps": ("i", 0),
     "descent_x": ("f", 2),
+    "descent_jacobian_x": ("f", 2),
     "descent_state": ("f", 2),
     "descent_stop": ("U", 1),
     "descent_scores": ("U", 0),
@@ -143,6 +144,9 @@ class RunFolder:
             "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),
             "descent_x": np.stack([d.x.numpy() for d in descents]) if descents else np.zeros((0, 0)),
+            "descent_jacobian_x": np.stack([(d.x if d.jacobian_x is None else d.jacobian_x).numpy() for d in descents])
+            if descents
+            else np.zeros((0, 0)),
             "descent_state": np.array(
                 [[d.score, d.damping, d.iteration, d.stalled, d.jacobian is not None] for d in descents]
             ).reshape(-1, 5),
@@ -174,7 +178,10 @@ class RunFolder:
                 refuse(path, f"{name} is of another type or shape", _ANEW)
             if kind == "f" and np.isnan(arrays[name]).any():
                 refuse(path, f"{name} holds values that are no numbers", _ANEW)
-        if len({len(arrays[name]) for name in ("descent_x", "descent_state", "descent_stop")}) > 1:
+        if (
+            len({len(arrays[name]) for name in ("descent_x", "descent_jacobian_x", "descent_state", "descent_stop")})
+            > 1
+        ):
             refuse(path, "its descents are not of one number", _ANEW)
         if arrays["descent_state"].shape[1] != 5:
             refuse(path, "descent_state is of another shape", _ANEW)
