@@ -120,7 +120,7 @@ def test_what_is_stated_holds_and_a_contradiction_is_told_with_both_numbers():
     found = drives(recorded(stated={"stiffness": 20.0, "damping": 1.0}))
     assert found.recordings[0].drive.stiffness[0] == 20.0 and "stiffness" not in found.taken
     (said,) = found.warnings
-    assert "stated as 20" in said and "says 40" in said and "Correct stiffness" in said
+    assert "stated as 20" in said and "says 40" in said and "--unknown stiffness" in said
     assert not drives(recorded(stated={"stiffness": 40.5, "damping": 1.0})).warnings
 
 

@@ -10,6 +10,7 @@ from pace_optim.diagnosis import DiagnosisSettings
 from pace_optim.fit import fit, help_fit, resume
 from pace_optim.problem.problem import DELAY_MODES
 from pace_optim.problem.processes import join
+from pace_optim.problem.unknown_facts import UNKNOWN_FACTS
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import given_options, make_parser
@@ -41,6 +42,13 @@ def main() -> None:
         default=[],
         metavar="NAME",
         help="effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared",
+    )
+    parser.add_argument(
+        "--unknown",
+        nargs="+",
+        default=[],
+        metavar="FACT",
+        help=f"facts of the drives that nobody knows, to be identified: {', '.join(UNKNOWN_FACTS)}",
     )
     parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")

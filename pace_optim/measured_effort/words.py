@@ -55,7 +55,7 @@ def contradiction(
     text = f"{_WORDS[fact]} of {law.joint} is stated as {stated:.4g} {_UNITS[fact]}, "
     text += f"and its dof_effort says {value:.4g}{error}"
     if holds:
-        text += f": what is stated is used. Correct {fact}."
+        text += f": what is stated is used. Correct {fact}, or fit with --unknown {fact}."
     else:
         text += ": that is used."
     return in_slide_units(text) if slides else text

@@ -72,7 +72,7 @@ class ParameterSpace:
             if parameter.start is not None:
                 here = self.slices[parameter.name]
                 physical = self.to_physical(x)
-                physical[here] = parameter.start
+                physical[here] = torch.as_tensor(parameter.start, dtype=physical.dtype)
                 x[here] = self.to_normalised(physical)[here]
         return x
 

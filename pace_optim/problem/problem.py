@@ -22,6 +22,7 @@ from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all, tell_on_stderr
 from pace_optim.problem.stated_limits import contradicted_limits
+from pace_optim.problem.unknown_facts import lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
@@ -48,6 +49,8 @@ class Problem:
     """Where environments are built."""
     measured: MeasuredDrives = field(default_factory=MeasuredDrives)
     """What the recordings' torques say of the drives."""
+    unknown: tuple[str, ...] = ()
+    """Facts of the drives that are identified because nobody knows them."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -124,6 +127,7 @@ def load_problem(
     physics_dt: float | None = None,
     drive_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
+    unknown: Sequence[str] = (),
     env_cfg: Any = None,
     columns: str | Path | None = None,
     strict: bool = False,
@@ -140,6 +144,8 @@ def load_problem(
         drive_dt: Time between two runs of the drives' own controllers [s]; ``None`` keeps the configuration's.
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
+        unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
+            they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
@@ -174,11 +180,17 @@ def load_problem(
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
     recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
-    measured = _read_torques(env, [*recordings, *held_out], control_dt)
-    told = list(measured.recordings)
-    recordings, held_out = told[: len(recordings)], told[len(recordings) :]
-    for each in (plain, cfg):
-        _narrow_delay(each, measured)
+    count = len(recordings)
+    measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
+    told, bounds = lift_limits(plain, measured.recordings, unknown)
+    plain.sim2real.effect_bounds = {**plain.sim2real.effect_bounds, **bounds}
+    _narrow_delay(plain, measured)
+    recordings, held_out = told[:count], told[count:]
+    if unknown:
+        env.close()
+        cfg = _configured(plain, physics_dt, with_unknown(effects or plain.sim2real.effects, unknown))
+        env = ManagerBasedRLEnv(cfg)
+    _narrow_delay(cfg, measured)
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), max_duration, tell_on_stderr
@@ -195,23 +207,38 @@ def load_problem(
         delay_mode=next(iter(drives)).delay_mode,
         control_dt=control_dt,
         measured=measured,
+        unknown=unknown,
     )
     env.close()
     return problem
 
 
-def _read_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording], control_dt: float) -> MeasuredDrives:
-    """What the recordings' torques say of the drives."""
+def _read_torques(
+    env: ManagerBasedRLEnv, recordings: Sequence[Recording], control_dt: float, unknown: Sequence[str]
+) -> tuple[MeasuredDrives, tuple[str, ...]]:
+    """What the recordings' torques say of the drives, and what nobody knows even so.
+
+    A fact is read if every recording has it of every joint; else it is identified, and all recordings keep what they
+    state.
+    """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     low, high = sim2real.bounds_params[-1].tolist()
-    return read_drives(
-        recordings,
-        {name: of_joints(env, name) for name in ("stiffness", "damping", "effort_limit")},
-        delay_bounds=(low, high),
-        delay_mode=next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode,
-        control_dt=control_dt,
-        slides=sim2real.slide_joints,
-    )
+
+    def read(facts: Sequence[str]) -> MeasuredDrives:
+        return read_drives(
+            recordings,
+            {name: of_joints(env, name) for name in ("stiffness", "damping", "effort_limit")},
+            delay_bounds=(low, high),
+            delay_mode=next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode,
+            control_dt=control_dt,
+            unknown=facts,
+            slides=sim2real.slide_joints,
+        )
+
+    measured = read(unknown)
+    known = [fact for fact in unknown if len(measured.taken.get(fact, ())) == len(sim2real.joint_order)]
+    left = tuple(fact for fact in unknown if fact not in known)
+    return (read(known) if left and measured.laws else measured), left
 
 
 def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:

@@ -133,6 +133,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
         physics_dt=settings.physics_dt,
         drive_dt=settings.drive_dt,
         effects=settings.effects,
+        unknown=settings.unknown,
         env_cfg=env_cfg,
         columns=settings.columns,
         strict=settings.strict,

@@ -18,6 +18,7 @@ from pace_actuators.joint_units import JointType
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
+from pace_optim.problem.unknown_facts import identified_limits
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 
@@ -167,6 +168,7 @@ def make_result(
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
     trained = residuals.error[0].square()[train]
+    values = space.to_dict(physical)
     return FitResult(
         task=problem.task,
         robot_name=problem.env_cfg.sim2real.robot_name,
@@ -174,7 +176,7 @@ def make_result(
         delay_mode=problem.delay_mode,
         physics_dt=problem.physics_dt,
         control_dt=problem.control_dt,
-        parameters=space.to_dict(physical),
+        parameters=values,
         delay_s=float(physical[space["delay"]]) * problem.control_dt,
         std=std_by_parameter(space, uncertainty),
         units=space.units,
@@ -192,6 +194,6 @@ def make_result(
         notes=list(problem.env_cfg.sim2real.notes)
         + list(problem.measured.notes)
         + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
-        drive=drive_in_force(problem),
+        drive=drive_in_force(problem) | identified_limits(problem.unknown, values, facts.get("undetermined", ())),
         **facts,
     )

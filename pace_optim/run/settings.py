@@ -8,6 +8,7 @@ from typing import Any
 
 from pace_actuators.files import checked, read_json, refuse
 from pace_envs.task_source import EnvironmentRecord
+from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
 
 OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
@@ -30,6 +31,10 @@ class FitSettings:
     effects: list[str] = field(default_factory=list)
     """Physical effects identified beside the base parameters: ``name``, ``name@joints``, ``name@shared`` or
     ``name@joints@shared``."""
+
+    unknown: list[str] = field(default_factory=list)
+    """Facts of the drives that nobody knows (``stiffness``, ``damping``, ``effort_limit``, ``saturation_effort``,
+    ``velocity_limit``): read from the recordings' torques where they have them, else identified."""
 
     num_envs: int = 512
     """Simulations at once in a search; refining takes as many as it needs."""
@@ -93,6 +98,7 @@ class FitSettings:
         """
         if self.optimizer not in OPTIMIZERS:
             raise ValueError(f"Unknown optimizer {self.optimizer!r}. Available: {', '.join(OPTIMIZERS)}.")
+        check_unknown(self.unknown)
         for name, lowest in (("num_envs", 1), ("max_iteration", 1), ("seed", 0)):
             value = getattr(self, name)
             if value is not None and value < lowest:

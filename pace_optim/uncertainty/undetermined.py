@@ -16,6 +16,7 @@ from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
+from pace_optim.problem.unknown_facts import UNKNOWN_FACTS
 from pace_optim.uncertainty.other_solutions import AS_GOOD
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
@@ -25,6 +26,8 @@ HARDLY_KNOWN = 0.5
 
 def undetermined(problem: Problem, uncertainty: Uncertainty, far: bool = False) -> list[str]:
     """Labels of parameters without influence, and of those whose error bar is as wide as their bounds.
+
+    A fact that the user declares unknown is open too where others can make up for it: what is stated then holds.
 
     Args:
         problem: What was fitted.
@@ -36,7 +39,14 @@ def undetermined(problem: Problem, uncertainty: Uncertainty, far: bool = False) 
         return [label for label in problem.space.labels if label in silent]
     width = (problem.space.upper - problem.space.lower).numpy()
     wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * width
+    silent |= _of_unknown(problem) & {label for group in uncertainty.indistinguishable for label in group}
     return [label for label, yes in zip(problem.space.labels, wide, strict=True) if yes or label in silent]
+
+
+def _of_unknown(problem: Problem) -> set[str]:
+    """Labels of what stands for facts that are declared unknown."""
+    effects = {UNKNOWN_FACTS[fact] for fact in problem.unknown}
+    return {label for label in problem.space.labels if label.split(".")[0] in effects}
 
 
 def held_at_prior(
@@ -45,7 +55,7 @@ def held_at_prior(
     """A vector with what the recordings leave open at its prior, the rest fitted again beside it; and what that is.
 
     Several parameters that are open each may not be so together: where their prior costs more than another solution
-    may, only what has no influence is held.
+    may, only facts that are declared unknown are held, and where that costs too much, only what has no influence.
 
     Args:
         problem: What was fitted.
@@ -55,16 +65,26 @@ def held_at_prior(
         cfg: How the rest is fitted; ``None`` holds only what has no influence.
     """
     silent = [label for label in labels if label in uncertainty.no_influence]
-    if cfg is not None and len(silent) < len(labels):
-        physical = problem.space.to_physical(at_prior(problem, x, labels))
-        held = replace(problem, space=problem.space.holding(labels, physical))
-        evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
-        before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
-        start = held.space.to_normalised(physical)
-        best = least_squares(evaluator, colouring, [start], cfg)[0]
-        if best.score <= (1 + AS_GOOD) * before:
-            return problem.space.to_normalised(held.space.to_physical(best.x)), labels
+    unknown = _of_unknown(problem)
+    fewer = [label for label in labels if label in silent or label in unknown]
+    for chosen in dict.fromkeys((tuple(labels), tuple(fewer))):
+        if cfg is not None and len(silent) < len(chosen):
+            found = _fitted_beside(problem, x, list(chosen), cfg)
+            if found is not None:
+                return found, list(chosen)
     return at_prior(problem, x, silent), silent
+
+
+def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: LeastSquaresCfg) -> torch.Tensor | None:
+    """The vector with some entries at their prior and the rest fitted again; ``None`` where it is not as good."""
+    physical = problem.space.to_physical(at_prior(problem, x, labels))
+    held = replace(problem, space=problem.space.holding(labels, physical))
+    evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
+    before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
+    best = least_squares(evaluator, colouring, [held.space.to_normalised(physical)], cfg)[0]
+    if best.score > (1 + AS_GOOD) * before:
+        return None
+    return problem.space.to_normalised(held.space.to_physical(best.x))
 
 
 def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tensor:

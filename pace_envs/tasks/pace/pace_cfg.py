@@ -88,6 +88,10 @@ class PaceCfg:
     friction_ratio_bounds: tuple[float, float] = (0.0, 1.0)
     """Lower and upper bound of that ratio."""
 
+    effect_bounds: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
+    """Where an effect's parameters are sought, ``{"<effect>.<parameter>": {joint: (lower, start, upper)}}``, if not
+    where the effect's own declaration says."""
+
     extra_parameters: tuple[Any, ...] = ()
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 

@@ -55,8 +55,8 @@ class Parameter:
     scale: Literal["linear", "log"] = "linear"
     """How the optimizer's coordinate runs from the lower to the upper bound."""
 
-    start: float | None = None
-    """Where a search starts; ``None``: in the middle of the bounds, on the parameter's scale."""
+    start: float | tuple[float, ...] | None = None
+    """Where a search starts, one value or one per key; ``None``: in the middle of the bounds, on its scale."""
 
     units: tuple[str, ...] | None = None
     """Unit of each key, where they differ from ``unit``."""
@@ -141,17 +141,23 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             lower, upper = parameter.widest if effect.wide else (parameter.lower, parameter.upper)
             if kind is DynamicFriction:
                 lower, upper = cfg.friction_ratio_bounds
+            given = cfg.effect_bounds.get(f"{kind.name}.{parameter.name}", {})
+            start = min(max(parameter.start, lower), upper)
+            each = [given.get(joint, (lower, start, upper)) for joint in own]
+            if effect.shared and each:
+                lows, starts, highs = zip(*each, strict=True)
+                each = [(min(lows), sum(starts) / len(starts), max(highs))]
             result.append(
                 Parameter(
                     name=f"{kind.name}.{parameter.name}",
                     unit=parameter.unit,
-                    lower=(lower,) * len(keys),
-                    upper=(upper,) * len(keys),
+                    lower=tuple(low for low, _, _ in each),
+                    upper=tuple(high for _, _, high in each),
                     apply=partial(_apply_effect, effect=kind.name, parameter=parameter.name, joint_ids=ids),
                     keys=keys,
                     scale=parameter.scale,
                     units=_units(parameter.unit, own if effect.shared else keys, cfg)[: len(keys)],
-                    start=min(max(parameter.start, lower), upper),
+                    start=tuple(at for _, at, _ in each) if given else start,
                 )
             )
     return tuple(result)

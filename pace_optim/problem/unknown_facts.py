@@ -1,0 +1,132 @@
+"""Facts of the drives that a user declares unknown: which effects find them, and within which bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pace_actuators import match_names, resolve_joint_values
+from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.recording import Recording
+
+UNKNOWN_FACTS = {
+    "stiffness": "proportional_gain",
+    "damping": "derivative_gain",
+    "effort_limit": "torque_limit",
+    "saturation_effort": "torque_speed_limit",
+    "velocity_limit": "torque_speed_limit",
+}
+"""Fact (field of a drive's configuration) -> the effect whose parameter finds it: gains as factors of what is stated,
+limits themselves."""
+LIMITS = {
+    "effort_limit": "torque_limit.effort",
+    "saturation_effort": "torque_speed_limit.effort",
+    "velocity_limit": "torque_speed_limit.velocity",
+}
+"""Limit -> the parameter that is it."""
+_OF_THE_REACHED = 0.7
+"""Part of the torque that is asked where a search for a limit of it starts."""
+_FACTOR = 10.0
+"""How far from what is stated a limit is sought, both ways."""
+
+
+def check_unknown(facts: Iterable[str]) -> None:
+    """Refuse what cannot be unknown.
+
+    Raises:
+        ValueError: If a fact has no effect that finds it.
+    """
+    if wrong := [fact for fact in facts if fact not in UNKNOWN_FACTS]:
+        raise ValueError(f"--unknown {wrong[0]} is not understood. Available: {', '.join(UNKNOWN_FACTS)}.")
+
+
+def with_unknown(effects: Sequence[EffectCfg | str], facts: Iterable[str]) -> list[EffectCfg | str]:
+    """The effects with those that find unknown facts, if they are not among them."""
+    named = {cfg.effect_class.name for cfg in effect_cfgs(effects)}
+    wanted = dict.fromkeys(UNKNOWN_FACTS[fact] for fact in facts)
+    return [*effects, *(name for name in wanted if name not in named)]
+
+
+def lift_limits(
+    cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], facts: Iterable[str]
+) -> tuple[list[Recording], dict[str, dict[str, tuple[float, float, float]]]]:
+    """Let no stated limit act that is unknown: recordings without it, and where to seek what takes its place.
+
+    A search starts where the limit is reached: beyond, it would not be felt.
+
+    Args:
+        cfg: The environment; its drives lose these limits.
+        recordings: The recordings.
+        facts: What is unknown; gains among it are left alone.
+    """
+    facts = [fact for fact in facts if fact in LIMITS]
+    line = any(LIMITS[fact].startswith("torque_speed_limit") for fact in facts)
+    joints = list(cfg.sim2real.joint_order)
+    bounds: dict[str, dict[str, tuple[float, float, float]]] = {}
+    if not facts:
+        return list(recordings), bounds
+    asked, speed = _reached(cfg, recordings, joints)
+    for fact, label in LIMITS.items():
+        if fact not in facts and not (line and label.startswith("torque_speed_limit")):
+            continue
+        stated = _stated(cfg, recordings, fact, joints)
+        sought = _FACTOR if fact in facts else 1.0
+        reached = (speed if fact == "velocity_limit" else asked).tolist()
+        bounds[label] = {
+            joint: (v / sought, min(max(at, v / sought), v * sought), v * sought)
+            for joint, v, at in zip(joints, stated.tolist(), reached, strict=True)
+            if math.isfinite(v)
+        }
+        for drive in cfg.scene.robot.actuators.values():
+            setattr(drive, fact, None)
+        infinite = np.full(len(joints), np.inf)
+        recordings = [replace(r, drive=replace(r.drive, **{fact: infinite})) for r in recordings]
+    return list(recordings), bounds
+
+
+def identified_limits(
+    facts: Iterable[str], parameters: Mapping[str, Mapping[str, float]], undetermined: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """Limits that were unknown, as a drive has them now: by fact and joint, where the recordings determine them."""
+    facts, left_open = list(facts), set(undetermined)
+    line = any(fact in facts for fact in ("saturation_effort", "velocity_limit"))
+    found = {}
+    for fact, label in LIMITS.items():
+        if fact in facts or (line and label.startswith("torque_speed_limit")):
+            values = {j: v for j, v in parameters.get(label, {}).items() if f"{label}/{j}" not in left_open}
+            found[fact] = values
+    return found
+
+
+def _reached(
+    cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], joints: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """A torque that the drives were asked for [N m], not the largest, and beyond their largest speed [rad/s], (n,)."""
+    torques, speeds = [], []
+    for recording in recordings:
+        kp, kd = (_stated(cfg, [recording], name, joints) for name in ("stiffness", "damping"))
+        speed = np.gradient(recording.dof_pos, recording.time, axis=0)
+        wanted = 0.0 if recording.command_vel is None else recording.command_vel[:: recording.sample_stride]
+        error = recording.sampled_command - recording.dof_pos
+        added = 0.0 if recording.command_effort is None else recording.command_effort[:: recording.sample_stride]
+        torque = np.abs(
+            np.where(np.isfinite(kp), kp, 0.0) * error + np.where(np.isfinite(kd), kd, 0.0) * (wanted - speed) + added
+        )
+        torques.append(np.quantile(torque, 0.98, axis=0))
+        speeds.append(np.quantile(np.abs(speed), 0.99, axis=0))
+    return _OF_THE_REACHED * np.max(torques, axis=0), np.max(speeds, axis=0) / _OF_THE_REACHED
+
+
+def _stated(cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], fact: str, joints: Sequence[str]) -> np.ndarray:
+    """A limit as recordings state it, else the configuration, (n,); infinite where nobody does."""
+    result = np.full(len(joints), np.inf)
+    for drive in cfg.scene.robot.actuators.values():
+        own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]
+        if (value := getattr(drive, fact)) is not None:
+            result[[joints.index(j) for j in own]] = resolve_joint_values(value, own, field=fact).numpy()
+    values = [v for recording in recordings if (v := getattr(recording.drive, fact)) is not None]
+    return np.max(values, axis=0) if values else result

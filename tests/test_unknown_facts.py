@@ -1,0 +1,122 @@
+"""Facts of the drives that a user declares unknown."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bench_recordings import Bench, chirp, record
+
+from pace_actuators import PaceDCMotorCfg
+from pace_optim.fit import fit
+from pace_optim.problem.problem import load_problem
+from pace_optim.run.open import open_problem
+from pace_optim.run.settings import FitSettings
+
+BENCH = "Pace-TestBench-v0"
+
+
+@pytest.fixture(scope="module")
+def soft(tmp_path_factory):
+    """Two recordings of a drive whose gains are twice what is stated."""
+    folder = tmp_path_factory.mktemp("soft")
+    return [
+        record(folder / f"{kp}.csv", Bench(kp=kp, kd=kd, stated={"stiffness": kp / 2, "damping": kd / 2}),
+               position=chirp(1.0), seed=kp) for kp, kd in ((40, 1.2), (70, 2.4))
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(soft, tmp_path_factory):
+    """A fit to them that is not told the gains."""
+    settings = FitSettings(
+        task=BENCH, data=[str(path) for path in soft], unknown=["stiffness", "damping"], optimizer="least_squares",
+        check_consistency=False, log_dir=str(tmp_path_factory.mktemp("logs")),
+    )  # fmt: skip
+    return fit(settings)
+
+
+def test_unknown_gains_are_identified_as_factors_of_what_is_stated(run):
+    result, _ = run
+    assert result.effects == ["proportional_gain", "derivative_gain"]
+    assert result.parameters["proportional_gain.gain"]["servo"] == pytest.approx(2.0, rel=0.02)
+    assert result.parameters["derivative_gain.gain"]["servo"] == pytest.approx(2.0, rel=0.1)
+
+
+def test_a_run_knows_what_was_unknown_and_a_drive_has_what_was_found(run):
+    result, folder = run
+    problem = open_problem(folder)
+    assert problem.unknown == ("stiffness", "damping") and problem.effects == result.effects
+    drive = PaceDCMotorCfg.from_result(folder, stiffness=20.0, damping=0.6)
+    assert {cfg.effect_class.name for cfg in drive.effects} == {"proportional_gain", "derivative_gain"}
+
+
+def test_a_stiffness_that_the_recordings_do_not_determine_is_listed(tmp_path):
+    weightless = Bench(load_mass=1e-6, stated={"stiffness": 40.0, "damping": 1.0})
+    path = record(tmp_path / "free.csv", weightless, position=chirp(1.0))
+    settings = FitSettings(
+        task=BENCH, data=[str(path)], unknown=["stiffness"], optimizer="least_squares", check_consistency=False,
+        log_dir=str(tmp_path),
+    )  # fmt: skip
+    result, _ = fit(settings)
+    assert "proportional_gain.gain/servo" in result.undetermined
+    assert result.parameters["proportional_gain.gain"]["servo"] == 1.0
+
+
+def test_an_unknown_limit_is_sought_about_the_stated_one_which_no_longer_acts(tmp_path):
+    stated = {"effort_limit": 6.0, "saturation_effort": 12.0, "velocity_limit": 8.0}
+    path = record(tmp_path / "weak.csv", Bench(stated=stated), position=chirp(1.0))
+    problem = load_problem(BENCH, data=[path], unknown=["effort_limit", "saturation_effort"])
+    space = problem.space
+    for label, low, high in (
+        ("torque_limit.effort", 0.6, 60), ("torque_speed_limit.effort", 1.2, 120), ("torque_speed_limit.velocity", 8, 8)
+    ):  # fmt: skip
+        assert (float(space.lower[space[label]]), float(space.upper[space[label]])) == pytest.approx((low, high))
+    env = problem.make_env(1)
+    problem.training_evaluator().residuals(space.to_physical(space.start)[None])
+    (drive,) = env.scene["robot"].actuators.values()
+    assert drive.effort_limit.isinf().all()
+    env.close()
+
+
+def test_a_limit_that_was_found_is_that_of_the_drive(tmp_path):
+    path = record(tmp_path / "weak.csv", Bench(current_limit=8.0, stated={"effort_limit": 20.0}), position=chirp(1.2))
+    settings = FitSettings(
+        task=BENCH, data=[str(path)], unknown=["effort_limit"], optimizer="least_squares",
+        check_consistency=False, log_dir=str(tmp_path),
+    )  # fmt: skip
+    result, folder = fit(settings)
+    assert result.drive["effort_limit"]["servo"] == result.parameters["torque_limit.effort"]["servo"]
+    assert result.drive["effort_limit"]["servo"] == pytest.approx(8.0, rel=0.02)
+    assert PaceDCMotorCfg.from_result(folder).effort_limit == result.drive["effort_limit"]["servo"]
+
+
+def test_what_the_torque_says_is_no_longer_unknown(tmp_path, soft):
+    path = tmp_path / "log.csv"
+    rows = np.genfromtxt(soft[0], delimiter=",", names=True)
+    time, q, target = (rows[name] for name in rows.dtype.names)
+    torque = 40.0 * (np.roll(target, 2) - q) - 1.2 * np.gradient(q, time)
+    header = "time,dof_pos/servo,des_dof_pos/servo,dof_effort/servo"
+    np.savetxt(path, np.column_stack([time, q, target, torque]), "%.7f", ",", header=header, comments="")
+    path.with_suffix(".json").write_text(soft[0].with_suffix(".json").read_text())
+    problem = load_problem(BENCH, data=[path], unknown=["stiffness"])
+    assert problem.unknown == () and problem.effects == []
+    assert problem.dataset.recordings[0].drive.stiffness[0] == pytest.approx(40.0, rel=0.02)
+    both = load_problem(BENCH, data=[path, soft[1]], unknown=["stiffness"])  # one has no torque
+    assert both.unknown == ("stiffness",) and both.effects == ["proportional_gain"]
+    assert (
+        both.dataset.recordings[0].drive.stiffness[0]
+        == json.loads(soft[0].with_suffix(".json").read_text())["stiffness"]
+    )
+
+
+def test_an_effect_that_is_named_too_is_there_once(soft):
+    problem = load_problem(BENCH, data=soft[:1], unknown=["stiffness"], effects=["proportional_gain", "torque_offset"])
+    assert problem.effects == ["proportional_gain", "torque_offset"]
+
+
+def test_a_fact_that_cannot_be_unknown_is_refused():
+    with pytest.raises(ValueError, match=r"--unknown kp is not understood\. Available: stiffness, damping"):
+        FitSettings(task=BENCH, unknown=["kp"])
+    with pytest.raises(ValueError, match="--unknown"):
+        replace(FitSettings(task=BENCH), unknown=["mass"])
