@@ -526,6 +526,9 @@ class PaceDCMotor:
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
         self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
+        if self.effects is not None:
+            given = self.effects.state.enabled
+            given.copy_(torch.ones_like(given) if self.torque_enable is None else self.torque_enable.expand_as(given))
 
     def _make_effects(self, physics_dt: float | None) -> EffectStack | None:
         cfgs = [cfg for cfg in effect_cfgs(self.cfg.effects) if _applies(cfg, self._joint_names)]

@@ -30,6 +30,8 @@ class Bench:
     load_length: float = 0.2
     noise: float = 1e-4
     drive_dt: float = CONTROL_DT
+    off_viscous: float | None = None
+    """Viscous friction while the drive is switched off; ``None``: the same."""
     stated: dict[str, float] = field(default_factory=dict)
 
 
@@ -39,7 +41,7 @@ def chirp(seconds: float, amplitude: float = 0.5, top: float = 6.0) -> np.ndarra
     return 0.3 + amplitude * np.sin(2 * np.pi * (0.2 * t + 0.5 * (top - 0.2) / seconds * t**2))
 
 
-def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, *, seed: int = 0) -> Path:
+def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, *, enabled=None, seed: int = 0) -> Path:
     """Write a CSV of the drive that follows commands (T,) [rad], [rad/s], [N m], and the JSON of what is stated."""
     given = {"des_dof_pos": position, "des_dof_vel": velocity, "des_dof_effort": effort}
     commands = {name: values for name, values in given.items() if values is not None}
@@ -66,13 +68,18 @@ def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, 
             if part == 0:
                 asked_of[k] = asked
             limited = min(max(asked, -bench.current_limit), bench.current_limit)
-            free = bench.motor_gain * limited - weight * math.sin(q) - bench.viscous * v
+            viscous = bench.viscous
+            if enabled is not None and not enabled[k]:
+                limited, viscous = 0.0, viscous if bench.off_viscous is None else bench.off_viscous
+            free = bench.motor_gain * limited - weight * math.sin(q) - viscous * v
             moved = v + STEP * free / inertia
             stop = STEP * bench.coulomb / inertia
             v = moved - min(max(moved, -stop), stop)  # friction stops what it can
             q += STEP * v
     columns = {"time": np.arange(count) * CONTROL_DT, "dof_pos/servo": seen}
     columns |= {f"{name}/servo": np.asarray(values, dtype=float) for name, values in commands.items()}
+    if enabled is not None:
+        columns["torque_enable"] = np.asarray(enabled, dtype=float)
     rows = np.column_stack(list(columns.values()))
     np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.7f")
     facts = {

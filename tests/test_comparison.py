@@ -48,6 +48,7 @@ def track(error, position=CHIRP, *, noise=1e-4, name="chirp", group=0, load=None
         train=np.full(len(position), train),
         load=None if load is None else load[:, None],
         group=group,
+        enabled=np.ones(len(position), dtype=bool),
     )
 
 

@@ -124,6 +124,34 @@ class TorqueLimit(Effect):
 
 
 @register_effect
+class OffDamping(Effect):
+    """A drive that is switched off brakes otherwise than one that is on: viscous friction d + c in place of d.
+
+    Its windings are open (what back-EMF brakes while the drive is on is missing then, c < 0) or shorted (they brake by
+    kt²/R).
+    """
+
+    name = "off_damping"
+    stage = "drive"
+    parameters = (
+        EffectParameter(
+            name="damping", unit="N m s/rad", lower=-5.0, upper=20.0, null=0.0, start=0.1, meaning="more while off"
+        ),
+    )
+    equation = "d + c in place of d while the drive is switched off"
+    looks = "the error sits where the drive is off: the joint falls or swings too fast or too slowly there"
+    source = "open or shorted windings of a DC motor; torque_enable of servo firmware"
+    probes = ({"damping": 0.1}, {"damping": 1.0})
+    acts_while_off = True
+    separates = "a recording with the drive switched off while the joint moves"
+    damping: torch.Tensor
+
+    def friction(self, s: DriveState) -> None:
+        """Add it while the drive is off."""
+        s.viscous_friction += (1.0 - s.enabled) * self.damping
+
+
+@register_effect
 class TorqueSpeedLimit(Effect):
     """The torque falls with the speed where the motor drives; braking is not limited.
 

@@ -39,6 +39,7 @@ class DriveState:
         spare_inertia: What may be taken from the joint's inertia beyond the armature [kg m²].
         base_friction, base_viscous_friction, base_armature: The identified base parameters.
         time: Since the session began [s].
+        enabled: 1 where the drive gives torque, 0 where it is switched off.
     """
 
     joint_pos_target: torch.Tensor
@@ -66,6 +67,7 @@ class DriveState:
     base_viscous_friction: torch.Tensor
     base_armature: torch.Tensor
     time: torch.Tensor
+    enabled: torch.Tensor
 
     __slots__ = tuple(f"_{name}" for name in __annotations__)
 

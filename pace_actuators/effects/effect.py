@@ -129,6 +129,8 @@ class Effect:
     """A more general effect that can be it: a diagnosis looks for that one."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
+    acts_while_off: ClassVar[bool] = False
+    """Whether it acts only while the drive is switched off: it is tried only where a recording has that."""
     absorbed_by: ClassVar[str] = ""
     """Base parameter that may take it up wholly, so that recordings of positions do not show it."""
     scales: ClassVar[str] = ""

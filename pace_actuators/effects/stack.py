@@ -62,6 +62,7 @@ class EffectStack:
         """
         self._is_trapezoidal = False
         self.state = DriveState.zeros(num_envs, len(joint_names), device, dtype)
+        self.state.enabled.fill_(1.0)
         self._joint_names = list(joint_names)
         self._num_envs = num_envs
         self.dt = dt

@@ -40,13 +40,19 @@ class Dimension:
         return len(self.edges) - 1
 
 
-def dimensions_of(motions: Sequence[Motion], times: Sequence[np.ndarray], loads: Sequence[np.ndarray] | None) -> list:
+def dimensions_of(
+    motions: Sequence[Motion],
+    times: Sequence[np.ndarray],
+    loads: Sequence[np.ndarray] | None,
+    enabled: Sequence[np.ndarray] | None = None,
+) -> list:
     """Every dimension of one joint over all its recordings, whose samples follow each other.
 
     Args:
         motions: Of each recording.
         times: Of each recording, (K_r,) [s].
         loads: Load torque in each recording, (K_r,) [N m], if known.
+        enabled: Whether the drive gave torque in each recording, (K_r,) bool; ``None``: always.
     """
     speed = np.concatenate([motion.speed for motion in motions])
     acceleration = np.concatenate([motion.acceleration for motion in motions])
@@ -67,6 +73,9 @@ def dimensions_of(motions: Sequence[Motion], times: Sequence[np.ndarray], loads:
     ]
     if loads is not None:
         result += _sized("load", "load torque", "N m", np.concatenate(loads))
+    if enabled is not None:
+        on = np.concatenate(enabled).astype(float)
+        result.append(_cut("drive", "drive off, on", "", on, (-np.inf, 0.5, np.inf)))
     if len(motions) > 1:
         which = np.concatenate([np.full(len(t), r) for r, t in enumerate(times)])
         edges = tuple(np.arange(len(times) + 1) - 0.5)

@@ -47,7 +47,12 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track]) -> JointCompariso
     floors = noise_floors(j, tracks)
     motions = [motion_of(t.measured[:, j], t.dt, f.sigma) for t, f in zip(tracks, floors, strict=True)]
     loads = [t.load[:, j] for t in tracks if t.load is not None]
-    dimensions = dimensions_of(motions, [t.time for t in tracks], loads if len(loads) == len(tracks) else None)
+    dimensions = dimensions_of(
+        motions,
+        [t.time for t in tracks],
+        loads if len(loads) == len(tracks) else None,
+        [t.enabled for t in tracks],
+    )
     error = np.concatenate([t.error[:, j] for t in tracks])
     sigma = np.concatenate([np.full(len(t.time), f.sigma) for t, f in zip(tracks, floors, strict=True)])
     layouts = [lay_out(error, sigma, d.bin, d.num_bins) for d in dimensions]

@@ -42,6 +42,8 @@ class Track:
     """Whether a sample was trained on, (K,) bool."""
     load: np.ndarray | None
     """Load torque, (K, n) [N m], if it could be computed."""
+    enabled: np.ndarray
+    """Whether the drive gives torque, (K,) bool."""
     group: int
     """Recordings of one group repeat each other: same commands, drive and load."""
 
@@ -130,6 +132,7 @@ def load_tracks(
             error=np.asarray(entry["sim_dof_pos"]) - np.asarray(entry["dof_pos"]),
             train=trained[r] if trained and len(trained[r]) == len(entry["time"]) else _train(entry, bool(data)),
             load=None if loads is None else loads[r],
+            enabled=_enabled(entry),
             group=groups[r],
         )
         for r, entry in enumerate(content["recordings"])
@@ -166,6 +169,13 @@ def _are_those(recordings: Sequence[Recording], content: dict[str, Any]) -> bool
 def _train(entry: dict[str, Any], others: bool) -> np.ndarray:
     train = np.asarray(entry["train"]).astype(bool)
     return np.zeros_like(train) if others else train
+
+
+def _enabled(entry: dict[str, Any]) -> np.ndarray:
+    """When the drive gave torque; runs of earlier versions do not say it."""
+    if "torque_enable" in entry:
+        return np.asarray(entry["torque_enable"]).astype(bool)
+    return np.ones(len(entry["time"]), dtype=bool)
 
 
 def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:

@@ -33,6 +33,8 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
         return f"in the recording {recordings[region.first]}"
     if dimension.name == "direction":
         return "on the way up (q grows)" if region.first else "on the way down (q falls)"
+    if dimension.name == "drive":
+        return "while the drive is on" if region.first else "while the drive is off"
     if dimension.name == "since_reversal":
         return _after_reversal(low, high)
     if dimension.name == "time":

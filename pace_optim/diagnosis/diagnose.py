@@ -69,10 +69,12 @@ def diagnose(
     folder = run.folder
     check_folder(folder, anew=FILE)
     result = FitResult.load(folder)
-    candidates = candidate_effects(settings.effects, only=settings.only)
+    candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
     problem = run.problem(physics_dt=physics_dt, effects=())
     base = {name: result.parameters[name] for name in problem.space.slices}
+    off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)
+    candidates = candidate_effects(settings.effects, only=settings.only, switched_off=off)
     decisions: list[Decision] = []
     found = search_effects(
         problem,
@@ -183,8 +185,15 @@ def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, pr
     return path
 
 
-def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[type[Effect]]:
+def candidate_effects(
+    extra: Sequence[str] = (), *, only: bool = False, switched_off: bool = True
+) -> list[type[Effect]]:
     """What is tried: all registered effects but curves of any form and special cases, and the user's; or only those.
+
+    Args:
+        extra: The user's.
+        only: Whether only those are tried.
+        switched_off: Whether a recording has its drives switched off, so that effects of that show.
 
     Raises:
         ValueError: If the user names a curve.
@@ -197,6 +206,7 @@ def candidate_effects(extra: Sequence[str] = (), *, only: bool = False) -> list[
             f"told to. Leave it out, or fit it: scripts/fit.py --effects {curves[0]}."
         )
     every = [] if only else [get_effect(name) for name in available_effects()]
+    every = [effect for effect in every if switched_off or not effect.acts_while_off]
     return list(dict.fromkeys([*(e for e in every if not e.free_form and not e.special_case_of), *own]))
 
 

@@ -80,6 +80,8 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
     for r, recording in enumerate(data.recordings):
         at = residuals.where[:, r]
         measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
+        enabled = recording.torque_enable
+        on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
         result.append(
             {
                 "name": recording.name,
@@ -88,6 +90,7 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
                 "dof_pos": measured,
                 "sim_dof_pos": measured + residuals.error[0, at, r],
                 "train": data.train[residuals.step][at, r],
+                "torque_enable": on[: len(measured)],
             }
         )
     return {"joint_names": list(problem.joint_names), "recordings": result}
