@@ -35,6 +35,12 @@ def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
     return spec
 
 
+_RESOLVED = 1.0
+"""Furthest that a joint with effects moves in a step [rad, m]. A torque within an effect's bounds may be more than a
+small drive can hold; beyond this no motion is resolved, and forces that grow with the square of speeds bring in energy
+without limit."""
+
+
 class Articulation:
     """A robot, batched over environments; every joint index is an index into ``joint_names``."""
 
@@ -285,8 +291,19 @@ class Articulation:
                 self._write_what_drags(actuator, place)
 
     def update(self) -> None:
-        """Read the state after a physics step."""
+        """Read the state after a physics step; joints that effects have thrown are slowed to what a step resolves."""
+        for actuator in self.actuators.values():
+            if actuator.effects is not None and actuator.effects.effects:
+                self._slow_down(self._place_of(actuator), _RESOLVED / self._sim.cfg.dt)
         self._refresh()
+
+    def _slow_down(self, place: torch.Tensor | slice, fastest: float) -> None:
+        """Limit speeds, in the simulator itself."""
+        speeds = self._sim.qvel
+        if isinstance(place, slice):
+            speeds[:, place].clamp_(-fastest, fastest)
+        else:
+            speeds[:, place] = speeds[:, place].clamp(-fastest, fastest)
 
     @property
     def closed_loops(self) -> ClosedLoops | None:

@@ -16,6 +16,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
+from pace_envs.mujoco_warnings import keep_quiet
 
 EnvIds = Sequence[int] | torch.Tensor | np.ndarray | slice | None
 
@@ -309,8 +310,7 @@ class Simulation:
             f"num_envs = {self.num_envs}: that many simulations of this model",
             "Take fewer environments.",
         )
-        if mujoco.get_mju_user_warning() is None:
-            mujoco.set_mju_user_warning(_ignore_warning)
+        keep_quiet()
         threads = self.cfg.num_threads or available_processors()
         self.batch = batch.Batch(self.model, self.num_envs, nthread=threads)
 
@@ -342,7 +342,3 @@ class Simulation:
 def bytes_per_env(model: mujoco.MjModel) -> int:
     """Memory that one more environment takes, with its drive and terms [bytes]; measured on the robots here."""
     return 4000 + 400 * model.nv
-
-
-def _ignore_warning(message: str) -> None:
-    """Keep MuJoCo from printing, and logging to a file, each diverged simulation: their states say it."""

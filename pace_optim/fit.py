@@ -160,14 +160,18 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
 
 
+def search_population(problem: Problem, settings: FitSettings) -> int:
+    """Candidates in a generation; a hybrid takes all of ``num_envs`` on a GPU alone."""
+    population = max(4, settings.num_envs // len(problem.dataset.trained()))
+    is_small = settings.optimizer == "hybrid" and settings.device == "cpu"
+    return min(population, _HYBRID_POPULATION) if is_small else population
+
+
 def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
     """The search of a fit."""
-    population = max(4, settings.num_envs // len(problem.dataset.trained()))
-    if settings.optimizer == "hybrid" and settings.device == "cpu":
-        population = min(population, _HYBRID_POPULATION)
     return CMAESOptimizer(
         problem.space,
-        population,
+        search_population(problem, settings),
         problem.env_cfg.sim2real.cmaes,
         trees=problem.trees,
         seed=settings.seed,
@@ -208,8 +212,9 @@ def _load(settings: FitSettings, env_cfg: Any) -> Problem:
     try_out(problem)
     if settings.device != "cpu":
         problem.for_search(settings.device).make_env(1).close()
-    if settings.optimizer == "cmaes":  # the others choose how much they simulate at once
-        check_size(problem, settings.num_envs)
+    if settings.optimizer != "least_squares":  # which chooses how much it simulates at once
+        simulated = search_population(problem, settings) * len(problem.dataset.trained())
+        check_size(problem, simulated, settings.num_envs)
     return problem
 
 

@@ -114,6 +114,10 @@ SLOW = ("diagnose", "train", "play", "replay")
 """Scripts, and commands, that are left out where time is short."""
 
 
+STATE = "state"
+"""Folder beside the files for what is kept of the user: the code that the world's own commands named."""
+
+
 def build(folder: Path, *, quick: bool = False) -> Path:
     """Make the files in a folder, through the command lines; a fit, a diagnosis and a training are as small as can be.
 

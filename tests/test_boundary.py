@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command_lines import run_script
@@ -15,7 +16,9 @@ from pace_actuators import memory
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.files import remove_leftovers, write_together
 from pace_actuators.memory import available_memory, check_memory
+from pace_optim.fit import search_population
 from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.cli import run_cli
 from pace_optim.terminal.screen import one_line, readable, safe_streams
 
@@ -124,6 +127,16 @@ def test_memory_is_looked_at_before_it_is_asked_for(tmp_path, monkeypatch):
     done = run_script("fit", *many, cwd=tmp_path)
     assert done.returncode == 2 and "--num_envs 1000000000 would take" in done.stderr, done.stderr
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "device", "expected"),
+    [("cmaes", "cpu", 5 * 10**8), ("hybrid", "cuda:0", 5 * 10**8), ("hybrid", "cpu", 48)],
+)
+def test_memory_is_asked_for_by_what_a_search_simulates(optimizer, device, expected):
+    settings = FitSettings(task=BENCH, optimizer=optimizer, device=device, num_envs=10**9)
+    problem = SimpleNamespace(dataset=SimpleNamespace(trained=lambda: ["a", "b"]))
+    assert search_population(problem, settings) == expected
 
 
 def test_the_limit_of_a_container_counts(tmp_path):

@@ -272,3 +272,8 @@ def test_the_command_lines_train_and_play(tmp_path):
         *("--command", "0.5", "0", "0", "--export", "out"),
     )
     assert lines[0].startswith("velocity error") and (tmp_path / "out" / "policy.onnx").is_file()
+
+
+def test_a_training_without_a_checkpoint_is_told_which_file_is_expected(tmp_path):
+    with pytest.raises(ValueError, match=r"holds no checkpoint: expected model_0\.pt"):
+        latest_checkpoint(tmp_path)

@@ -5,11 +5,13 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.mujoco_warnings import collected
 from pace_envs.robots import apply_test_bench_load
 from pace_envs.simulation import available_processors
 
@@ -337,3 +339,17 @@ def test_threads_are_those_that_the_process_may_use(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 5)
     assert available_processors() == 5
+
+
+def test_mujocos_warnings_leave_no_file_in_the_users_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mujoco.set_mju_user_warning(None)
+    with collected():  # as a report does, with a run's model
+        pass
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.nan
+    mujoco.mj_step(model, data)
+    assert data.warning.number.any() and list(tmp_path.iterdir()) == []

@@ -19,7 +19,8 @@ controller, drive, friction, transmission; `model` changes the rigid body, `reco
 the drive the torque that is asked is limited first (`effort_limit`, `torque_limit`), then the current follows
 (`drive_bandwidth`), then torque comes of it (`torque_gain`, `torque_ripple`), and the supply limits what is left
 (`torque_speed_limit`, the torque-speed line). Of `joint_elasticity` and `backlash`, give a joint one: a backlash has an
-elasticity of its own. Friction then acts on the motor, other torques on the link.
+elasticity of its own, and a joint with both has one gap with the two springs in series behind it. Friction then acts
+on the motor, other torques on the link.
 
 The last six, `torque_over_…` and `friction_over_…`, are curves of any form: straight from knot to knot, at `center +
 reach · knot`, and constant beyond the last. They say what is missing and not why: `scripts/diagnose.py` does not look

@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.effect_cfg import EffectCfg
+from pace_actuators.effects.two_mass import join_couplings
 from pace_actuators.joint_values import resolve_joint_values
 
 _IN_DRIVE = ("current_limit", "current_loop", "drive", "torque_speed")
@@ -162,6 +163,7 @@ class EffectStack:
         s.base_armature, s.base_friction, s.base_viscous_friction = armature, friction, viscous_friction
         for effect in self.effects:
             effect.prepare()
+        join_couplings(self.effects, self._num_envs)
         s.armature, s.friction, s.viscous_friction = armature, friction, viscous_friction
         self.run("armature")
 

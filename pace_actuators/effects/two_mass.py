@@ -13,11 +13,19 @@ The motor's equation gives θ̇₊ as a function of v₊, so that f = f₀ - D v
 viscous friction, which the simulator integrates implicitly. No stiffness is too large for the step, whatever the
 link's inertia; for k -> ∞, D -> J/h, which is the rigid drive's armature.
 
+A joint that has both has one coupling, the gap with both springs in series behind it and no mass between them:
+
+    1/k = 1/k_b + 1/k_e        c = k² (c_b/k_b² + c_e/k_e²)
+
+(what the two dissipate while both carry the torque), and the encoder is where the backlash has it. Two couplings of
+which each took the other's torque for that of the motor would bring energy in.
+
 Source: Newmark 1959; Spong 1987 for the flexible joint.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -28,6 +36,11 @@ from pace_actuators.effects.registry import register_effect
 
 _SMALLEST_ARMATURE = 1e-6
 """A motor without inertia would have no state [kg m²]."""
+
+_RESOLVED = 0.1
+"""Furthest that motor and link move against each other in a step [rad, m]. A link without inertia rings on from step to
+step in this scheme, and a gap or a torque that no drive could hold makes it ring louder: beyond this, k h (θ̇₊ - v₊) is
+added, which ends it."""
 
 _SIDE = EffectParameter(
     name="encoder_side",
@@ -52,6 +65,8 @@ class _TwoMass(Effect):
     numerical_damping: ClassVar[float] = 0.05
     """Part of k h below which c does not fall (half of what it says is added there, so that a fit feels it): what is
     too fast for the step dies out, a resonance inside the band does not."""
+    stiffness: torch.Tensor
+    damping: torch.Tensor
     encoder_side: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
@@ -69,12 +84,29 @@ class _TwoMass(Effect):
     def prepare(self) -> None:
         """Where it acts."""
         self._on = self.switched_on()
-        self._any, self._all = bool(self._on.any()), bool(self._on.all())
-        self._side = torch.where(self._on, self.encoder_side, 0.0)
+        self._softness, self._loss = self.zeros(), self.zeros()
+        self._take_sides()
         if not hasattr(self, "_angle"):
             zeros = self.zeros
             self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
             self._drive, self._coupling, self._inertia, self._direction = zeros(), zeros(), zeros() + 1, zeros()
+
+    def _take_sides(self) -> None:
+        self._any, self._all = bool(self._on.any()), bool(self._on.all())
+        self._side = torch.where(self._on, self.encoder_side, 0.0)
+
+    def lead(self, other: _TwoMass, num_envs: int) -> None:
+        """Take another coupling in, on the joints that have both: it acts no more there, and is a spring in series."""
+        n = self._on.shape[1]
+        own, given = self._on.new_zeros((num_envs, n)), self._on.new_zeros((num_envs, n))
+        own[self.rows], given[other.rows] = self._on, other._on
+        both = own & given
+        for name, value in (("_softness", 1 / other.stiffness), ("_loss", other.damping / other.stiffness**2)):
+            whole = value.new_zeros((num_envs, n))
+            whole[other.rows] = value
+            setattr(self, name, torch.where(both, whole, 0.0)[self.rows])
+        other._on = other._on & ~both[other.rows]
+        other._take_sides()
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """Deflection that holds the load."""
@@ -128,6 +160,7 @@ class _TwoMass(Effect):
         coupling = 0.25 * h * k + 0.5 * c
         ahead = (0.25 if self.is_trapezoidal else -0.25) * h * k
         explicit = torque + (0.5 * c + ahead) * relative
+        coupling = coupling + (h * k) * (h * relative.abs() > _RESOLVED)
         momentum = s.base_armature.clamp(min=_SMALLEST_ARMATURE) / h
         drag = 0.5 * s.viscous_friction
         inertia = momentum + drag + s.implicit_damping
@@ -228,14 +261,32 @@ class Backlash(_TwoMass):
     def spring(self, deflection: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Nothing inside the gap."""
         beyond = (deflection.abs() - 0.5 * self.gap).clamp(min=0.0)
-        k = self.stiffness * (beyond > 0)
+        k = self._stiffness() * (beyond > 0)
         return k * torch.sign(deflection) * beyond, k
 
     def damping_of(self, stiffness: torch.Tensor, s: DriveState) -> torch.Tensor:
         """Only in contact."""
-        return self.damping * (stiffness > 0)
+        return (self.damping / self.stiffness**2 + self._loss) * stiffness**2
 
     def rest_deflection(self, s: DriveState) -> torch.Tensor:
         """-τ_g / k beyond the gap, on the side that the load presses on."""
         side = -torch.sign(s.load_effort)
-        return side * 0.5 * self.gap - s.load_effort / self.stiffness
+        return side * 0.5 * self.gap - s.load_effort / self._stiffness()
+
+    def _stiffness(self) -> torch.Tensor:
+        """In contact, with a spring in series where there is one."""
+        return self.stiffness / (1 + self.stiffness * self._softness)
+
+
+def join_couplings(effects: Sequence[Effect], num_envs: int) -> None:
+    """Make one coupling of two on a joint: the gap leads.
+
+    Args:
+        effects: Of one drive, prepared.
+        num_envs: Number of environments.
+    """
+    couplings = [effect for effect in effects if isinstance(effect, _TwoMass)]
+    for leading in (effect for effect in couplings if isinstance(effect, Backlash)):
+        for other in couplings:
+            if not isinstance(other, Backlash):
+                leading.lead(other, num_envs)

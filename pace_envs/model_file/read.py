@@ -9,6 +9,7 @@ import mujoco
 
 from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
 from pace_envs.model_file.urdf import UrdfFacts, read_urdf
+from pace_envs.mujoco_warnings import keep_quiet
 
 MODEL_SUFFIXES = (".xml", ".urdf", ".mjcf")
 
@@ -54,6 +55,7 @@ def read_model_file(path: str | Path) -> ModelFile:
         raise ValueError(f"The model file {path} does not exist. Correct its path.")
     text = path.read_bytes().decode("utf-8", errors="replace")
     facts = read_urdf(text, path) if "<robot" in text and "<mujoco model" not in text[: text.find("<robot")] else None
+    keep_quiet()
     try:
         spec = mujoco.MjSpec.from_file(str(path)) if facts is None else mujoco.MjSpec.from_string(facts.xml)
     except ValueError as error:

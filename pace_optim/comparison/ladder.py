@@ -33,7 +33,8 @@ def check_alike(runs: Sequence[RunTracks]) -> None:
             differences = _recording_differences(first.tracks, other.tracks)
         if differences:
             raise ValueError(
-                f"{first.folder} and {other.folder} cannot stand side by side; they differ in {'; '.join(differences)}."
+                f"{first.folder} and {other.folder} cannot stand side by side; their result.json differ in "
+                f"{'; '.join(differences)}."
                 " Fit both to the same recordings, or simulate both on the same files with --data."
             )
 

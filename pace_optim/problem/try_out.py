@@ -28,8 +28,13 @@ def try_out(problem: Problem) -> None:
     )
 
 
-def check_size(problem: Problem, num_envs: int) -> None:
+def check_size(problem: Problem, simulated: int, num_envs: int) -> None:
     """Refuse a search for which there is no memory, before the run has a folder.
+
+    Args:
+        problem: What is fitted.
+        simulated: How many simulations the search makes at once.
+        num_envs: How many were asked for.
 
     Raises:
         ValueError: If there is too little.
@@ -37,7 +42,7 @@ def check_size(problem: Problem, num_envs: int) -> None:
     env = problem.make_env(1)
     each = bytes_per_env(env.sim.model) + _BYTES_PER_VALUE * problem.space.size
     env.close()
-    check_memory(num_envs * each, f"--num_envs {num_envs}", "Take fewer: a search gains little beyond 4096.")
+    check_memory(simulated * each, f"--num_envs {num_envs}", "Take fewer: a search gains little beyond 4096.")
 
 
 def _stays_finite(problem: Problem) -> bool:

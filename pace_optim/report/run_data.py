@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from pace_actuators.files import read_json, refuse
+from pace_envs.mujoco_warnings import collected
 from pace_envs.task_source import file_digest
 from pace_optim.run.history import History
 from pace_optim.run.result import FitResult
@@ -96,15 +97,12 @@ class RunData:
             return None
         if self.model_digest not in (None, file_digest(path)):  # MuJoCo's reader checks less than it would have to
             refuse(path, "is not the model that the fit wrote", "Remove it, or fit again.")
-        said: list[str] = []
-        mujoco.set_mju_user_warning(said.append)  # it would go to a file in the present folder
-        try:
-            return mujoco.MjModel.from_binary_path(str(path))
-        except ValueError as error:
-            why = said[0] if said else str(error)
-            raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({why}). Remove it.") from error
-        finally:
-            mujoco.set_mju_user_warning(None)
+        with collected() as said:
+            try:
+                return mujoco.MjModel.from_binary_path(str(path))
+            except ValueError as error:
+                why = said[0] if said else str(error)
+                raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({why}). Remove it.") from error
 
     def model(self) -> mujoco.MjModel:
         """The compiled model that the run was made with.
