@@ -12,6 +12,8 @@ Interpolation = Literal["linear", "hold"]
 
 _LARGE = 1e7
 """Samples from where on it is looked whether there is memory for them."""
+_LARGEST_LEAD = 0.5
+"""Of a step: by so much at most a simulator lets a held signal act too early."""
 
 
 class DelayBuffer:
@@ -66,7 +68,8 @@ class DelayBuffer:
         self.parts = parts
         self._num_envs = num_envs
         self._device = torch.device(device)
-        self._length = math.ceil(max_delay) + 2
+        self._lead = 0.0
+        self._length = math.ceil(max_delay + _LARGEST_LEAD) + 2
         self._lag = torch.zeros(num_envs, 1, dtype=torch.float64, device=self._device)
         self._storage: torch.Tensor | None = None  # (length * num_envs, num_joints)
         self._head = 0
@@ -107,6 +110,12 @@ class DelayBuffer:
                 self._lag = self._lag.expand(-1, lag.shape[1]).clone()
         self._lag[slice(None) if env_ids is None else env_ids] = lag
         self._index_lags()
+
+    def set_lead(self, lead: float) -> None:
+        """Say by how much the simulator lets what it is given act too early [steps], 0 to 0.5: it is added to all lags."""
+        if lead != self._lead:
+            self._lead = lead
+            self._index_lags()
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
         """Forget the history of all or some environments."""
@@ -170,10 +179,11 @@ class DelayBuffer:
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
-        whole = self._lag.ceil() if self.interpolation == "hold" else self._lag.floor()
-        self._fraction = torch.zeros_like(self._lag) if self.interpolation == "hold" else self._lag - whole
+        self._total = lag = self._lag + self._lead
+        whole = lag.ceil() if self.interpolation == "hold" else lag.floor()
+        self._fraction = torch.zeros_like(lag) if self.interpolation == "hold" else lag - whole
         self._whole = not bool(self._fraction.any())
-        self._all_zero = not bool(self._lag.any())
+        self._all_zero = not bool(lag.any())
         self._newer, self._older = self._rows(whole), self._rows(whole + 1)
         self._index_parts()
 
@@ -185,7 +195,7 @@ class DelayBuffer:
             return
         before: tuple[torch.Tensor, torch.Tensor] | None = None
         for part in range(self.parts):
-            left = self._lag - part / self.parts
+            left = self._total - part / self.parts
             back = left.ceil().clamp(min=0.0)
             weight = (self.parts * (1 + left - back)).clamp(max=1.0)
             same = bool((weight == 1).all())

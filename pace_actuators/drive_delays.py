@@ -61,6 +61,11 @@ class DriveDelays:
         for buffer in self._buffers.values():
             buffer.set_time_lag(lag, env_ids)
 
+    def set_lead(self, lead: float) -> None:
+        """Say by how much the simulator lets what it is given act too early [runs of the controller]."""
+        for buffer in self._buffers.values():
+            buffer.set_lead(lead)
+
     def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments."""
         for buffer in self._buffers.values():

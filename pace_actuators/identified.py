@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 """Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
 
+RATE_FLAGS = ("implicit", "centred_commands")
+"""How its controller ran, beside ``drive_dt``."""
+
 RIG_EFFECTS = ("mount_compliance",)
 """Effects of what held the robot during the recording, by name: a walking robot does not have them."""
 
@@ -176,14 +179,16 @@ class IdentifiedDrives:
         Raises:
             ValueError: If they ran differently.
         """
-        rates = {(self.drive.get("drive_dt", {}).get(j), bool(self.drive.get("implicit", {}).get(j))) for j in joints}
+        names = ("drive_dt", *RATE_FLAGS)
+        rates = {tuple(self.drive.get(name, {}).get(joint) for name in names) for joint in joints}
         if len(rates) > 1:
             raise ValueError(
-                f"{self.path}: the controllers of {', '.join(joints)} ran at different rates (drive_dt, implicit): "
+                f"{self.path}: the controllers of {', '.join(joints)} ran at different rates ({', '.join(names)}): "
                 f"{sorted(rates, key=str)}. Make them groups of their own."
             )
-        drive_dt, implicit = rates.pop() if rates else (None, False)
-        return ({} if drive_dt is None else {"drive_dt": drive_dt}) | ({"implicit": True} if implicit else {})
+        drive_dt, *flags = rates.pop() if rates else (None,)
+        rate = {} if drive_dt is None else {"drive_dt": drive_dt}
+        return rate | {name: True for name, flag in zip(RATE_FLAGS, flags, strict=False) if flag}
 
     def _effects_of(self, joints: Sequence[str], on_the_rig: bool) -> list[EffectCfg]:
         """The effects with their values on those of some joints that have them."""

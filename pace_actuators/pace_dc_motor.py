@@ -180,6 +180,7 @@ class PaceDCMotor:
         self._asked = self.computed_effort
         self._calls_until_control = 0
         self.update_time_lags(delay)
+        self._delays.set_lead(self._lead)
         self.effects = self._make_effects(dt)
         self.update_effects()
 
@@ -522,6 +523,20 @@ class PaceDCMotor:
                 "one delay per environment or per joint."
             )
         self._delays.set_time_lag(delay, env_ids)
+
+    def take_over_simulator(self, *, is_trapezoidal: bool, holds_line: bool) -> None:
+        """Say how the simulator moves positions, and what it holds between two calls: see the attributes."""
+        self.holds_line, self.is_trapezoidal = holds_line, is_trapezoidal
+        self.centred = holds_line and not is_trapezoidal
+        if self.effects is not None:
+            self.effects.is_trapezoidal = is_trapezoidal
+        self._delays.set_lead(self._lead)
+
+    @property
+    def _lead(self) -> float:
+        """By how much the simulator lets a delayed command act too early, in runs of the controller."""
+        early = self.cfg.centred_commands and self.cfg.delay_mode == "command"
+        return 0.5 / self._calls_per_run if early and not (self.is_trapezoidal or self.centred) else 0.0
 
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""

@@ -86,6 +86,12 @@ class PaceDCMotorCfg:
     """Whether the controller runs continuously, as that of a position actuator in a model file: at every physics step,
     and its damping (and the stiffness behind it) acts on the motion within the step. Other loops hold their torque."""
 
+    centred_commands: bool = False
+    """Whether a delay of commands is the drive's alone. Simulators that update speeds before positions (semi-implicit
+    Euler: MuJoCo's, PhysX') let what is held over a step act half a step early; PACE's identified delay makes up for
+    it, and is longer than the drive's by half a physics step. ``True`` takes that half step out of the commands, so
+    that it does not go into the delay; feedback stays as it is."""
+
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects beyond this base model, by name (``"stribeck_friction"``) or with their values."""
 

@@ -486,11 +486,9 @@ class Articulation:
                 **{key: values[ids] for key, values in model_values.items()},
             )
         for actuator in self.actuators.values():
-            actuator.holds_line = actuator.cfg.control_decimation > 1 or self._sim.is_trapezoidal
-            actuator.centred = actuator.holds_line and not self._sim.is_trapezoidal
-            actuator.is_trapezoidal = self._sim.is_trapezoidal
-            if actuator.effects is not None:
-                actuator.effects.is_trapezoidal = self._sim.is_trapezoidal
+            trapezoidal = self._sim.is_trapezoidal
+            holds_line = actuator.cfg.control_decimation > 1 or trapezoidal
+            actuator.take_over_simulator(is_trapezoidal=trapezoidal, holds_line=holds_line)
             driven = actuator.joint_indices
             self.write_joint_armature_to_sim(actuator.armature, driven)
             self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)

@@ -92,6 +92,11 @@ def test_the_controller_keeps_the_rate_of_the_identification(result):
     env.close()
 
 
+def test_commands_that_act_on_time_go_on_to(result):
+    changed(result, drive={"centred_commands": dict.fromkeys(JOINTS, 1.0)})
+    assert PaceDCMotorCfg.from_result(result).centred_commands
+
+
 def test_a_continuous_controller_stays_one(result):
     changed(result, drive={"implicit": {joint: 1.0 for joint in JOINTS if joint.endswith("KFE")}})
     assert PaceDCMotorCfg.from_result(result, ".*KFE").implicit

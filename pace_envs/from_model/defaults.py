@@ -3,9 +3,6 @@
 CONTROL_DT = 0.0025
 """Time between two commands [s]: 400 Hz, PACE's rate."""
 
-STEPS_OF_A_HELD_TORQUE = 2
-"""Physics steps per control step where drives hold their torque in between: one would let it act half a step early."""
-
 LONGEST_DELAY = 0.05
 """Upper bound of the delay [s]."""
 

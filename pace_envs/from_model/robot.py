@@ -93,11 +93,11 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
     position, orientation = _base_pose(robot)
     continuous = runs_continuously(joints, robot.model)
-    steps = 1 if continuous else defaults.STEPS_OF_A_HELD_TORQUE
+    integrator = "implicitfast" if continuous else "rk4"
     articulation = ArticulationCfg(
         mjcf_path=Path(path),
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
-        actuators={"drives": _drive_cfg(joints, continuous=continuous, steps=steps)},
+        actuators={"drives": _drive_cfg(joints, continuous=continuous)},
         joint_order=names,
     )
     rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
@@ -105,8 +105,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
-        sim=SimulationCfg(dt=defaults.CONTROL_DT / steps, gravity=_gravity(robot.model)),
-        decimation=steps,
+        sim=SimulationCfg(dt=defaults.CONTROL_DT, integrator=integrator, gravity=_gravity(robot.model)),
         sim2real=PaceCfg(
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",
@@ -124,7 +123,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     )
 
 
-def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool, steps: int) -> PaceDCMotorCfg:
+def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool) -> PaceDCMotorCfg:
     pairs = [gains(joint) for joint in joints]
     limits = [joint.effort_limit for joint in joints]
     speeds = [joint.velocity_limit for joint in joints]
@@ -136,7 +135,6 @@ def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool, steps: int) ->
         velocity_limit=speeds if np.isfinite(speeds).any() else None,
         max_delay=_longest_delay(),
         implicit=continuous,
-        control_decimation=steps,
     )
 
 

@@ -55,7 +55,6 @@ def env_cfg() -> PaceSim2realEnvCfg:
         effort_limit=column(2),
         velocity_limit=column(3),
         max_delay=LONGEST_DELAY,
-        control_decimation={steps},
         implicit={implicit},  # whether the loop runs continuously; else it holds its torque between two commands
     )
     robot = ArticulationCfg(
@@ -72,8 +71,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
     bounds += [(-b, b) for b in column(9)] + [(0.0, LONGEST_DELAY)]
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=robot),
-        sim=SimulationCfg(dt={dt:g}, gravity={gravity}),
-        decimation={steps},
+        sim=SimulationCfg(dt={dt:g}, integrator={integrator!r}, gravity={gravity}),
         sim2real=PaceCfg(
             robot_name={name!r},
             data_dir="data/{name}/chirp.npz",
@@ -132,10 +130,10 @@ def configuration_text(model: str | Path, output: str | Path) -> tuple[str, str,
         delay=float(sim2real.bounds_params[-1, 1]),
         path=os.path.relpath(Path(model).resolve(), Path(output).resolve().parent),
         implicit=drive.implicit,
-        steps=cfg.decimation,
         pos=tuple(robot.init_state.pos),
         rot=tuple(robot.init_state.rot),
         dt=cfg.sim.dt,
+        integrator=cfg.sim.integrator,
         gravity=tuple(cfg.sim.gravity),
         sample={key: value if key == "delay" else _short(value) for key, value in sim2real.sample_params.items()},
     )

@@ -22,6 +22,7 @@ def test_bench_cfg() -> ArticulationCfg:
     """The bench with ANYmal's drive, hanging down."""
     drive = anymal_d_drive_cfg()
     drive.joint_names_expr = "servo"
+    drive.centred_commands = True
     return ArticulationCfg(
         mjcf_path=ASSETS_DIR / "test_bench" / "test_bench.xml",
         actuators={"servo": drive},

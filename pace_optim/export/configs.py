@@ -10,7 +10,7 @@ from typing import Any
 
 from pace_actuators import IdentifiedAt, IdentifiedDrives, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg
-from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable
 from pace_envs.identified import load_identified_cfg
 
@@ -32,7 +32,7 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
         patterns = [drive.joint_names_expr] if isinstance(drive.joint_names_expr, str) else drive.joint_names_expr
         own = [joint for joint in drives.joint_names if any(re.fullmatch(p, joint) for p in patterns)]
         if own:
-            kept = (*(name for name in DRIVE_FIELDS if name not in drives.drive), "drive_dt", "implicit")
+            kept = (*(name for name in DRIVE_FIELDS if name not in drives.drive), "drive_dt", *RATE_FLAGS)
             configured = {name: getattr(drive, name) for name in kept}
             found = drives.cfg_fields([re.escape(joint) for joint in own])
             result[group] = PaceDCMotorCfg(**configured | {"joint_names_expr": drive.joint_names_expr} | found)

@@ -77,6 +77,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 ("encoder_bias", 0.0),
             )
         }
+        early = 0.5 * drives.at.physics_dt if cfg.centred_commands else 0.0  # the other simulator's step does it too
         for i, joint in enumerate(joints):
             gain = own["torque_gain"].get(joint, 1.0)
             line = math.isfinite(found["saturation_effort"][i]) and math.isfinite(found["velocity_limit"][i])
@@ -87,7 +88,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 saturation_effort=found["saturation_effort"][i] if line else math.inf,
                 velocity_limit=found["velocity_limit"][i] if line else math.inf,
                 encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
-                delay_s=drives.delay_s if commands else 0.0,
+                delay_s=drives.delay_s + early if commands else 0.0,
                 run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
             )
     notes = []

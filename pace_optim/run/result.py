@@ -13,7 +13,7 @@ import torch
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.drive_result import ALL, CURE, DriveResult
 from pace_actuators.files import refuse, write_json
-from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -143,8 +143,9 @@ def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
         own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
         if cfg.drive_dt is not None:
             found.setdefault("drive_dt", {}).update(dict.fromkeys(own, cfg.drive_dt))
-        if cfg.implicit:
-            found.setdefault("implicit", {}).update(dict.fromkeys(own, 1.0))
+        for name in RATE_FLAGS:
+            if getattr(cfg, name):
+                found.setdefault(name, {}).update(dict.fromkeys(own, 1.0))
     return {name: values for name, values in found.items() if values}
 
 

@@ -10,6 +10,7 @@ import torch
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
+from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, times_noise
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
@@ -42,6 +43,7 @@ def fit_warnings(
     return [
         *problem.measured.warnings,
         *_overfit(rmse, change),
+        *_sampled_commands(problem, rmse, uncertainty),
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),
         *_undetermined(left_open),
@@ -102,6 +104,24 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
     return [
         f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
         f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
+    ]
+
+
+def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty) -> list[str]:
+    """Whether the drives seem to have got commands more often than they were logged.
+
+    What is logged with slow samples is then early by half of the time between two commands on average: no delay that
+    is 0 or more makes up for it, and the motion has none of the steps that held commands make.
+    """
+    slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
+    low = problem.space.lower[problem.space["delay"]]
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
+    if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get("all")) or 0.0) < FAR_ABOVE_NOISE:
+        return []
+    return [
+        f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between; "
+        "with a delay of 0 they still come too late. If the drive got more of them than were logged, this log cannot "
+        "tell its parameters: log every command, on its own clock (des_time)."
     ]
 
 
