@@ -112,7 +112,7 @@ class DelayBuffer:
         self._index_lags()
 
     def set_lead(self, lead: float) -> None:
-        """Say by how much the simulator lets what it is given act too early [steps], 0 to 0.5: it is added to all lags."""
+        """Say by how much the simulator lets what it gets act too early [steps], 0 to 0.5: it is added to all lags."""
         if lead != self._lead:
             self._lead = lead
             self._index_lags()

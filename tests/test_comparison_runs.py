@@ -126,7 +126,7 @@ def test_a_finer_physics_step_is_simulated_anew(bench):
     run, _ = bench
     coarse, fine = compare([run]), compare([run], physics_dt=0.00125)
     assert fine["physics_dt"] == 0.00125 and fine["rmse"]["train"] != coarse["rmse"]["train"]
-    assert coarse["rmse"]["train"] < fine["rmse"]["train"] < 3e-3  # fitted at the coarse step: it fits there alone
+    assert coarse["rmse"]["train"] < fine["rmse"]["train"] < 5e-3  # fitted at the coarse step: it fits there alone
     compare([run])
 
 

@@ -455,6 +455,25 @@ def test_half_the_control_rate_gives_stride_two_and_held_commands():
     assert np.array_equal(conformed.command_torque_enable[1::2], saved.torque_enable[:-1])
 
 
+@pytest.mark.parametrize("period", [0.0502, 0.0111, 1 / 22.3])
+def test_a_timer_of_another_rate_keeps_its_samples_beside_the_grid(period):
+    saved = recording(period * np.arange(100), torque_enable=np.arange(100) % 3 > 0)
+    conformed = conform(saved)
+    assert np.array_equal(conformed.dof_pos, saved.dof_pos) and np.allclose(conformed.time, saved.time, atol=1e-12)
+    assert np.array_equal(conformed.des_dof_pos, saved.des_dof_pos)
+    assert np.abs(conformed.sample_offset).max() <= 0.5
+    assert np.allclose((conformed.sample_steps + conformed.sample_offset) * CONTROL_DT, saved.time)
+    assert conformed.command.shape == (conformed.sample_steps[-1] + 1, 3)
+    assert np.array_equal(conform(conformed).command, conformed.command)
+    assert any("keep their instants" in note for note in conformed.notes)
+
+
+def test_torques_of_a_timer_of_another_rate_are_resampled():
+    """What they say of the drive is read from even samples."""
+    saved = recording(0.0502 * np.arange(100), dof_effort=np.ones((100, 3)))
+    assert conform(saved).sample_at is None
+
+
 def test_a_finer_recording_is_thinned_and_says_what_is_lost():
     time = 0.001 * np.arange(1001)
     conformed = conform(recording(time))
@@ -498,8 +517,10 @@ def test_conforming_twice_changes_nothing(rate, jitter, start, seed):
     rng = np.random.default_rng(seed)
     time = start + (np.arange(100) + jitter * rng.uniform(-1.0, 1.0, 100)) / rate
     once = conform(recording(time, torque_enable=rng.uniform(size=100) > 0.2))
-    assert len(once.command) == (once.num_samples - 1) * once.sample_stride + 1
-    assert np.array_equal(once.command[:: once.sample_stride], once.des_dof_pos)
+    assert len(once.command) == once.sample_steps[-1] + 1
+    if once.sample_at is None:  # else commands arrive within a step
+        assert len(once.command) == (once.num_samples - 1) * once.sample_stride + 1
+        assert np.array_equal(once.command[:: once.sample_stride], once.des_dof_pos)
     assert once.command.min() >= recording(time).des_dof_pos.min() - 1e-9
     assert once.command.max() <= recording(time).des_dof_pos.max() + 1e-9
     assert_same(once, conform(once), ignore=("notes",))
@@ -541,7 +562,7 @@ def test_the_go2_recording_is_kept_exactly_at_half_the_control_rate():
 @needs_measurements
 @pytest.mark.parametrize(
     ("path", "stride"),
-    [("xl330/kp400_sin_sin.csv", 2), ("sts3250/kp32_sin_sin.csv", 8), ("so101/multisine.npz", 8)],
+    [("xl330/kp400_sin_sin.csv", 2), ("sts3250/kp32_sin_sin.csv", 8)],
 )
 def test_uneven_real_recordings_are_resampled(path, stride):
     loaded = load_recording(SHARED / "measurements" / path)

@@ -26,6 +26,8 @@ from pace_envs.tasks.pace import CMAESOptimizerCfg
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Load
+from pace_optim.recording.resample import interpolate_smooth
+from pace_optim.recording.windows import Windows
 
 EXACT = 1e-12  # [rad²]
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05}
@@ -257,3 +259,17 @@ def test_speeds_are_at_hand_while_a_rollout_runs():
     between = (simulated[1:] + simulated[:-1]) / 2  # the engine's speed is a backward difference
     largest = float(measured.abs().max())
     assert largest > 4 and float((between - measured[:-1])[5:-5].abs().max()) < 0.02 * largest
+
+
+def test_samples_beside_the_grid_are_met_at_their_own_instants():
+    """A timer that is 0.4 % late: the truth's own motion, read between its steps, leaves next to nothing."""
+    whole = record(truth=TRUTH)
+    time = np.arange(int(whole.duration / 0.0201)) * 0.0201
+    cubic = interpolate_smooth(whole.time, whole.dof_pos, time)
+    problem = make_problem(dataclasses.replace(whole, time=time, dof_pos=cubic, des_dof_pos=whole.des_dof_pos,
+                                               des_time=whole.time, dof_vel=None))  # fmt: skip
+    assert problem.dataset.sample_offset.abs().max() > 0.4 and len(time) == int(problem.dataset.sampled.sum())
+    assert scores(problem, TRUTH, where=problem.dataset.sampled).sqrt() < 2e-5
+    windows = Windows.of(problem.dataset, DT)
+    cut = dataclasses.replace(problem, dataset=windows.cut(problem.dataset))
+    assert scores(cut, TRUTH, where=windows.mask(problem.dataset.sampled)).sqrt() < 1e-3

@@ -93,7 +93,6 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
     position, orientation = _base_pose(robot)
     continuous = runs_continuously(joints, robot.model)
-    integrator = "implicitfast" if continuous else "rk4"
     articulation = ArticulationCfg(
         mjcf_path=Path(path),
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
@@ -105,7 +104,11 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
-        sim=SimulationCfg(dt=defaults.CONTROL_DT, integrator=integrator, gravity=_gravity(robot.model)),
+        sim=SimulationCfg(
+            dt=defaults.CONTROL_DT,
+            integrator="implicitfast" if continuous else "rk4",  # where all damping is stable, or torques are held
+            gravity=_gravity(robot.model),
+        ),
         sim2real=PaceCfg(
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",

@@ -34,7 +34,7 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
         dt = float(np.median(np.diff(recording.time)))
         position = smoothed(recording.dof_pos, dt)
         speed = np.gradient(position, dt, axis=0)
-        here = slice(None, None, recording.sample_stride)
+        here = recording.sample_steps
         facts = {name: _in_force(getattr(recording.drive, name), configured[name]) for name in DRIVE_FIELDS}
         asked = np.zeros_like(position)
         if recording.command is not None:

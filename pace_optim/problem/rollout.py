@@ -118,20 +118,28 @@ class Rollout:
                 self.weight = self._rows(weights[k, :, None])
                 yield sim_dof_pos, self._rows(data.measured[k])
 
-    def _samples(self) -> Iterator[tuple[int, torch.Tensor]]:
-        """Step and sensed positions at every control step, as late as the effects on the recording have them."""
-        steps = self.duration_steps
+    def _samples(self, at_steps: bool = False) -> Iterator[tuple[int, torch.Tensor]]:
+        """Step and sensed positions at every control step, as late as the effects on the recording have them.
+
+        Args:
+            at_steps: Whether at the steps themselves, not at the instants of samples that were taken beside them.
+        """
+        steps, offset = self.duration_steps, None if at_steps else self.dataset.sample_offset
         lag = self._observation_lag(steps)
-        if lag is None:
+        if lag is None and offset is None:
             yield from enumerate(self.simulated(steps))
             return
-        # a sample of step k is taken at k - lag: some steps are simulated ahead, some are remembered
-        ahead = max(0, math.ceil(-float(lag.min()))) + 2
-        behind = max(0, math.ceil(float(lag.max()))) + 2
+        if lag is None:
+            lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
+        # a sample of step k is taken at k - lag + offset: some steps are simulated ahead, some are remembered
+        most = 0.0 if offset is None else float(offset.abs().max())
+        ahead = max(0, math.ceil(most - float(lag.min()))) + 2
+        behind = max(0, math.ceil(most + float(lag.max()))) + 2
         length = ahead + behind + 1
         shape = length, self.env.num_envs, self.robot.num_joints
         seen = torch.zeros(shape, dtype=self.env.dtype, device=self.env.device)
-        late = (lag != 0).any(dim=2).any(dim=0).nonzero()[:, 0]
+        moved = (lag != 0).any(dim=2).any(dim=0)
+        late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
         first = lag[0, late]
         rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
         for j, position in enumerate(self.simulated(steps + ahead)):
@@ -139,8 +147,10 @@ class Rollout:
             if j == 0:
                 seen[:] = position
             if (k := j - ahead) >= 0:
-                shown = seen[k % length].clone()
-                shown[late] = _interpolated(seen[:, late], k - (first + rate * k))
+                shown, at = seen[k % length].clone(), k - (first + rate * k)
+                if offset is not None:
+                    at = at + self._rows(offset[k, :, None])
+                shown[late] = _interpolated(seen[:, late], at)
                 yield k, shown
 
     def _observation_lag(self, steps: int) -> torch.Tensor | None:
@@ -191,7 +201,7 @@ class Rollout:
 
     def positions_at_every_step(self) -> Iterator[torch.Tensor]:
         """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
-        for _, sim_dof_pos in self._samples():
+        for _, sim_dof_pos in self._samples(at_steps=True):
             yield sim_dof_pos
 
     def begin(self, offset: torch.Tensor | float = 0.0) -> None:
@@ -201,6 +211,9 @@ class Rollout:
             offset: Added to the first positions, (num_envs, n) [rad].
         """
         shown = self._rows(self.dataset.measured[0]).clone()
+        if self.dataset.sample_offset is not None:
+            late = self.dataset.sample_offset[0, :, None] * self.env.step_dt
+            shown -= self._rows(late * self.dataset.start_vel)
         for actuator in self.robot.actuators.values():
             ids = actuator.joint_indices
             shown[:, ids] += actuator.encoder_bias

@@ -36,7 +36,10 @@ def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) ->
         else:
             held = hold_on_grid(instants, values, control_dt, count)
         none = np.isnan(values).all(axis=0)
-        result[key] = held if recording.des_time is not None else held[::stride]
+        if recording.des_time is not None:
+            result[key] = held
+        elif base.sample_at is None:  # placed samples keep their own
+            result[key] = held[::stride]
         result[GRID_COMMANDS[key]] = np.where(none, result["command"] if key == "des_dof_pos" else 0.0, held)
     if recording.des_time is not None:
         result["des_time"] = control_dt * np.arange(count)

@@ -32,7 +32,7 @@ def conform_recording(
     1. Check joints and load against the robot; put columns (and the drive's values) in `joint_order`.
     2. Check the motion: limits, units, wraps; note what is odd.
     3. Compare the time stamps with the grid of spacing `sample_stride * control_dt`: keep the samples bit for
-       bit when they lie on it, else resample them.
+       bit when they lie on it, or beside it where an even timer is slower than the control; else resample them.
     4. Fill `command`, `command_vel`, `command_effort` and `command_torque_enable` on the control grid. Commands with
        a clock of their own are held at their true instants; samples before the first of them are left out.
 
@@ -63,14 +63,17 @@ def conform_recording(
         return recording
     recording = _from_first_command(recording)
     origin = recording.start_stamp
-    base = fit_time_base(recording.time, control_dt, recording.label)
-    on_grid = _kept(recording, base) if base.exact else _resampled(recording, base, control_dt)
+    # what a torque says of its drive is read from even samples
+    base = fit_time_base(recording.time, control_dt, recording.label, may_place=recording.dof_effort is None)
+    if base.sample_at is not None:
+        on_grid = _placed(recording, base, control_dt)
+    else:
+        on_grid = _kept(recording, base) if base.exact else _resampled(recording, base, control_dt)
+        on_grid["time"] = control_dt * base.sample_steps
     on_grid |= commands_on_grid(recording, base, control_dt)
-    time = base.sample_stride * control_dt * np.arange(base.num_samples)
     return replace(
         recording,
         **on_grid,
-        time=time,
         time_origin=origin,
         sample_stride=base.sample_stride,
         notes=(*recording.notes, *base.notes, *notes),
@@ -90,7 +93,11 @@ def with_columns(recording: Recording, columns: Sequence[int], joint_order: tupl
 
 
 def _check_conformed(recording: Recording, control_dt: float) -> None:
-    own_dt = float(recording.time[1] - recording.time[0]) / recording.sample_stride
+    if recording.sample_offset is not None:
+        steps = recording.sample_steps[-1] + recording.sample_offset[-1]
+    else:
+        steps = recording.sample_steps[-1]
+    own_dt = recording.duration / float(steps)
     if abs(own_dt / control_dt - 1.0) > 1e-6:
         raise ValueError(
             f"{recording.label}: is already on a control step of {own_dt:g} s; expected a recording as "
@@ -120,6 +127,17 @@ def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:
     stride, count = base.sample_stride, base.num_steps
     enable = recording.torque_enable
     return {"command_torque_enable": None if enable is None else np.repeat(enable, stride)[:count]}
+
+
+def _placed(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
+    """The samples as they are, each beside the nearest step of the grid; whether the drive is on by its hold."""
+    stamps, enable = recording.time - recording.time[0], recording.torque_enable
+    result: dict[str, Any] = {"time": stamps, "sample_at": base.sample_at}
+    result["sample_offset"] = stamps / control_dt - base.sample_steps
+    if enable is not None:
+        share_on = hold_on_grid(stamps, enable[:, None].astype(np.float64), control_dt, base.num_steps)
+        result["command_torque_enable"] = share_on[:, 0] >= 0.5
+    return result
 
 
 def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:

@@ -78,6 +78,10 @@ class Recording:
     """The load carried."""
     sample_stride: int = 1
     """Control steps per sample (set by `conform_recording`)."""
+    sample_at: np.ndarray | None = None
+    """Nearest control step of each sample, (T,), where they do not lie on every `sample_stride`-th; else None."""
+    sample_offset: np.ndarray | None = None
+    """By how much later than that each of these samples was taken, (T,) [control steps]."""
     command: np.ndarray | None = None
     """Commanded positions on the control grid, ((T - 1) * sample_stride + 1, n) [rad]; None until conformed.
 
@@ -132,11 +136,16 @@ class Recording:
         return _has_values(self.des_dof_effort, self.num_joints)
 
     @property
+    def sample_steps(self) -> np.ndarray:
+        """Control step of each sample, (T,); once conformed."""
+        return np.arange(self.num_samples) * self.sample_stride if self.sample_at is None else self.sample_at
+
+    @property
     def sampled_command(self) -> np.ndarray:
         """`command` at the samples, (T, n) [rad]."""
         if self.command is None:
             raise ValueError(f"{self.label}: not on the control grid. Call conform_recording first.")
-        return self.command[:: self.sample_stride]
+        return self.command[self.sample_steps]
 
     @property
     def label(self) -> str:

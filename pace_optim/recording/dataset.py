@@ -37,6 +37,8 @@ class Dataset:
     """Where there is a sample to train on, (T, R) bool."""
     torque_enable: torch.Tensor | None
     """Whether the drives give torque, (T, R) bool; ``None`` when always."""
+    sample_offset: torch.Tensor | None
+    """By how much later than its step each sample was taken, (T, R) [control steps]; ``None`` where never."""
     validation_only: tuple[bool, ...]
     """For each recording, whether none of it is trained on."""
     session_start: torch.Tensor
@@ -70,6 +72,7 @@ class Dataset:
             sampled=self.sampled[:, chosen],
             train=self.train[:, chosen],
             torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
+            sample_offset=None if self.sample_offset is None else self.sample_offset[:, chosen],
             validation_only=tuple(self.validation_only[r] for r in chosen),
             session_start=self.session_start[chosen],
             start_time=self.start_time[chosen],
@@ -152,10 +155,12 @@ def make_dataset(
     command = torch.zeros(*shape, n, dtype=torch.float64)
     measured, measured_vel = torch.zeros_like(command), torch.zeros_like(command)
     sampled, train = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
-    enable = torch.ones(shape, dtype=torch.bool)
+    enable, offset = torch.ones(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.float64)
     for r, recording in enumerate(every):
         _hold(command[:, r], _command(recording))
-        at = torch.arange(recording.num_samples) * recording.sample_stride
+        at = torch.as_tensor(recording.sample_steps)
+        if recording.sample_offset is not None:
+            offset[at, r] = torch.as_tensor(recording.sample_offset)
         measured[at, r] = torch.as_tensor(recording.dof_pos)
         measured_vel[at, r] = torch.as_tensor(_speed(recording))
         sampled[at, r] = True
@@ -175,6 +180,7 @@ def make_dataset(
         sampled=sampled,
         train=train,
         torque_enable=None if bool(enable.all()) else enable,
+        sample_offset=offset if bool(offset.any()) else None,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
         session_start=torch.as_tensor(session_start),
         start_time=torch.zeros(len(every), dtype=torch.float64),

@@ -99,8 +99,8 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
 
 def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
     """Some samples; it begins at the speed that it has there."""
-    stride, begin = recording.sample_stride, float(recording.time[first])
-    grid = slice(first * stride, (end - 1) * stride + 1)
+    at, begin = recording.sample_steps[first:end], float(recording.time[first])
+    grid = slice(int(at[0]), int(at[-1]) + 1)
     measured: dict[str, Any] = {
         key: value[first:end]
         for key in (*MEASURED_SERIES, "torque_enable")
@@ -112,7 +112,7 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
         if (value := getattr(recording, key)) is not None
     }
     own: dict[str, Any] = {  # which joints have which commands is read from these
-        f"des_dof_{key}": np.where(has, commands[name][::stride], np.nan)
+        f"des_dof_{key}": np.where(has, commands[name][at - at[0]], np.nan)
         for key, name, has in (
             ("pos", "command", recording.has_position_command),
             ("vel", "command_vel", recording.has_velocity_command),
@@ -132,6 +132,8 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
         name=f"{recording.name} {begin:g} to {recording.time[end - 1] + dt:g} s",
         part_of=recording.name,
         time=recording.time[first:end] - begin,
+        sample_at=None if recording.sample_at is None else at - at[0],
+        sample_offset=None if recording.sample_offset is None else recording.sample_offset[first:end],
         des_time=None,
         time_origin=recording.time_origin + begin,
         notes=(),

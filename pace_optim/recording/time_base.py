@@ -1,7 +1,9 @@
-"""The time base of a recording against the simulation's control grid: keep the samples, or resample them.
+"""The time base of a recording against the simulation's control grid: keep the samples, place them, or resample them.
 
 Samples are kept exactly when their time stamps are those of the grid, up to what a clock or a file format
 adds: jitter below 1 % of a step, rounding of the stamps (decimals, float32), drift below a tenth of a sample.
+Those of a timer that is slower than the grid, at a rate of its own, are placed beside the grid's nearest steps, and
+what is simulated is interpolated to their instants: between slow samples only the simulation knows the motion.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 _JITTER = 0.01  # of a step: moves a joint at 10 rad/s by 0.25 mrad at 400 Hz, below any encoder's noise
 _DRIFT = 0.1  # of a sample, over the whole recording
 _RATE = 1e-3  # relative error of the mean step
+_EVEN = 0.05  # of a step: a timer that runs at a rate of its own
 _MAX_STEP = 0.05  # [s]
 _LATE = 1.1  # a timer of that step may run late by so much
 _MAX_GAP = 0.5  # [s]
@@ -28,22 +31,30 @@ class TimeBase:
     """Samples on the grid."""
     exact: bool
     """Whether the samples already lie on the grid."""
+    sample_at: np.ndarray | None = None
+    """The step of the grid that is nearest to each sample, (T,), where samples are placed; else ``None``."""
     notes: tuple[str, ...]
     """Rate, jitter, gaps, and what follows from them."""
 
     @property
     def num_steps(self) -> int:
         """Control steps up to and including the last sample."""
-        return (self.num_samples - 1) * self.sample_stride + 1
+        return int(self.sample_steps[-1]) + 1
+
+    @property
+    def sample_steps(self) -> np.ndarray:
+        """The step of the grid of each sample, (T,)."""
+        return np.arange(self.num_samples) * self.sample_stride if self.sample_at is None else self.sample_at
 
 
-def fit_time_base(time: np.ndarray, control_dt: float, source: str) -> TimeBase:
+def fit_time_base(time: np.ndarray, control_dt: float, source: str, may_place: bool = False) -> TimeBase:
     """Compare time stamps with the control grid.
 
     Args:
         time: Time stamps, (T,) [s], strictly increasing.
         control_dt: Control step of the simulation [s].
         source: Name of the recording, for messages.
+        may_place: Whether even samples that do not lie on the grid may be placed beside it, where they are slower.
 
     Raises:
         ValueError: If the recording is too slow, or has a gap that interpolation cannot honestly fill.
@@ -64,6 +75,13 @@ def fit_time_base(time: np.ndarray, control_dt: float, source: str) -> TimeBase:
             f"The time stamps span one step too many, as of linspace(0, T*dt, T): {mean * 1e3:.6g} ms a step "
             f"was read as {spacing * 1e3:g} ms."
         )
+    nearest = np.round(time / control_dt).astype(int)
+    if may_place and not exact and stride > 1 and np.abs(step - mean).max() <= _EVEN * mean:
+        notes.append(
+            "Samples keep their instants: the simulation is interpolated to them. Commands are held and averaged over "
+            f"each control step of {control_dt * 1e3:g} ms."
+        )
+        return TimeBase(sample_stride=stride, num_samples=len(time), exact=False, sample_at=nearest, notes=tuple(notes))
     if not exact:
         notes.append(
             f"Resampled to {spacing * 1e3:g} ms ({1 / spacing:g} Hz): positions and speeds by cubics, "
