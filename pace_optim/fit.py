@@ -325,7 +325,7 @@ class _Fit:
         if times is None or times < FAR_ABOVE_NOISE:
             self.processes.agree(None)
             return []
-        self.progress.say(f"{times:.3g} times the noise: looking for other starts")
+        self.progress.say(f"{times:.3g} times the noise: looking for other starts (Ctrl-C keeps what is found)")
         space = self.problem.space
         if self.optimizer is None:
             self.processes.agree(None)
@@ -338,10 +338,7 @@ class _Fit:
         """Refine other starts, as far as an interrupted run had not done it yet."""
         self.descents = [found, *others]
         self._write_checkpoint()
-        ends = refine(
-            self.evaluator, self.colouring, others, lambda descents: self._after_iteration([found, *descents])
-        )
-        self.descents = sorted([found, *ends], key=lambda d: d.score)
+        self.descents = refine(self.evaluator, self.colouring, others, self._after_iteration, found=[found])
         self._searched = self.descents[0] is found
 
     def _write_checkpoint(self) -> None:

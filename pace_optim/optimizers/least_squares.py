@@ -16,6 +16,7 @@ from pace_optim.problem.evaluator import Evaluator, Residuals
 _DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
 _STALLED = 3
 _CREEPING = 4
+_GIVEN = 5
 _SMALLEST_DAMPING = 1e-9
 _NEAR = 1e-2
 """A step that is expected to lower the score by less than this part of it hardly changes the derivatives."""
@@ -287,12 +288,13 @@ def _creeps(scores: Sequence[float], tolerance: float) -> bool:
 
 
 def _drop_hopeless(descents: list[Descent], cfg: LeastSquaresCfg) -> None:
-    """Stop starts that are far behind the best one, or that have come down into its valley."""
+    """Stop starts that are far behind the best one after some iterations, or that have come down into its valley."""
     best = min(descents, key=lambda d: d.score)
     for descent in descents:
-        if descent is best or descent.stop_reason is not None or descent.iteration < 5:
+        if descent is best or descent.stop_reason is not None:
             continue
-        if descent.score > cfg.give_up_ratio * best.score:
+        begins = descent.iteration < _GIVEN
+        if not begins and descent.score > cfg.give_up_ratio * best.score:
             descent.stop_reason = "another start is far better"
-        elif float((descent.x - best.x).abs().max()) < cfg.same_valley:
+        elif (best.stop_reason is not None or not begins) and float((descent.x - best.x).abs().max()) < cfg.same_valley:
             descent.stop_reason = "another start is in the same valley"

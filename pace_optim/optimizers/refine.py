@@ -25,6 +25,7 @@ def refine(
     colouring: Colouring,
     starts: Sequence[Descent],
     on_iteration: Callable[[list[Descent]], None] | None = None,
+    found: Sequence[Descent] = (),
 ) -> list[Descent]:
     """Least squares from several starts; most of the way is gone on a part of each recording, which is cheaper.
 
@@ -33,16 +34,17 @@ def refine(
         colouring: Which entries are perturbed together.
         starts: Fresh descents, or those of an interrupted run to go on with.
         on_iteration: Called with all descents after each iteration on the whole recordings.
+        found: Descents that have ended: a start that comes into their valley, or stays far above them, is dropped.
 
     Returns:
-        The descents, the best first.
+        The descents, those that had ended too, the best first.
     """
     descents = list(starts)
     if all(descent.iteration == 0 for descent in descents):
         descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents])
         if on_iteration is not None:
-            on_iteration(descents)
-    return least_squares(evaluator, colouring, descents, on_iteration=on_iteration)
+            on_iteration([*found, *descents])
+    return least_squares(evaluator, colouring, [*found, *descents], on_iteration=on_iteration)
 
 
 def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequence[torch.Tensor]) -> list[Descent]:
