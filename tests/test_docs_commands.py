@@ -10,8 +10,6 @@ import pytest
 from command_lines import ROOT, run_script
 from own_robot import write_robot
 
-from pace_optim.commands import fit as command
-
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(?:bash|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 IN_TEXT = re.compile(r"`((?:pace|(?:python )?scripts/)[^`]*)`")
@@ -83,9 +81,9 @@ def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_p
 def test_a_fit_goes_on_to_the_diagnosis_of_its_run(interrupted, diagnosed, run, tmp_path, monkeypatch):
     ended = SimpleNamespace(stop_reasons=["interrupted" if interrupted else "converged"])
     asked = []
-    monkeypatch.setattr(command, "summary", lambda _: "")
-    monkeypatch.setattr(command, "fit", lambda settings, **_: (ended, run))
-    monkeypatch.setattr(command, "run_and_tell", asked.append)
+    monkeypatch.setattr("pace_optim.run.summary.summary", lambda _: "")
+    monkeypatch.setattr("pace_optim.fit.fit", lambda settings, **_: (ended, run))
+    monkeypatch.setattr("pace_optim.commands.diagnose.run_and_tell", asked.append)
     words = ("--task", run.parents[3] / "swing.xml", "--data", run.parents[3] / "data" / "swing.csv", "--diagnose")
     done = run_script("fit", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

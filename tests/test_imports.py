@@ -20,7 +20,7 @@ DOWNSTREAM = {
 
 FLOORS = {
     "pace_optim": (
-        ["terminal", "recording", "excitation"],
+        ["choices", "terminal", "recording", "excitation"],
         ["robot_logs", "plant", "export", "measured_effort"],
         ["problem"],
         ["optimizers", "single_joint_model"],
@@ -139,3 +139,9 @@ def test_importing_the_actuators_loads_no_simulator():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_fit_says_that_it_reads_before_what_is_slow_is_imported():
+    code = "import sys; import pace_optim.commands.fit; print(*sorted({'torch', 'mujoco', 'numpy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

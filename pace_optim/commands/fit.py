@@ -3,16 +3,7 @@
 import os
 import sys
 
-import torch
-
-from pace_optim.commands.diagnose import run_and_tell
-from pace_optim.diagnosis import DiagnosisSettings
-from pace_optim.fit import fit, help_fit, resume
-from pace_optim.problem.problem import DELAY_MODES
-from pace_optim.problem.processes import join
-from pace_optim.problem.unknown_facts import UNKNOWN_FACTS
-from pace_optim.run.settings import OPTIMIZERS, FitSettings
-from pace_optim.run.summary import summary
+from pace_optim.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
 
@@ -80,12 +71,20 @@ def main() -> None:
         "--diagnose", action="store_true", help="then find out what the model lacks, as pace diagnose does with the run"
     )
     parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
-    args = take_common_options(vars(parser.parse_args()))
+    args = vars(parser.parse_args())
     del args["headless"]
     then_diagnose = args.pop("diagnose")
 
     if large := [path for path in (*args["data"], *args["validation"]) if _is_large(path)]:
-        print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while
+        print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while, and so do the imports
+    import torch
+
+    from pace_optim.fit import fit, help_fit, resume
+    from pace_optim.problem.processes import join
+    from pace_optim.run.settings import FitSettings
+    from pace_optim.run.summary import summary
+
+    args = take_common_options(args)
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     asked = args.pop("device")
     processes, device = join(asked or "cpu")
@@ -104,6 +103,9 @@ def main() -> None:
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
     if then_diagnose and "interrupted" not in result.stop_reasons:
+        from pace_optim.commands.diagnose import run_and_tell
+        from pace_optim.diagnosis import DiagnosisSettings
+
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder))
     else:

@@ -11,17 +11,9 @@ import numpy as np
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.choices import UNKNOWN_FACTS
 from pace_optim.recording import Recording
 
-UNKNOWN_FACTS = {
-    "stiffness": "proportional_gain",
-    "damping": "derivative_gain",
-    "effort_limit": "torque_limit",
-    "saturation_effort": "torque_speed_limit",
-    "velocity_limit": "torque_speed_limit",
-}
-"""Fact (field of a drive's configuration) -> the effect whose parameter finds it: gains as factors of what is stated,
-limits themselves."""
 LIMITS = {
     "effort_limit": "torque_limit.effort",
     "saturation_effort": "torque_speed_limit.effort",

@@ -8,8 +8,6 @@ import sysconfig
 import traceback
 from pathlib import Path
 
-from pace_actuators.memory import available_memory
-
 _OURS = ("pace_actuators", "pace_envs", "pace_optim", "scripts", "benchmarks", "tests")
 _NO_MEMORY = re.compile(r"allocate memory|bad_alloc|bad allocation|[Cc]ould not allocate|out of memory", re.DOTALL)
 
@@ -28,6 +26,8 @@ def sentence(error: BaseException) -> str:
     """What to say of an error, without its type where the text says it all."""
     own = own_code(error)
     if lacks_memory(error):
+        from pace_actuators.memory import available_memory  # with torch: a command that begins has no need of it
+
         text = f"there is not enough memory ({_text(error)}); {available_memory() / 1e9:.3g} GB are free. "
         text += "Ask for fewer --num_envs, or for shorter or fewer recordings."
     elif is_of_input(error):
