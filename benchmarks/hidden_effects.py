@@ -29,11 +29,12 @@ def read_results(path: Path) -> list[dict[str, Any]]:
     return list({line["case"]: line for line in lines}.values())
 
 
-def run_all(jobs: list[Job], results: Path, workers: int) -> None:
+def run_all(jobs: list[Job], results: Path, workers: int, limit: int | None = None) -> None:
     """Run what is not done and add a line for each; an interrupted run goes on where it was."""
     done = {line["case"] for line in read_results(results) if "error" not in line}
     left = [job for job in jobs if job.case.name not in done]
     left.sort(key=lambda job: hashlib.sha256(job.case.name.encode()).digest())  # a part of them is a fair sample
+    left = left[:limit]
     print(f"{len(jobs)} cases, {len(jobs) - len(left)} done before")
     results.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
@@ -57,6 +58,8 @@ def main() -> None:
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
     parser.add_argument("--off", nargs="+", default=[], metavar="RULE", help="rules to switch off")
     parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
+    parser.add_argument("--device", default="cpu", help="where single joints are simulated: cpu or cuda:0")
+    parser.add_argument("--limit", type=int, metavar="N", help="only N of the cases that are left")
     parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")
     parser.add_argument("--table", action="store_true", help="only print what the results say")
     args = parser.parse_args()
@@ -72,10 +75,11 @@ def main() -> None:
                 physics_dt=args.physics_dt,
                 max_effects=args.max_effects,
                 off=tuple(args.off),
+                device=args.device,
             )
         except ValueError as error:
             sys.exit(f"error: {error}")
-        run_all(jobs, results, args.workers)
+        run_all(jobs, results, args.workers, args.limit)
     print(make_table(read_results(results)))
 
 

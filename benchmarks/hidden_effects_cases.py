@@ -20,6 +20,7 @@ from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.on_gpu import fits_on
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines
@@ -37,7 +38,6 @@ PAIRS = (
     ("joint_elasticity", "torque_gain"),
     ("load_dependent_friction", "measurement_delay"),
 )
-FITS = Fits()
 _BACKGROUNDS = (1 / 3, 1.0)  # share of the effect's own size, seed by seed in turn
 
 
@@ -57,6 +57,13 @@ class Job:
     """How many effects the diagnosis may add."""
     off: tuple[str, ...] = ()
     """Rules of the diagnosis that are switched off."""
+    device: str = "cpu"
+    """Where single joints are simulated."""
+
+    @property
+    def fits(self) -> Fits:
+        """What fits models there."""
+        return fits_on(self.device, DiagnosisCfg(off=self.off))
 
 
 def make_jobs(
@@ -114,8 +121,10 @@ def run_case(job: Job) -> dict[str, Any]:
     made = time.perf_counter()
     middle = problem.space.to_physical(problem.space.start)
     decisions: list[Decision] = []
-    cfg = DiagnosisCfg(off=job.off)
-    found = search_effects(problem, middle, candidate_effects(), job.max_effects, cfg=cfg, log=decisions.append)
+    fits = job.fits
+    found = search_effects(
+        problem, middle, candidate_effects(), job.max_effects, cfg=fits.cfg, log=decisions.append, fits=fits
+    )
     diagnosed = time.perf_counter()
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     job.folder.with_name(f"{job.case.name}.jsonl").write_bytes(as_lines(decisions))
@@ -127,10 +136,10 @@ def run_case(job: Job) -> dict[str, Any]:
         same = set(true_effects) == set(final.model.effects)
         if not same:
             follow = ReferenceUpdate(
-                fits=FITS, problem=problem, candidates=candidate_effects(), enough=found.data.floor
+                fits=fits, problem=problem, candidates=candidate_effects(), enough=found.data.floor
             ).follow
-            twins, final = follow(outcome.problem, _fit_with(outcome.problem, base, true_effects, truth))
-            with_truth = _rms(FITS.validation_errors(twins, FITS.to_whole(twins, [final]))[0])
+            twins, final = follow(outcome.problem, _fit_with(fits, outcome.problem, base, true_effects, truth))
+            with_truth = _rms(fits.validation_errors(twins, fits.to_whole(twins, [final]))[0])
         else:
             with_truth = _rms(outcome.final_errors)
     fitted = time.perf_counter()
@@ -176,19 +185,21 @@ def _base_error(job: Job, part: Literal["effects", "background"]) -> float:
     On the joints that have the effect.
     """
     problem, _ = _load(job, replace(job.case, part=part))
-    twins, base, _ = fit_base(FITS, problem, problem.space.to_physical(problem.space.start))
+    twins, base, _ = fit_base(job.fits, problem, problem.space.to_physical(problem.space.start))
     joints = torch.tensor([bool(re.fullmatch(job.case.joints, name)) for name in problem.joint_names])
-    square = FITS.validation_errors(twins, [base])[0].mse[joints].mean()
+    square = job.fits.validation_errors(twins, [base])[0].mse[joints].mean()
     return math.sqrt(max(float(square) - job.case.noise**2, 0.0))
 
 
-def _fit_with(twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]) -> Fitted:
+def _fit_with(
+    fits: Fits, twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]
+) -> Fitted:
     """The model that knows which effects there are; its search starts at the usual place."""
     model, physical, n = base.model, base.model.to_physical(base.x), base.model.num_joints
     for effect in effects:
         has = torch.tensor([name in str(truth["effects"][effect.name]) for name in twins.joint_names])
         model, physical = model.extended(physical, effect, has, start_values(effect, {}).repeat(n, 1))
-    return FITS.coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
+    return fits.coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
 
 
 def _rms(errors: BlockErrors) -> float:

@@ -492,6 +492,19 @@ class PaceDCMotor:
         if self.effects is not None:
             self.effects.state.time = time.expand_as(self.effects.state.time)
 
+    def flags(self) -> list[tuple]:
+        """Everything of the drive and its effects that is no tensor and can be compared: what Python branches over."""
+        stack = self.effects
+        things: list[Any] = [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
+        return [
+            tuple(
+                (key, frozenset(value) if isinstance(value, set) else value)
+                for key, value in vars(each).items()
+                if value is None or isinstance(value, (bool, int, float, str, set))
+            )
+            for each in things
+        ]
+
     def update_effects(self) -> None:
         """Take over changed parameters of the base model and of the effects."""
         if self.effects is not None:

@@ -100,7 +100,7 @@ def test_rivals_are_sent_to_the_recording_where_they_part(bench):
         models=dict(zip((STRIBECK, QUADRATIC), models, strict=True)),
     )
     outcome = outcome_of([1e-3], [2e-4], [STRIBECK], rounds=[this])
-    apart = distances(bench.problem, rivals_of(outcome)[0], [c.recording for c in menu(bench.problem, 0)])
+    (apart,) = distances(bench.problem, rivals_of(outcome), [[c.recording for c in menu(bench.problem, 0)]])
     (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1e-4], dtype=torch.float64))
     assert f"{1e3 * float(apart.max()):.2g} mrad" in sentence and "scripts/data_collection.py --task" in sentence
     (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1.0], dtype=torch.float64))
@@ -115,8 +115,11 @@ def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monk
     outcome = outcome_of([1e-3], [2e-4], [STRIBECK], rounds=[this])
     apart = {QUADRATIC: {1: 4e-3, 2: 9e-3}, GAIN: {1: 1e-3}}  # the first pair parts further on another recording
 
-    def distances_of(_, pair, recordings):
-        return torch.tensor([apart[pair.rival].get(k, 0.0) for k in range(len(recordings))])
+    def distances_of(_, pairs, recordings):
+        counts = map(len, recordings)
+        return [
+            torch.tensor([apart[p.rival].get(k, 0.0) for k in range(n)]) for p, n in zip(pairs, counts, strict=True)
+        ]
 
     monkeypatch.setattr(next_experiment, "distances", distances_of)
     noise = torch.tensor([1e-4], dtype=torch.float64)

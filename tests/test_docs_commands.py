@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from command_lines import ROOT, run_script
 from own_robot import write_robot
 
@@ -69,6 +70,8 @@ def test_commands_are_found():
 @pytest.mark.parametrize("line", documented())
 def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_path):
     script, words = taken_apart(line)
+    if any(word.startswith("cuda") for word in words) and not torch.cuda.is_available():
+        pytest.skip("needs a GPU and torch for CUDA")
     places = {"RUN": str(run), "DATA": str(run.parents[3] / "data" / "swing.csv")}
     words = [places.get(word, word) for word in words]
     done = run_script(script, *words, *SHORT.get(script, "").split(), cwd=tmp_path)

@@ -34,7 +34,7 @@ def replay(problem, values):
     """Sensed positions of one candidate at every control step, (T, R, n)."""
     rollout = problem.evaluator().rollout(1)
     rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
-    return torch.stack([position.clone() for _, position in rollout._samples()])
+    return torch.stack([position.clone() for _, position in rollout.samples()])
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_late_log_is_exact_on_a_cubic_motion(effect, parameter, value, lag, mo
         yield from (torch.full((1, 1), position(k * DT), dtype=torch.float64) for k in range(count))
 
     monkeypatch.setattr(rollout, "simulated", simulated)
-    got = torch.stack([sample[0, 0] for _, sample in rollout._samples()]).numpy()
+    got = torch.stack([sample[0, 0] for _, sample in rollout.samples()]).numpy()
     t = np.arange(steps) * DT
     late = t - lag(t)
     inside = late >= DT  # before, the robot stands where the recording begins

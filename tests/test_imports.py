@@ -23,7 +23,7 @@ FLOORS = {
         ["choices", "terminal", "recording", "excitation"],
         ["robot_logs", "plant", "export", "measured_effort"],
         ["problem"],
-        ["optimizers", "single_joint_model"],
+        ["optimizers", "single_joint_model", "one_kernel"],
         ["uncertainty"],
         ["run", "experiment_design"],
         ["report", "data_collection"],

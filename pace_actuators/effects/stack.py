@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -95,6 +96,10 @@ class EffectStack:
             for stage in _STAGES
         }
         self._step_begun = False
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Note what the effects do together."""
         self.acts_in_drive = any(self._at[stage] for stage in _IN_DRIVE)
         """Whether what is asked of the motor becomes another torque between its two limits."""
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
@@ -126,6 +131,15 @@ class EffectStack:
         """Let all effects of a stage act."""
         for act, view in self._at[stage]:
             act(view)
+
+    def of(self, effects: Sequence[Effect]) -> EffectStack:
+        """Some of its effects, with the same state and the same views of it."""
+        part = copy.copy(self)
+        part.effects = [effect for effect in self.effects if effect in effects]
+        part.cfgs = [cfg for effect, cfg in zip(self.effects, self.cfgs, strict=True) if effect in effects]
+        part._at = {stage: [each for each in acts if each[0].__self__ in effects] for stage, acts in self._at.items()}
+        part._arrange()
+        return part
 
     def find(self, name: str) -> Effect:
         """The effect of that name.

@@ -7,7 +7,7 @@ import torch
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options
 
 
 def main() -> None:
@@ -35,7 +35,9 @@ def main() -> None:
         "--no_refit", dest="refit", action="store_false", help="do not fit the robot with what was found"
     )
     add_common_options(parser, run=True)
+    add_device_option(parser)
     options = take_common_options(vars(parser.parse_args()))
+    options["device"] = options["device"] or "cpu"
 
     torch.set_num_threads(1)  # many small tensors
     run_and_tell(DiagnosisSettings(**options))

@@ -20,6 +20,7 @@ from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.denormals import flushed_denormals
 from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.on_gpu import fits_on
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import check_long_enough
 from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
@@ -70,6 +71,7 @@ def diagnose(
     check_folder(folder, anew=FILE)
     result = FitResult.load(folder)
     candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
+    fits = fits_on(settings.device, settings.cfg)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
     problem = run.problem(physics_dt=physics_dt, effects=())
     base = {name: result.parameters[name] for name in problem.space.slices}
@@ -85,6 +87,7 @@ def diagnose(
         result,
         cfg=settings.cfg,
         log=decisions.append,
+        fits=fits,
     )
     diagnosis = Diagnosis(
         run=str(folder),
@@ -96,7 +99,7 @@ def diagnose(
         shares={effect.name: share for effect, share in found.shares.items()},
         free_form=found.free_form,
         ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
-        sizes=sizes(Fits(cfg=settings.cfg), found.outcome, problem.joint_names),
+        sizes=sizes(fits, found.outcome, problem.joint_names),
         likes=likes(found.outcome),
         joints=by_joint(found, problem),
         data=[*found.data.sentences, *_about_run(found, problem, result)],
@@ -221,6 +224,7 @@ def search_effects(
     *,
     cfg: DiagnosisCfg | None = None,
     log: Log = unlogged,
+    fits: Fits | None = None,
 ) -> Findings:
     """Look for missing effects, each joint simulated alone.
 
@@ -233,12 +237,13 @@ def search_effects(
         run: The whole robot's own fit, if there is one.
         cfg: Its numbers.
         log: Gets every decision.
+        fits: Fits models; ``None``: on the processor.
 
     Raises:
         ValueError: If the validation recordings are too short to judge by.
     """
     cfg = cfg or DiagnosisCfg()
-    fits = Fits(cfg=cfg)
+    fits = fits or Fits(cfg=cfg)
     check_long_enough(problem.dataset.validation, problem.control_dt, cfg=cfg.judging)
     twins, base, effort = fit_base(fits, problem, physical, candidates, say)
     data = check_data(fits, problem, twins, base, run)

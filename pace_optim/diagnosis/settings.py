@@ -34,6 +34,9 @@ class DiagnosisSettings:
     """Whether the model with the effects found is fitted to the whole robot, as a run of its own; ``None``: where they
     are what is missing, or a curve explains it in their place."""
 
+    device: str = "cpu"
+    """Where single joints are simulated: ``cpu``, or a GPU as ``cuda:0``; in float64 on both."""
+
     cfg: DiagnosisCfg = field(default_factory=DiagnosisCfg)
     """Its numbers, and which of its rules are in force."""
 

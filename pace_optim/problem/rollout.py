@@ -112,20 +112,20 @@ class Rollout:
         data = self.dataset
         weights = (self._where.double() / self._where.sum()).to(self.env.dtype)
         counts = self._where.any(dim=1).tolist()
-        for k, sim_dof_pos in self._samples():
+        for k, sim_dof_pos in self.samples():
             self._step = k
             if counts[k]:
                 self.weight = self._rows(weights[k, :, None])
                 yield sim_dof_pos, self._rows(data.measured[k])
 
-    def _samples(self, at_steps: bool = False) -> Iterator[tuple[int, torch.Tensor]]:
+    def samples(self, at_steps: bool = False) -> Iterator[tuple[int, torch.Tensor]]:
         """Step and sensed positions at every control step, as late as the effects on the recording have them.
 
         Args:
             at_steps: Whether at the steps themselves, not at the instants of samples that were taken beside them.
         """
         steps, offset = self.duration_steps, None if at_steps else self.dataset.sample_offset
-        lag = self._observation_lag(steps)
+        lag = self.observation_lag(steps)
         if lag is None and offset is None:
             yield from enumerate(self.simulated(steps))
             return
@@ -153,7 +153,7 @@ class Rollout:
                 shown[late] = _interpolated(seen[:, late], at)
                 yield k, shown
 
-    def _observation_lag(self, steps: int) -> torch.Tensor | None:
+    def observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
         dt = self.env.step_dt
         shape = 2, self.env.num_envs, self.robot.num_joints
@@ -171,22 +171,25 @@ class Rollout:
 
     def simulated(self, steps: int) -> Iterator[torch.Tensor]:
         """Simulate that many control steps; yields the sensed positions at each, (num_envs, n) [rad]."""
-        data, enable = self.dataset, self.dataset.torque_enable
-        last = len(data.command) - 1
         for j in range(steps):
             yield self.robot.sensed_joint_pos()
             if j + 1 == steps:
                 break
-            k = min(j, last)
-            if enable is not None and (j == 0 or k in self._enable_changes):
-                for actuator in self.robot.actuators.values():
-                    actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
-            if data.command_vel is not None:
-                self.robot.set_joint_velocity_target(self._rows(data.command_vel[k]))
-            if data.command_effort is not None:
-                self.robot.set_joint_effort_target(self._rows(data.command_effort[k]))
-            self.env.simulate(self._rows(data.command[k]))
+            self.advance(j)
         self.simulated_steps += (steps - 1) * self.env.num_envs
+
+    def advance(self, step: int) -> None:
+        """Simulate a control step, the one after ``step``."""
+        data, enable = self.dataset, self.dataset.torque_enable
+        k = min(step, len(data.command) - 1)
+        if enable is not None and (step == 0 or k in self._enable_changes):
+            for actuator in self.robot.actuators.values():
+                actuator.set_torque_enable(self._rows(enable[k, :, None])[:, 0])
+        if data.command_vel is not None:
+            self.robot.set_joint_velocity_target(self._rows(data.command_vel[k]))
+        if data.command_effort is not None:
+            self.robot.set_joint_effort_target(self._rows(data.command_effort[k]))
+        self.env.simulate(self._rows(data.command[k]))
 
     def _rows(self, per_recording: torch.Tensor) -> torch.Tensor:
         """(R, m) to (num_envs, m): the same for every candidate."""
@@ -201,7 +204,7 @@ class Rollout:
 
     def positions_at_every_step(self) -> Iterator[torch.Tensor]:
         """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
-        for _, sim_dof_pos in self._samples(at_steps=True):
+        for _, sim_dof_pos in self.samples(at_steps=True):
             yield sim_dof_pos
 
     def begin(self, offset: torch.Tensor | float = 0.0) -> None:

@@ -51,18 +51,41 @@ class TwinSimulation(Simulation):
         self._shape = (-1, path.position.shape[1], len(self._columns))
         self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
-        # one tensor an interval: taking them out of a list costs nothing at each step
-        self._inertia, self._torque = path.feel.inertia.unbind(), path.feel.torque.unbind()
-        self._stiffness = path.stiffness[: self._intervals].unbind()
-        parts = [part / self._steps_per_interval for part in range(self._steps_per_interval)]
-        middle = 0.5 / self._steps_per_interval
-        self._middle = [_between(path.position, part + middle).unbind() for part in parts]
-        self._begin = [_between(path.position, part).unbind() for part in parts]
-        load = _at_instants(path.feel.load)
-        self._load = [_between(load, part).unbind() for part in parts]
+        self._inertia, self._torque, self._stiffness = (
+            _OneByOne(self.series(name)) for name in ("inertia", "torque", "stiffness")
+        )
+        self._middle, self._begin, self._load = (
+            [_OneByOne(self._in_part(name, part)) for part in range(self._steps_per_interval)]
+            for name in ("middle", "begin", "load")
+        )
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
         self._felt: tuple[int, torch.Tensor, torch.Tensor] | None = None
         """Of an interval, what joints carry in it: it is asked for several times."""
+
+    def series(self, name: str) -> torch.Tensor:
+        """What the reference gives at every control step, (T, R, n): also where it has ended.
+
+        Args:
+            name: ``inertia``, ``torque`` or ``stiffness``; of a physics step of the interval, such as ``middle.1``,
+                ``middle``, ``begin`` or ``load``; of a model effect, ``<effect>.<parameter>.inertia`` and so on.
+        """
+        if name in ("inertia", "torque"):
+            return getattr(self.path.feel, name)
+        if name == "stiffness":
+            return self.path.stiffness[: self._intervals]
+        kind, _, rest = name.partition(".")
+        if rest.isdigit():
+            last = self._steps_per_interval - 1
+            return torch.cat([self._in_part(kind, int(rest)), self._in_part(kind, last)[-1:]])
+        parameter, _, part = rest.partition(".")
+        return getattr(self.path.model_effects[kind, parameter], part)
+
+    def _in_part(self, name: str, part: int) -> torch.Tensor:
+        """A position or load in a physics step of each interval, (T - 1, R, n)."""
+        share = part / self._steps_per_interval
+        if name == "load":
+            return _between(_at_instants(self.path.feel.load), share)
+        return _between(self.path.position, share + (0.5 / self._steps_per_interval if name == "middle" else 0.0))
 
     def note_model_effect(self, effect: Effect, columns: torch.Tensor) -> None:
         """Take over the parameters of an effect on the model, of joints with these degrees of freedom."""
@@ -197,6 +220,23 @@ class TwinSimulation(Simulation):
             field.copy_(value.view(field.shape))
         else:
             field[:, self._columns] = value.view(len(field), -1)
+
+
+class _OneByOne:
+    """One tensor an interval: taking them out of a list costs nothing at each step, making it pays after the first."""
+
+    def __init__(self, values: torch.Tensor):
+        """Of (T, …)."""
+        self._values = values
+        self._list: tuple[torch.Tensor, ...] = ()
+
+    def __getitem__(self, interval: int) -> torch.Tensor:
+        """Of an interval."""
+        if not self._list:
+            if interval == 0:
+                return self._values[0]
+            self._list = self._values.unbind()
+        return self._list[interval]
 
 
 def _between(at_instants: torch.Tensor, part: float) -> torch.Tensor:

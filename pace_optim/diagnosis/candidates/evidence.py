@@ -12,7 +12,6 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.screening import free_columns, simulated_probes
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -55,11 +54,10 @@ def log_evidence(
     """
     coarse = problem.coarse()
     seen = fits.looked_at(coarse, [replace(fitted, tried=effect) for effect, fitted in models.items()])
-    found = parallel_map(
+    found = fits.shared_out(
         lambda own: [_of_model(fits, coarse, each, effects, effort) for each in own],
         seen,
         [each.tried for each in seen],
-        fits.cfg.fitting.stiff_cost,
     )
     return dict(zip(models, found, strict=True))
 

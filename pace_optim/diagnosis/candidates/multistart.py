@@ -8,7 +8,6 @@ import torch
 
 from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.fitting.side_by_side import Slot
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
@@ -28,9 +27,7 @@ def multistart(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[
         now: The present model.
         effects: What is tried.
     """
-    starts = parallel_map(
-        lambda own: _best_points(fits, problem, now, own), effects, effects, fits.cfg.fitting.stiff_cost
-    )
+    starts = fits.shared_out(lambda own: _best_points(fits, problem, now, own), effects, effects)
     return [start for of_effect in starts for start in of_effect]
 
 
@@ -50,7 +47,7 @@ def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequenc
     batch = fits.batch(problem, slots, training=True)
     where = batch.dataset.train.clone()
     where[int(cfg.fitting.part * len(where)) :] = False
-    scores = batch.simulate(values, where, cfg.fitting.stride).square().sum(dim=(1, 2))
+    scores = batch.simulate(values, where, cfg.fitting.stride).square().sum(dim=(1, 2)).cpu()
     result = []
     for effect, slot, points_of, score in zip(effects, slots, values, batch.split(scores), strict=True):
         every = torch.arange(len(score))

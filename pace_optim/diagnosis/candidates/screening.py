@@ -11,7 +11,6 @@ import torch
 from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.fitting.side_by_side import Slot
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, start_values
@@ -50,9 +49,7 @@ def screen(
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
     """
-    each = parallel_map(
-        lambda own: _screened(fits, problem, now, own, effort), effects, effects, fits.cfg.fitting.stiff_cost
-    )
+    each = fits.shared_out(lambda own: _screened(fits, problem, now, own, effort), effects, effects)
     return [probe for probes in each for probe in probes]
 
 
@@ -142,7 +139,7 @@ def simulated_probes(
         values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
     batch = fits.batch(problem, slots, training=True)
-    errors = batch.simulate(values, batch.dataset.train, stride)
+    errors = batch.simulate(values, batch.dataset.train, stride).cpu()
     return probes, errors[1:] - errors[:1], batch.dataset.train
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
 from pace_optim.diagnosis.fitting.processes import parallel_map
@@ -24,6 +25,8 @@ class Fits:
     cfg: DiagnosisCfg = field(default_factory=DiagnosisCfg)
     batch: Callable[..., SideBySide] = SideBySide
     """Makes what simulates: of a problem, slots, and whether only what is trained on is wanted."""
+    on_gpu: bool = False
+    """Whether it simulates on a GPU: the more at once, the better."""
 
     def coarse_to_fine(self, problem: TwinProblem, starts: Sequence[Fitted], rough: bool = False) -> list[Fitted]:
         """Go most of the way in windows at the control step, on at the problem's own, the rest on whole recordings.
@@ -90,12 +93,17 @@ class Fits:
             rough: Whether derivatives are taken over wide steps first.
             kept: Which of the recordings that are trained on count for which joints, (R, n) bool; all if not given.
         """
-        return parallel_map(
+        return self.shared_out(
             lambda own: self._fit(problem, own, max_iteration, keep_jacobian, part, rough, kept),
             starts,
             [start.tried for start in starts],
-            self.cfg.fitting.stiff_cost,
         )
+
+    def shared_out(self, work: Callable[[list], list], items: Sequence, effects: Sequence[type[Effect] | None]) -> list:
+        """``work(items)``: by :func:`parallel_map` on a processor, all at once on a GPU."""
+        if self.on_gpu:
+            return work(list(items))
+        return parallel_map(work, items, effects, self.cfg.fitting.stiff_cost)
 
     def validation_errors(self, problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
         """Errors of fitted models on the recordings that were not trained on."""
@@ -103,7 +111,7 @@ class Fits:
         where = batch.dataset.validation
         every = torch.zeros_like(where)
         every[: batch.dataset.last_step(where)] = True
-        errors = batch.simulate([m.physical[None] for m in models], every)
+        errors = batch.simulate([m.physical[None] for m in models], every).cpu()
         cfg = self.cfg.judging
         return [block_errors(error, where[: errors.shape[1]], problem.control_dt, cfg=cfg) for error in errors]
 
@@ -136,7 +144,7 @@ class Fits:
         """A model's RMSE in each window on each joint, (R, n) [rad]."""
         batch = self.batch(windows, [Slot(model=now.model, rows=1)], training=True)
         where = batch.dataset.train
-        error = batch.simulate([now.physical[None]], where)[0]
+        error = batch.simulate([now.physical[None]], where)[0].cpu()
         return (error.double().square().sum(dim=0) / where.sum(dim=0).clamp(min=1)[:, None]).sqrt()
 
     def _fit(
@@ -164,7 +172,7 @@ class Fits:
             errors = batch.split(batch.simulate(physical, where, cfg.stride))
             for way, x, error in zip(running, rows, errors, strict=True):
                 if not way.finished:  # where it ends must not depend on what is fitted beside it
-                    way.tell(x, error if kept is None else error * weight)
+                    way.tell(x, error if kept is None else error * weight.to(error.device))
             going = [way for way in running if not way.finished]
             if not going:
                 break

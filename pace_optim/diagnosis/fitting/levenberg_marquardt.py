@@ -68,7 +68,7 @@ class LevenbergMarquardt:
     def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
         """Take the best row of each joint."""
         size = self.x.shape[1]
-        scores = error.square().sum(dim=(1, 2), dtype=torch.float64) / self._samples
+        scores = error.square().sum(dim=(1, 2), dtype=torch.float64).cpu() / self._samples
         choice = [0, *range(1 + size, len(x))]
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
@@ -96,14 +96,14 @@ class LevenbergMarquardt:
         self._damping = torch.where(narrower, self._cfg.damping, self._damping)
         if bool(at_favoured.any()):
             difference = error[1 : 1 + size] - error[:1]
-            columns = difference / self._step.T[:, None, None, :].float()
-            hessian = torch.einsum("pkrj,skrj->jps", columns, columns).double() / self._samples[:, None, None]
-            gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).double() / self._samples[:, None]
+            columns = difference / self._step.T[:, None, None, :].to(error.device, torch.float32)
+            hessian = torch.einsum("pkrj,skrj->jps", columns, columns).cpu().double() / self._samples[:, None, None]
+            gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).cpu().double() / self._samples[:, None]
             self._hessian = torch.where(at_favoured[:, None, None], hessian, self._hessian)
             self._gradient = torch.where(at_favoured[:, None], gradient, self._gradient)
             self._converged |= at_favoured & ~narrower & self._at_the_bottom()
             if self._keep:
-                mask = at_favoured.float()
+                mask = at_favoured.to(error.device, torch.float32)
                 old_j = torch.zeros_like(columns) if self._jacobian is None else self._jacobian
                 old_e = torch.zeros_like(error[0]) if self._error is None else self._error
                 self._jacobian = columns * mask + old_j * (1 - mask)
@@ -127,8 +127,8 @@ class LevenbergMarquardt:
             x=self.x,
             score=self.score,
             tried=self.tried,
-            jacobian=self._jacobian,
-            error=self._error,
+            jacobian=None if self._jacobian is None else self._jacobian.cpu(),
+            error=None if self._error is None else self._error.cpu(),
             falls=self._falls(),
         )
 

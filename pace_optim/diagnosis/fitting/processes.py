@@ -35,7 +35,7 @@ _PR_SET_PDEATHSIG = 1
 def parallel_map(
     work: Callable[[list[Item]], list[Result]],
     items: Sequence[Item],
-    effects: Sequence[type[Effect] | None],
+    effects: Sequence[type[Effect] | None] | None = None,
     stiff_cost: float = 1.0,
 ) -> list[Result]:
     """``work(items)``, with the items shared out among as many processes as there are processors.
@@ -46,13 +46,14 @@ def parallel_map(
     Args:
         work: Gives one result per item, in order.
         items: What there is to do.
-        effects: The effect of each item; items of one effect stay together.
+        effects: The effect of each item; items of one effect stay together. ``None``: each item is on its own.
         stiff_cost: What an item of a stiff effect costs, as a multiple of another one's.
 
     Raises:
         RuntimeError: If a process ended without a result.
     """
-    shares = _shares(effects, _processes(), stiff_cost)
+    count = _processes()
+    shares = _dealt(len(items), count) if effects is None else _shares(effects, count, stiff_cost)
     if len(shares) < 2:
         return work(list(items))
     results: list[Result | None] = [None] * len(items)
@@ -75,6 +76,11 @@ def parallel_map(
 def _processes() -> int:
     forks = sys.platform == "linux" and multiprocessing.parent_process() is None
     return available_processors() if forks else 1
+
+
+def _dealt(items: int, count: int) -> list[list[int]]:
+    """Indices for each process, as many for each."""
+    return [list(range(items))[k::count] for k in range(min(count, items))]
 
 
 def _shares(effects: Sequence[type[Effect] | None], count: int, stiff_cost: float) -> list[list[int]]:

@@ -57,6 +57,14 @@ class SideBySide:
         Returns:
             (candidates, K, R, n) float32 [rad], zero where there is no sample; the slots one after another.
         """
+        bias = self._begin(physical, where)
+        steps = where.any(dim=1).nonzero()[:, 0][::stride]
+        errors = self._errors(bias, steps)
+        errors *= where[steps][:, None, :, None].to(errors.device)
+        return errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
+
+    def _begin(self, physical: Sequence[torch.Tensor], where: torch.Tensor) -> torch.Tensor:
+        """Write all parameter sets and begin; returns the encoders' biases, (candidates, R, n) [rad]."""
         rollout, count = self.rollout, self.dataset.num_recordings
         rollout.env.scene.reset()
         base = torch.cat([values[..., : len(BASE)] for values in physical]).repeat_interleave(count, dim=0)
@@ -65,15 +73,16 @@ class SideBySide:
         rollout.look_at(where)
         rollout.begin()
         bias = base[..., BASE.index("encoder_bias")]
-        steps = where.any(dim=1).nonzero()[:, 0][::stride]
+        return bias.view(self._num_candidates, count, bias.shape[1])
+
+    def _errors(self, bias: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
+        """Simulated less measured positions at some control steps, (K, candidates, R, n) float32 [rad]."""
         index = {int(step): i for i, step in enumerate(steps)}
-        shape = (self._num_candidates, count, bias.shape[1])
-        errors, bias = torch.zeros(len(steps), *shape, dtype=torch.float32), bias.view(shape)
-        for step, sim in enumerate(rollout.positions_at_every_step()):
+        errors = torch.zeros(len(steps), *bias.shape, dtype=torch.float32)
+        for step, sim in self.rollout.samples():
             if step in index:
-                errors[index[step]] = (sim.view(shape) - bias).sub_(self.dataset.measured[step])
-        errors *= where[steps][:, None, :, None]
-        return errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
+                errors[index[step]] = (sim.view(bias.shape) - bias).sub_(self.dataset.measured[step])
+        return errors
 
     def split(self, values: torch.Tensor) -> list[torch.Tensor]:
         """The parts of something with one row per candidate, slot by slot."""

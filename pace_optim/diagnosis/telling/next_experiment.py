@@ -10,6 +10,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
+from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import found_effects
 from pace_optim.diagnosis.model.model import whole_values
@@ -17,7 +18,7 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.excitation import make_excitation
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
-from pace_optim.recording.dataset import make_dataset
+from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.terminal.cli import command
 
 _MOTIONS = ("chirp", "multisine", "ramp", "steps")
@@ -69,7 +70,13 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
     pairs = rivals_of(outcome)
     if not pairs or problem.env_cfg.sim2real.excitation is None:
         return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
-    predictions = [each for pair in pairs for each in _predictions(problem, pair, noise, outcome.cfg.verdict)]
+    menus = [list(menu(problem, pair.joints[0], cfg=outcome.cfg.verdict)) for pair in pairs]
+    apart = distances(problem, pairs, [[choice.recording for choice in choices] for choices in menus])
+    predictions = [
+        Prediction(pair=pair, choice=choice, apart=each, times=each / float(noise[pair.joints].mean()))
+        for pair, choices, own in zip(pairs, menus, apart, strict=True)
+        for choice, each in zip(choices, own.tolist(), strict=True)
+    ]
     result = []
     clear = [each for each in predictions if each.times >= outcome.cfg.judging.far]
     while clear:
@@ -83,16 +90,6 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
         text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
         result.append(f"{text} {_hint(pair)}".rstrip())
     return result
-
-
-def _predictions(problem: Problem, pair: Rivals, noise: torch.Tensor, cfg: VerdictCfg) -> list[Prediction]:
-    choices = list(menu(problem, pair.joints[0], cfg=cfg))
-    apart = distances(problem, pair, [choice.recording for choice in choices]).tolist()
-    level = float(noise[pair.joints].mean())
-    return [
-        Prediction(pair=pair, choice=choice, apart=each, times=each / level)
-        for choice, each in zip(choices, apart, strict=True)
-    ]
 
 
 def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
@@ -163,15 +160,30 @@ def menu(problem: Problem, joint: int, *, cfg: VerdictCfg = DEFAULT.verdict) -> 
             )
 
 
-def distances(problem: Problem, pair: Rivals, recordings: Sequence[Recording]) -> torch.Tensor:
-    """RMS difference of two models' predictions on each recording, over the joints of the pair, (R,) [rad]."""
-    data = make_dataset(recordings, train_fraction=1)
-    errors = []
-    for fitted in pair.models:
-        own = replace(problem.with_effects(found_effects(fitted.model, problem.joint_names)), dataset=data)
-        values = own.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
-        errors.append(own.evaluator().residuals(values[None], data.sampled).error[0][..., pair.joints])
-    return (errors[0] - errors[1]).square().mean(dim=(0, 2)).sqrt()
+def distances(
+    problem: Problem, pairs: Sequence[Rivals], recordings: Sequence[Sequence[Recording]]
+) -> list[torch.Tensor]:
+    """RMS difference of two models' predictions on each recording, over the joints of the pair, (R,) [rad] each.
+
+    Args:
+        problem: The whole robot.
+        pairs: Pairs of models.
+        recordings: What each pair is simulated on.
+    """
+    datasets = [make_dataset(own, train_fraction=1) for own in recordings]
+    items = [(fitted, data) for pair, data in zip(pairs, datasets, strict=True) for fitted in pair.models]
+    errors = parallel_map(lambda own: [_predicted(problem, fitted, data) for fitted, data in own], items)
+    return [
+        (errors[2 * i] - errors[2 * i + 1])[..., pair.joints].square().mean(dim=(0, 2)).sqrt()
+        for i, pair in enumerate(pairs)
+    ]
+
+
+def _predicted(problem: Problem, fitted: Fitted, data: Dataset) -> torch.Tensor:
+    """A model's motion on recordings, less what is written there, (K, R, n) [rad]."""
+    own = replace(problem.with_effects(found_effects(fitted.model, problem.joint_names)), dataset=data)
+    values = own.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
+    return own.evaluator().residuals(values[None], data.sampled).error[0]
 
 
 def _other_gain(like: Recording, cfg: VerdictCfg) -> Iterator[tuple[str, str, Recording]]:

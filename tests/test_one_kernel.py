@@ -1,0 +1,191 @@
+"""The single-joint simulation as one kernel moves as itself: on a GPU, and what g++ makes of the same C."""
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
+
+from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.fitting.on_gpu import KernelSideBySide, fits_on
+from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
+from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.one_kernel import NotTraceableError
+from pace_optim.one_kernel.nvrtc import kernels_of
+from pace_optim.single_joint_model import reference_path, twin_problem
+
+STEPS = 80
+"""Control steps that are simulated."""
+
+
+class HostKernels:
+    """The same source for the processor, compiled in one go."""
+
+    def __init__(self, folder):
+        self.folder, self.functions = folder, {}
+
+    def compile(self, sources):
+        new = [source for source in dict.fromkeys(sources) if source not in self.functions]
+        if not new:
+            return
+        parts = [
+            f"namespace n{i} {{{source.replace('simulate(', f'simulate_{i}(')}\n}}\n" for i, source in enumerate(new)
+        ]
+        path = self.folder / f"k{len(self.functions)}.cpp"
+        path.write_text("#include <math.h>\n" + "".join(parts))
+        library = path.with_suffix(".so")
+        subprocess.run(["g++", "-O0", "-ffp-contract=off", "-shared", "-fPIC", path, "-o", library], check=True)
+        loaded = ctypes.CDLL(str(library))
+        self.functions.update({source: getattr(loaded, f"simulate_{i}") for i, source in enumerate(new)})
+
+    def launch(self, source, threads, width, arguments):
+        values = [ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int(a) for a in arguments]
+        self.functions[source](*values)
+
+
+@pytest.fixture(scope="module", params=["processor", "GPU"])
+def kernels(request, tmp_path_factory):
+    """What compiles, and where it runs."""
+    if request.param == "GPU":
+        if not torch.cuda.is_available():
+            pytest.skip("needs a GPU and torch for CUDA")
+        device = torch.device("cuda", 0)
+        return {"compiler": kernels_of(device), "device": device}
+    if shutil.which("g++") is None:
+        pytest.skip("needs g++")
+    return {"compiler": HostKernels(tmp_path_factory.mktemp("kernels")), "device": torch.device("cpu")}
+
+
+def slots_of(problem, start, *sets):
+    """The base model, and one with each set of effects at where searches for them start; values (n, P) of each."""
+    here = torch.ones(len(start), dtype=torch.bool)
+    result = [(JointModel.base(problem), start)]
+    for effects in sets:
+        model, physical = result[0]
+        for effect in effects:
+            values = torch.tensor([[p.start for p in effect.parameters]], dtype=torch.float64).repeat(len(start), 1)
+            model, physical = model.extended(physical, effect, here, values)
+        result.append((model, physical))
+    return result
+
+
+def both(problem, models, kernels, training=True):
+    """Errors of models by the simulation and by kernels, which tell what they cannot do; two candidates of each."""
+    slots = [Slot(model=model, rows=2) for model, _ in models]
+    rows = [torch.stack([values, values * 1.01]) for _, values in models]
+    batches = SideBySide(problem, slots, training), KernelSideBySide(problem, slots, training, **kernels)
+    where = (batches[0].dataset.train if training else batches[0].dataset.sampled).clone()
+    where[STEPS:] = False
+    expected, got = (SideBySide.simulate(batch, rows, where, 2) for batch in batches)
+    again = SideBySide.simulate(batches[1], rows, where, 2)
+    assert torch.equal(got, again)
+    return expected, got.cpu()
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A joint alone on two short recordings, with a payload's influence along its reference."""
+    recordings = [record(chirp(0.5, 2.0, 6.0, size), CALM) for size in (0.5, 0.3)]
+    problem = make_problem(recordings).with_physics_dt(DT / 2)
+    path = reference_path(problem, physical(problem, CALM), ["payload", "com_offset"])
+    start = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64)
+    return SimpleNamespace(problem=problem, twins=twin_problem(problem, path), start=start)
+
+
+@pytest.fixture(scope="module")
+def legs():
+    """A robot of twelve joints that move each other, with a payload's influence along its reference."""
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.5), TRUTH, cfg=cfg), cfg=cfg)
+    path = reference_path(problem, problem.space.from_dict(TRUTH), ["payload", "com_offset"])
+    start = torch.tensor([[TRUTH[name] for name in BASE]], dtype=torch.float64).repeat(12, 1)
+    return SimpleNamespace(problem=problem, twins=twin_problem(problem, path).with_physics_dt(0.00125), start=start)
+
+
+def test_every_effect_moves_a_joint_as_in_the_simulation(kernels, bench):
+    names = available_effects()
+    models = slots_of(bench.problem, bench.start, *([get_effect(name)] for name in names))
+    expected, got = both(bench.twins.in_windows(), models, kernels)
+    apart = dict(zip(["base", *names], (expected - got).abs().amax(dim=(1, 2, 3))[::2].tolist(), strict=True))
+    assert max(apart.values()) < 1e-8, apart
+
+
+def test_several_joints_recordings_and_effects_at_once(kernels, legs):
+    sets = (["payload"], ["com_offset", "backlash"], ["measurement_delay", "stribeck_friction", "torque_gain"])
+    models = slots_of(legs.problem, legs.start, *([get_effect(name) for name in names] for names in sets))
+    expected, got = both(legs.twins, models, kernels)
+    assert float((expected - got).abs().max()) < 1e-8
+    rows = expected[::2]
+    assert all(float((row - rows[0]).abs().max()) > 1e-5 for row in rows[1:])
+
+
+def test_drives_that_delay_their_torque_or_run_at_control_steps(kernels, bench):
+    for delay_mode in ("command", "effort"):
+        cfg = env_cfg()
+        for drive in cfg.scene.robot.actuators.values():
+            drive.delay_mode, drive.control_decimation = delay_mode, cfg.decimation
+        problem = make_problem(bench.problem.dataset.recordings[0], cfg=cfg).with_physics_dt(0.000625)
+        twins = twin_problem(problem, bench.twins.path.select([0]))
+        models = slots_of(problem, bench.start, [get_effect("other_delay"), get_effect("integral_gain")])
+        expected, got = both(twins, models, kernels)
+        assert float((expected - got).abs().max()) < 1e-8
+
+
+def test_drives_that_are_switched_off_and_samples_beside_the_steps(kernels, bench):
+    data = bench.twins.dataset
+    enable = torch.ones_like(data.sampled)
+    enable[20:45] = False
+    offset = torch.linspace(-0.5, 0.5, len(enable), dtype=torch.float64)[:, None].expand(enable.shape)
+    twins = replace(bench.twins, dataset=replace(data, torque_enable=enable, sample_offset=offset))
+    sets = (["off_damping"], ["measurement_delay", "backlash"])
+    models = slots_of(bench.problem, bench.start, *([get_effect(name) for name in names] for names in sets))
+    expected, got = both(twins, models, kernels)
+    assert float((expected - got).abs().max()) < 1e-8
+    assert float((expected - both(bench.twins, models, kernels)[0]).abs().max()) > 1e-3
+
+
+class Branching(Effect):
+    """An effect of a user's that asks for a tensor's values."""
+
+    name = "branching"
+    stage = "transmission"
+    parameters = (EffectParameter(name="effort", unit="N m", lower=-1.0, upper=1.0, null=0.0, start=0.1),)
+
+    def transmission(self, s):
+        if bool((s.joint_pos > 0).any()):
+            s.effort += self.effort
+
+
+def test_the_processor_simulates_what_no_kernel_can(kernels, bench, monkeypatch):
+    monkeypatch.setitem(registry._EFFECTS, Branching.name, Branching)
+    models = slots_of(bench.problem, bench.start, [Branching])
+    with pytest.raises(NotTraceableError, match="any"):
+        both(bench.twins, models, kernels)
+    slots, values = [Slot(model=model, rows=1) for model, _ in models], [own[None] for _, own in models]
+    batches = SideBySide(bench.twins, slots, True), KernelSideBySide(bench.twins, slots, True, **kernels)
+    where = batches[0].dataset.train.clone()
+    where[20:] = False
+    expected, got = (batch.simulate(values, where) for batch in batches)
+    assert torch.equal(expected, got.cpu()) and got.device == kernels["device"]
+
+
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="torch finds"):
+        fits_on("cuda:99", DEFAULT)
+
+
+def test_no_recording_leaves_a_trace_in_the_drives(kernels, bench):
+    """A batch that was simulated by kernels goes on as one that was not."""
+    model, values = slots_of(bench.problem, bench.start, [get_effect("backlash")])[1]
+    slots = [Slot(model=replace(model), rows=1)]
+    one, other = SideBySide(bench.twins, slots, True), KernelSideBySide(bench.twins, slots, True, **kernels)
+    where = one.dataset.train.clone()
+    where[30:] = False
+    other.simulate([values[None]], where)
+    other._kernels = None
+    assert torch.equal(one.simulate([values[None]], where), other.simulate([values[None]], where).cpu())
