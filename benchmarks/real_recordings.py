@@ -59,6 +59,9 @@ def main() -> None:
         if name == "fit":
             command.add_argument("--optimizer", choices=OPTIMIZERS, help="default: what the robot needs")
             command.add_argument("--effects", nargs="+", default=[], metavar="NAME", help="physical effects to add")
+            command.add_argument(
+                "--unknown", nargs="+", default=[], metavar="FACT", help="facts of the drive to identify"
+            )
             command.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step")
             command.add_argument("--delay_mode", help="command or effort")
             command.add_argument("--seed", type=int, default=0)
@@ -84,7 +87,7 @@ def fit_command(args: argparse.Namespace) -> None:
     """Convert, fit with the documented split, print errors by recording, draw."""
     robot = ROBOTS[args.robot]
     paths = {path.stem: str(path) for path in convert_robot(robot, args.source, args.output, args.whole)}
-    more = {"effects": args.effects} if args.effects else {}
+    more = {"effects": args.effects, "unknown": args.unknown}
     settings = FitSettings(
         task=robot.task,
         data=[paths[stem] for stem in robot.train],

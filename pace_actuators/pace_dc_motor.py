@@ -182,6 +182,8 @@ class PaceDCMotor:
         self.update_time_lags(delay)
         self._delays.set_lead(self._lead)
         self.effects = self._make_effects(dt)
+        held = not cfg.implicit and cfg.delay_mode == "command"
+        self._feeds_back = held and self.effects is not None and self.effects.has("feedback")
         self.update_effects()
 
     @property
@@ -240,6 +242,8 @@ class PaceDCMotor:
         self._asked = asked
         if self.centred and not first and asked is not before:
             asked = 0.5 * (before + asked)
+        if self._feeds_back:
+            asked, self._loop_slope = self.effects.fed_back(asked)  # type: ignore[union-attr]
         effort = self.drive_effort(asked, joint_pos, joint_vel)
         if self.effects is not None:
             effort = self.transmitted_effort(effort)
@@ -416,7 +420,8 @@ class PaceDCMotor:
     @property
     def changes_passive(self) -> bool:
         """Whether ``joint_friction`` and ``joint_viscous_friction`` change from call to call."""
-        return self.holds_line or self.cfg.implicit or (self.effects is not None and self.effects.changes_passive)
+        own = self.holds_line or self.cfg.implicit or self._feeds_back
+        return own or (self.effects is not None and self.effects.changes_passive)
 
     @property
     def needs_load(self) -> bool:

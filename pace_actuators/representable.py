@@ -75,7 +75,7 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
                 f"{kind.name} depends on the joint's inertia at every physics step, which {world.name} cannot do. "
                 "Fit again without it, or train elsewhere."
             )
-        if kind.overrides("friction") or kind.overrides("transmission"):
+        if any(kind.overrides(stage) for stage in ("feedback", "friction", "transmission")):
             if not world.friction_per_step:
                 raise ValueError(
                     f"{kind.name} changes the joint's friction at every physics step, which {world.name} cannot do. "

@@ -10,6 +10,7 @@ from bench_recordings import Bench, chirp, record
 from pace_actuators import PaceDCMotorCfg
 from pace_optim.fit import fit
 from pace_optim.problem.problem import load_problem
+from pace_optim.problem.unknown_facts import started_from
 from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 
@@ -108,6 +109,13 @@ def test_what_the_torque_says_is_no_longer_unknown(tmp_path, soft):
         both.dataset.recordings[0].drive.stiffness[0]
         == json.loads(soft[0].with_suffix(".json").read_text())["stiffness"]
     )
+
+
+def test_a_refit_of_a_diagnosis_starts_unknown_facts_where_the_run_had_them():
+    run = {"friction": {"j": 0.1}, "proportional_gain.gain": {"j": 2.0}, "torque_limit.effort": {"j": 8.0}}
+    found = {"friction": {"j": 0.2}, "torque_gain.gain": {"j": 0.5}, "torque_limit.effort": {"j": 7.0}}
+    assert started_from(found, run, ["stiffness", "effort_limit"]) == {**found, "proportional_gain.gain": {"j": 2.0}}
+    assert started_from(found, run, []) == found
 
 
 def test_an_effect_that_is_named_too_is_there_once(soft):

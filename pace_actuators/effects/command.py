@@ -215,6 +215,49 @@ class DerivativeGain(Effect):
 
 
 @register_effect
+class FastLoop(Effect):
+    """The drive's own loop runs faster than commands come: between two of them its torque follows the motion.
+
+    With q₀ and v₀ what the controller saw at the last command: τ - s (kp (q - q₀) + kd (v - v₀)). A loop of period h
+    under commands of period Δt is s = 1 - h/Δt.
+    """
+
+    name = "fast_loop"
+    stage = "controller"
+    parameters = (
+        EffectParameter(
+            name="share", unit="1", lower=0.0, upper=1.0, null=0.0, start=0.5, possible=(0.0, 1.0),
+            meaning="1 for a loop that runs continuously, 0 for one that runs with its commands",
+        ),
+    )  # fmt: skip
+    equation = "τ - s (kp (q - q₀) + kd (v - v₀)), q₀ and v₀ as at the last command"
+    looks = "viscous friction and delay change from gain set to gain set"
+    source = "position loops of servo drives, which run at 1 to 20 kHz whatever the bus does; drive_dt states it"
+    probes = ({"share": 0.5}, {"share": 1.0})
+    two_sided = False
+    separates = "recordings at another proportional gain"
+    share: torch.Tensor
+
+    def prepare(self) -> None:
+        """Where the controller last ran."""
+        if not hasattr(self, "_seen"):
+            self._seen, self._speed = self.zeros(), self.zeros()
+
+    def controller(self, s: DriveState) -> None:
+        """Remember what it sees."""
+        self._seen, self._speed = s.joint_pos.clone(), s.joint_vel.clone()
+
+    def feedback(self, s: DriveState) -> None:
+        """Follow the motion: up to here, and within the step."""
+        moved, faster, slope = s.joint_pos - self._seen, s.joint_vel - self._speed, s.damping
+        if self.is_trapezoidal:  # the law of the middle of the step
+            half = 0.5 * self.dt
+            moved, slope = moved + half * s.joint_vel, slope + half * s.stiffness
+        s.effort -= self.share * (s.stiffness * moved + s.damping * faster)
+        s.speed_slope += self.share * slope
+
+
+@register_effect
 class IntegralGain(Effect):
     """The controller integrates its error, which the recording does not say: τ + I.
 

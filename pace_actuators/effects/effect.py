@@ -205,6 +205,13 @@ class Effect:
     def effort_command(self, s: DriveState) -> None:
         """Once per physics step, after the controller and its delay: change ``s.effort``."""
 
+    def feedback(self, s: DriveState) -> None:
+        """Once per physics step, before the limits: let ``s.effort`` follow the motion since the controller ran.
+
+        ``s.speed_slope`` is how fast it falls with the speed within the step. Not called where the controller runs
+        continuously, or its torque is delayed.
+        """
+
     def current_limit(self, s: DriveState) -> None:
         """Once per physics step, where the drive limits what is asked of it: change ``s.effort``."""
 

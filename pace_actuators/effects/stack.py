@@ -25,6 +25,7 @@ _STAGES = (
     "controller",
     "controller_effort",
     "effort_command",
+    "feedback",
     *_IN_DRIVE,
     "friction",
     "transmission",
@@ -246,6 +247,14 @@ class EffectStack:
         self.state.effort = effort
         self.run("effort_command")
         return self.state.effort.clone()
+
+    def fed_back(self, effort: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The torque that is asked as it follows the motion [N m], and how fast it falls with the speed in the step."""
+        s = self.state
+        s.effort = effort
+        s.speed_slope.zero_()
+        self.run("feedback")
+        return s.effort.clone(), s.speed_slope.clone()
 
     def given_by_drive(
         self, effort: torch.Tensor, speed_slope: torch.Tensor | None = None

@@ -41,6 +41,7 @@ from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import explained_joints, likes, ranking, restrict_to, verdict
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem
+from pace_optim.problem.unknown_facts import started_from
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
@@ -166,7 +167,11 @@ def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, pr
         effects=found.paying,
         optimizer="least_squares",
         physics_dt=problem.physics_dt,
-        start=whole_values(final.model, final.x, problem.joint_names),
+        start=started_from(
+            whole_values(final.model, final.x, problem.joint_names),
+            FitResult.load(run.folder).parameters,
+            problem.unknown,
+        ),
         check_consistency=False,  # the run has done it
         log_dir=str(run.folder.absolute().parent.parent),
     )

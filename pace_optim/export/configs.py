@@ -107,7 +107,8 @@ def _is_implicit(drives: IdentifiedDrives) -> bool:
 
 def _changes_friction(drives: IdentifiedDrives) -> bool:
     kinds = [effect.effect_class for effect in drives.effects]
-    return _is_implicit(drives) or any(k.overrides("friction") or k.overrides("transmission") for k in kinds)
+    stages = ("feedback", "friction", "transmission")
+    return _is_implicit(drives) or any(kind.overrides(stage) for kind in kinds for stage in stages)
 
 
 def _groups(drives: IdentifiedDrives, **extra: str) -> str:

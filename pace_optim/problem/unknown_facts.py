@@ -43,6 +43,15 @@ def with_unknown(effects: Sequence[EffectCfg | str], facts: Iterable[str]) -> li
     return [*effects, *(name for name in wanted if name not in named)]
 
 
+def started_from(
+    values: Mapping[str, Mapping[str, float]], before: Mapping[str, Mapping[str, float]], facts: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """Parameters to start a fit from that also seeks unknown facts: where they lack those, as they were before."""
+    effects = {UNKNOWN_FACTS[fact] for fact in facts}
+    own = {name: dict(entries) for name, entries in before.items() if name.split(".")[0] in effects}
+    return own | {name: dict(entries) for name, entries in values.items()}
+
+
 def lift_limits(
     cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], facts: Iterable[str]
 ) -> tuple[list[Recording], dict[str, dict[str, tuple[float, float, float]]]]:
