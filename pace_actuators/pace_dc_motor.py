@@ -47,6 +47,7 @@ class PaceDCMotor:
         τ     = kp (q* - q_enc) + kd (q̇* - q̇) + τ_ff        q*, q̇*, τ_ff delayed  (delay_mode "command")
         τ     = τ(t - delay)                                  the torque delayed     (delay_mode "effort")
         ------- held until the controller runs again; a command that arrives in between acts at once -------
+        (the effect fast_loop lets τ follow the motion in between)
         τ     = clip(τ, ± effort_limit)                       limit of what is asked, a current limit
         τ     = clip(τ, τ_min(v), τ_max(v))                   torque-speed line
         τ     = 0 where the drive is disabled
