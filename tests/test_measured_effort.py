@@ -113,7 +113,7 @@ def test_what_nobody_stated_is_taken_from_the_torque():
     assert (drive.stiffness[0], drive.damping[0], drive.effort_limit[0]) == pytest.approx((40, 1, 8), rel=0.01)
     assert found.taken["stiffness"] == {"servo"} and found.delay_bounds == pytest.approx((2, 4), abs=0.01)
     assert len(found.notes) == 2 and "kp 40 " in found.notes[0] and "7.5 ms" in found.notes[0]
-    assert "stated as 85" in found.warnings[0] and "says 40" in found.warnings[0] and "is used" in found.warnings[0]
+    assert "configured as 85" in found.warnings[0] and "says 40" in found.warnings[0] and "is used" in found.warnings[0]
 
 
 def test_what_is_stated_holds_and_a_contradiction_is_told_with_both_numbers():
@@ -141,7 +141,7 @@ def test_nothing_is_read_where_there_is_no_torque():
     recording = replace(recorded(), dof_effort=None)
     assert read_law(recording, 0, 10) is None
     found = drives(recording)
-    assert found.recordings == (recording,) and not found.notes and not found.to_dict()
+    assert found.recordings[0].drive is recording.drive and not found.notes and not found.to_dict()
 
 
 def test_torque_of_a_drive_that_is_off_says_nothing():
@@ -178,3 +178,26 @@ def test_a_log_with_its_drives_own_torque_says_gains_and_delay(tmp_path):
     assert DT * law["delay"] == pytest.approx(0.005, abs=1e-5) and law["limit"] is None
     low, high = (float(bound[problem.space["delay"]]) for bound in (problem.space.lower, problem.space.upper))
     assert (low, high) == pytest.approx((1, 3), abs=0.01)
+
+
+def test_a_log_at_another_rate_than_the_drive_is_read_at_its_own_samples():
+    rng = np.random.default_rng(3)
+    fine = np.arange(0, 8, 1e-4)
+    moved, target = sines(fine - 0.01, 2, 0.1), sines(fine, 1, 0.1)
+    ticks = np.arange(0, len(fine), 25)  # the drive runs at 400 Hz, commands come at 200 Hz
+    command = target[(ticks // 50) * 50]
+    torque = 40.0 * (command[np.maximum(np.arange(len(ticks)) - 2, 0)] - moved[ticks]) - np.gradient(moved, 1e-4)[ticks]
+    rows = np.unique(np.clip(np.arange(0, len(fine), 20) + rng.integers(-1, 2, len(fine) // 20), 0, None))
+    recording = Recording(
+        name="r",
+        joint_names=("servo",),
+        time=fine[rows],
+        dof_pos=moved[rows, None],
+        dof_vel=np.gradient(moved, 1e-4)[rows, None],
+        dof_effort=torque[rows // 25, None],
+        des_dof_pos=target[::50, None],
+        des_time=fine[::50],
+    )
+    law = read_law(conform_recording(recording, joint_order=("servo",), control_dt=DT), 0, 10)
+    assert law.stiffness == pytest.approx(40, rel=0.03) and law.damping == pytest.approx(1, rel=0.03)
+    assert 2 - law.resolution <= law.delay <= 2 + law.resolution

@@ -128,7 +128,7 @@ def _with_facts(
         if fact in taken:
             facts[fact] = values
     changed = replace(recording, drive=replace(recording.drive, **facts)) if facts else recording
-    return _with_feed_forward(changed, laws), taken, said
+    return _with_feed_forward(replace(changed, logged=None), laws), taken, said
 
 
 def _value(law: MeasuredLaw, fact: str) -> tuple[float | None, float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pace_optim.recording import Recording
 
-from .table import FEEDBACK_LAGS, Table
+from .table import Table
 
 SURE = 5.0
 """Standard deviations, and ..."""
@@ -111,8 +111,8 @@ class _Fit:
     """Their columns as combinations of the table's, (m, p)."""
     command_lag: float
     """[control steps]."""
-    feedback_lag: int
-    """[samples]."""
+    feedback_lag: float
+    """[control steps]."""
 
     @cached_property
     def columns(self) -> np.ndarray:
@@ -160,8 +160,8 @@ class _Moments:
 
 def _terms(table: Table, command_lag: float, feedback: int, speed: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
     """Coefficients and their columns, where commands are so many control steps late: a mix of two whole ones."""
-    at = command_lag - table.first_lag
-    whole = int(np.clip(np.floor(at), 0, len(next(iter(table.commands.values()))) - 2))
+    at = (command_lag - table.command_lags[0]) / (table.command_lags[1] - table.command_lags[0])
+    whole = int(np.clip(np.floor(at), 0, len(table.command_lags) - 2))
     weights = (1 - (at - whole), at - whole)
     found: dict[str, np.ndarray] = {}
 
@@ -192,21 +192,29 @@ def _best_lags(table: Table, below: np.ndarray) -> _Fit:
     of Bayes).
     """
     moments = _Moments(table, below)
-    lags = range(table.first_lag, table.first_lag + len(next(iter(table.commands.values()))) - 1)
+    lags = table.command_lags[:-1]
     tried = [
         (moments.error(_terms(table, lag, f, speed)[1]), lag, f, s)
         for s, speed in enumerate(table.speeds)
-        for f in range(len(FEEDBACK_LAGS))
+        for f in range(len(table.feedback_lags))
         for lag in lags
     ]
-    of_now = min(each for each in tried if FEEDBACK_LAGS[each[2]] == 0)
+    of_now = min(each for each in tried if table.feedback_lags[each[2]] == 0)
     best = min(tried)
     least = np.finfo(float).tiny  # of a sum of squares that may be zero
     evidence = below.sum() * (np.log(max(of_now[0], least)) - np.log(max(best[0], least)))
     _, lag, f, s = best if evidence > np.log(below.sum()) else of_now
-    finer = _minimum(lambda at: moments.error(_terms(table, at, f, table.speeds[s])[1]), lag - 1.0, lag + 1.0)
+    step = lags[1] - lags[0]
+    finer = _minimum(lambda at: moments.error(_terms(table, at, f, table.speeds[s])[1]), lag - step, lag + step)
     names, terms = _terms(table, finer, f, table.speeds[s])
-    return _Fit(table=table, below=below, names=names, terms=terms, command_lag=finer, feedback_lag=FEEDBACK_LAGS[f])
+    return _Fit(
+        table=table,
+        below=below,
+        names=names,
+        terms=terms,
+        command_lag=float(finer),
+        feedback_lag=float(table.feedback_lags[f]),
+    )
 
 
 def _minimum(error, low: float, high: float) -> float:  # type: ignore[no-untyped-def]
@@ -262,9 +270,9 @@ def _law(joint: str, table: Table, fit: _Fit, limit: float | None) -> MeasuredLa
         feed_forward=value.get("feed_forward"),
         offset=value["offset"],
         std=std,
-        delay=fit.command_lag - fit.feedback_lag * table.stride,
-        feedback_lag=float(fit.feedback_lag * table.stride),
-        resolution=float(table.stride),
+        delay=fit.command_lag - fit.feedback_lag,
+        feedback_lag=fit.feedback_lag,
+        resolution=max(1.0, table.stride),
         limit=limit,
         peak=float(np.abs(table.torque).max()),
         r_squared=1.0 - float(left.var() / torque.var()) if torque.var() else 0.0,

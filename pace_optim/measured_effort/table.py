@@ -8,11 +8,15 @@ import numpy as np
 
 from pace_optim.recording import Recording
 
-FEEDBACK_LAGS = (-1, 0, 1, 2, 3)
+_FEEDBACK_LAGS = (-1.0, 0.0, 1.0, 2.0, 3.0)
 """Samples by which a log's torque may come later than the position that it was made of."""
+_BETWEEN = (-0.5, 0.5, 1.5)
+"""More of them where a log's samples are not those of the drive."""
 _MOST_SAMPLES = 20_000
 """More say nothing new of six numbers."""
 _LEAST_SAMPLES = 100
+_TOLERANCE = 1e-3
+"""Part of a command's period by which stamps of one instant may differ."""
 _SMOOTH = np.array([-2, -1, 0, 1, 2]) / 10
 """Speed in samples from five positions: the slope of a parabola through them."""
 _SHARP = np.array([1, -8, 0, 8, -1]) / 12
@@ -29,37 +33,46 @@ class Table:
     """(K, m)."""
     follows: np.ndarray
     """Whether a sample comes right after the one before, (K - 1,) bool."""
-    stride: int
+    stride: float
     """Control steps in a sample."""
     commands: dict[str, np.ndarray]
-    """Columns of each commanded series ("position", "velocity", "effort") at rising lags in control steps."""
-    first_lag: int
-    """The first of those lags."""
+    """Columns of each commanded series ("position", "velocity", "effort") at each of ``command_lags``."""
+    command_lags: np.ndarray
+    """Evenly rising [control steps]."""
     position: np.ndarray
-    """Columns of the position at each of ``FEEDBACK_LAGS``."""
+    """Columns of the position at each of ``feedback_lags``."""
     speeds: list[np.ndarray]
     """The same of the speed; more than one where it is taken from positions, in more than one way."""
+    feedback_lags: np.ndarray
+    """[control steps]."""
 
     @classmethod
     def of(cls, recording: Recording, j: int, longest_delay: float) -> Table | None:
         """The table of a joint; ``None`` where its torque is not known, or too little of it.
+
+        It is made of the samples as they were logged, which belong to the torques that came with them.
 
         Args:
             recording: On the control grid.
             j: Column of the joint.
             longest_delay: Longest delay of commands [control steps].
         """
-        if recording.dof_effort is None:
+        log = recording if recording.logged is None else recording.logged
+        if log.dof_effort is None:
             return None
-        stride, torque, position = recording.sample_stride, recording.dof_effort[:, j], recording.dof_pos[:, j]
-        given = {name: series for name, series in _commands(recording, j).items() if series is not None}
-        speeds = _speeds(recording, j)
-        steps = int(np.ceil(longest_delay)) + FEEDBACK_LAGS[-1] * stride
-        before = -(-steps // stride) + 1
+        control_dt = float(recording.time[1] - recording.time[0]) / recording.sample_stride
+        stride = float(np.median(np.diff(log.time))) / control_dt
+        sampled = log is recording
+        feedback = stride * np.array(_FEEDBACK_LAGS if sampled else sorted((*_FEEDBACK_LAGS, *_BETWEEN)))
+        steps = np.ceil(longest_delay) + feedback[-1]
+        lags = np.arange(-np.ceil(stride), steps + 1, 1.0 if sampled else 0.5)
+        time, torque, position = log.time, log.dof_effort[:, j], log.dof_pos[:, j]
+        given, speeds = _commands(recording, j), _speeds(log, j)
+        before = int(np.ceil(steps / stride)) + 2
         usable = np.isfinite(torque) & np.all([np.isfinite(speed) for speed in speeds], axis=0)
         usable[:before] = usable[-3:] = False
-        if recording.torque_enable is not None:
-            off = np.convolve(~recording.torque_enable.astype(bool), np.ones(before))[: len(torque)]
+        if log.torque_enable is not None:
+            off = np.convolve(~log.torque_enable.astype(bool), np.ones(before))[: len(torque)]
             usable &= off == 0
         rows = np.flatnonzero(usable)
         rows = rows[:: max(1, len(rows) // _MOST_SAMPLES)]
@@ -67,39 +80,61 @@ class Table:
             return None
         columns: list[np.ndarray] = []
 
-        def add(*new: np.ndarray) -> np.ndarray:
+        def add(new: list[np.ndarray]) -> np.ndarray:
             columns.extend(new)
             return np.arange(len(columns) - len(new), len(columns))
 
-        at = [np.clip(rows * stride - lag, 0, None) for lag in range(-stride, steps + 1)]
-        commands = {name: add(*(s[np.minimum(k, len(s) - 1)] for k in at)) for name, s in given.items()}
+        def seen(series: np.ndarray) -> list[np.ndarray]:
+            return [np.interp(time[rows] - lag * control_dt, time, series) for lag in feedback]
+
         return cls(
             torque=torque[rows],
-            commands=commands,
-            first_lag=-stride,
-            position=add(*(position[rows - lag] for lag in FEEDBACK_LAGS)),
-            speeds=[add(*(speed[rows - lag] for lag in FEEDBACK_LAGS)) for speed in speeds],
+            commands={
+                name: add([_held(*c, time[rows] - lag * control_dt) for lag in lags]) for name, c in given.items()
+            },
+            command_lags=lags,
+            position=add(seen(position)),
+            speeds=[add(seen(speed)) for speed in speeds],
+            feedback_lags=feedback,
             columns=np.stack([*columns, np.ones(len(rows))], axis=1),
             follows=np.diff(rows) == rows[1] - rows[0],
             stride=stride,
         )
 
 
-def _commands(recording: Recording, j: int) -> dict[str, np.ndarray | None]:
-    """What is commanded of a joint on the control grid, by kind; ``None`` where nothing is."""
-    found = {
-        "position": (recording.has_position_command[j], recording.command),
-        "velocity": (recording.has_velocity_command[j], recording.command_vel),
-        "effort": (recording.has_effort_command[j], recording.command_effort),
+def _held(stamps: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Commands as they are in force at some times."""
+    tolerance = _TOLERANCE * float(stamps[1] - stamps[0])
+    return values[np.clip(np.searchsorted(stamps, at + tolerance, side="right") - 1, 0, None)]
+
+
+def _commands(recording: Recording, j: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What is commanded of a joint, by kind: stamps and values; those kinds that there are."""
+    there = {
+        "position": recording.has_position_command[j],
+        "velocity": recording.has_velocity_command[j],
+        "effort": recording.has_effort_command[j],
     }
-    return {name: series[:, j] if there and series is not None else None for name, (there, series) in found.items()}
+    log = recording.logged
+    if log is None:
+        series = recording.command, recording.command_vel, recording.command_effort
+        dt = float(recording.time[1] - recording.time[0]) / recording.sample_stride
+        stamps = dt * np.arange(max(len(s) for s in series if s is not None))
+    else:
+        series = log.des_dof_pos, log.des_dof_vel, log.des_dof_effort
+        stamps = log.time if log.des_time is None else log.des_time
+    return {
+        name: (stamps, values[:, j])
+        for (name, has), values in zip(there.items(), series, strict=True)
+        if has and values is not None
+    }
 
 
 def _speeds(recording: Recording, j: int) -> list[np.ndarray]:
     """The measured speed, or the speed from positions in two ways, (T,) each [rad/s]; NaN at the ends."""
     if recording.dof_vel is not None and np.isfinite(recording.dof_vel[:, j]).any():
         return [recording.dof_vel[:, j]]
-    dt = float(recording.time[1] - recording.time[0])
+    dt = float(np.median(np.diff(recording.time)))
     results = []
     for weights in (_SMOOTH, _SHARP):
         speed = np.full(recording.num_samples, np.nan)

@@ -52,7 +52,7 @@ def contradiction(
 ) -> str:
     """What is stated, what the torque says, and which of the two counts."""
     error = f" ± {std:.1g}" if std else ""
-    text = f"{_WORDS[fact]} of {law.joint} is stated as {stated:.4g} {_UNITS[fact]}, "
+    text = f"{_WORDS[fact]} of {law.joint} is {'stated' if holds else 'configured'} as {stated:.4g} {_UNITS[fact]}, "
     text += f"and its dof_effort says {value:.4g}{error}"
     if holds:
         text += f": what is stated is used. Correct {fact}, or fit with --unknown {fact}."

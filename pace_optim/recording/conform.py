@@ -76,6 +76,7 @@ def conform_recording(
         **on_grid,
         time_origin=origin,
         sample_stride=base.sample_stride,
+        logged=None if base.exact and recording.des_time is None else recording,
         notes=(*recording.notes, *base.notes, *notes),
     )
 

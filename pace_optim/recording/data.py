@@ -97,6 +97,8 @@ class Recording:
     """What a user should know about this recording, in plain sentences."""
     source: str = ""
     """Path of the file."""
+    logged: Recording | None = None
+    """The same as it was logged, where it was resampled or its commands have a clock of their own."""
     part_of: str = ""
     """Name of the recording that this is a part of; empty: it is whole."""
 
