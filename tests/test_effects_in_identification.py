@@ -112,6 +112,7 @@ TWIN_CASES = {
     "torque_gain": {"gain": 1.1},
     "proportional_gain": {"gain": 1.1},
     "derivative_gain": {"gain": 1.5},
+    "fast_loop": {"share": 0.7},
     "drive_bandwidth": {"time_constant": 0.005},
     "velocity_filter": {"time_constant": 0.02},
     "torque_limit": {"effort": 10.0},
