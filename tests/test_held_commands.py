@@ -16,6 +16,7 @@ from pace_envs import load_env_cfg
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.result import drive_in_force
+from pace_optim.uncertainty.whole_delay import whole_delay
 
 URDF = """<robot name="pendulum"><link name="base"/>
   <link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/>
@@ -140,3 +141,15 @@ def test_the_rows_of_the_table_of_cases_have_their_files():
     for case in CASES.values():
         for path in (*case.logs, *([case.task] if "/" in case.task else [])):
             assert (cases / path).exists()
+
+
+def test_a_delay_of_whole_steps_of_a_held_loop_is_said_to_be_one_of_many(tmp_path):
+    bench = Bench(drive_dt=STEP)
+    recording = load_recording(record(tmp_path / "chirp.csv", bench, position=chirp(2.0)))
+    clocks = replace(recording, des_time=recording.time[::2], des_dof_pos=recording.des_dof_pos[::2])
+    paths = [save_recording(tmp_path / f"{name}.npz", each) for name, each in (("own", clocks), ("rows", recording))]
+    own, rows = (load_problem(BENCH, data=[path], env_cfg=env_cfg()) for path in paths)
+    assert "above 5 and up to 7.5 ms" in whole_delay(own, 2.98, 0.008)[0]
+    assert not whole_delay(own, 2.9, 0.008) and not whole_delay(rows, 3.0, 0.008)
+    fast = load_problem(BENCH, data=[paths[0]], env_cfg=env_cfg(), drive_dt=0.0005)
+    assert not whole_delay(fast, 3.0, 0.008)

@@ -20,6 +20,7 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_limits
 from pace_optim.uncertainty.uncertainty import Uncertainty
+from pace_optim.uncertainty.whole_delay import whole_delay
 
 
 @dataclass(kw_only=True)
@@ -169,7 +170,7 @@ def make_result(
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
     trained = residuals.error[0].square()[train]
-    values = space.to_dict(physical)
+    values, std = space.to_dict(physical), std_by_parameter(space, uncertainty)
     return FitResult(
         task=problem.task,
         robot_name=problem.env_cfg.sim2real.robot_name,
@@ -179,7 +180,7 @@ def make_result(
         control_dt=problem.control_dt,
         parameters=values,
         delay_s=float(physical[space["delay"]]) * problem.control_dt,
-        std=std_by_parameter(space, uncertainty),
+        std=std,
         units=space.units,
         at_bound=list(uncertainty.at_bound),
         no_influence=list(uncertainty.no_influence),
@@ -194,6 +195,7 @@ def make_result(
         measured_drive=problem.measured.to_dict(),
         notes=list(problem.env_cfg.sim2real.notes)
         + list(problem.measured.notes)
+        + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
         + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, facts.get("undetermined", ())),
         **facts,
