@@ -1,9 +1,7 @@
 """Held commands act when they arrive, at the default steps too, beside an integrator of its own at 0.1 ms."""
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,17 +128,6 @@ def test_what_a_fit_found_keeps_how_commands_act_in_training_and_exports(tmp_pat
     problem = load_problem(BENCH, env_cfg=env_cfg())
     assert drive_in_force(problem)["centred_commands"] == {"servo": 1.0}
     assert not load_env_cfg("Pace-AnymalD-v0").scene.robot.actuators["legs"].centred_commands  # PACE's own
-
-
-@pytest.mark.skipif(not (Path(__file__).parents[2] / "shared" / "cases").is_dir(), reason="shared/cases is absent")
-def test_the_rows_of_the_table_of_cases_have_their_files():
-    sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-    from cases import CASES
-
-    cases = Path(__file__).parents[2] / "shared" / "cases"
-    for case in CASES.values():
-        for path in (*case.logs, *([case.task] if "/" in case.task else [])):
-            assert (cases / path).exists()
 
 
 def test_a_delay_of_whole_steps_of_a_held_loop_is_said_to_be_one_of_many(tmp_path):

@@ -1,0 +1,45 @@
+"""Logs and models of users' kinds, with known values: what the benchmark of cases finds is right."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+from cases import CASES, run, table
+
+SHARED = Path(__file__).parents[2] / "shared" / "cases"
+pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="shared/cases is absent")
+LEG_ACTS_AT = 7.5
+"""Its loop takes commands over every 2.5 ms: they are 6 ms late, and act then [ms]."""
+
+
+def test_the_rows_have_their_files():
+    for case in CASES.values():
+        for path in (*case.logs, *([case.task] if "/" in case.task else [])):
+            assert (SHARED / path).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["plain", "feed_forward", "two_clocks", "timer_19_9_hz", "four_bar", "leg_mcap"])
+def test_a_fit_reaches_what_is_true(name, tmp_path):
+    case = CASES[name]
+    run(name, case, SHARED, tmp_path)
+    found = json.loads((tmp_path / f"{name}.found.json").read_text())
+    for group in ("armature", "viscous_friction", "friction"):
+        for value in found["parameters"][group].values():
+            assert value == pytest.approx(case.right[group], rel=0.05)
+    for value in found["parameters"]["encoder_bias"].values():
+        assert value == pytest.approx(case.right["encoder_bias"], abs=2e-3)
+    right = LEG_ACTS_AT if name == "leg_mcap" else case.right["delay_ms"]
+    assert 1e3 * found["delay_s"] == pytest.approx(right, abs=0.4)
+    assert ("up to 7.5 ms" in " ".join(found["notes"])) == (name == "leg_mcap")
+    assert name in table(tmp_path)
+
+
+@pytest.mark.slow
+def test_commands_logged_more_slowly_than_they_were_sent_are_told(tmp_path):
+    run("lerobot_leg", CASES["lerobot_leg"], SHARED, tmp_path)
+    found = json.loads((tmp_path / "lerobot_leg.found.json").read_text())
+    assert "If the drive got more of them than were logged" in " ".join(found["warnings"])
