@@ -181,8 +181,9 @@ def _at_every_step(dataset: Dataset, count: int) -> torch.Tensor:
     result = np.empty((count, *measured.shape[1:]))
     for r in range(dataset.num_recordings):
         at = dataset.sampled[:, r].nonzero()[:, 0].numpy()
+        taken = at if dataset.sample_offset is None else at + dataset.sample_offset[at, r].numpy()
         for j in range(measured.shape[2]):
-            result[:, r, j] = np.interp(steps, at, measured[at, r, j])
+            result[:, r, j] = np.interp(steps, taken, measured[at, r, j])
     return torch.from_numpy(result)
 
 
