@@ -35,7 +35,7 @@ def main() -> None:
         "--no_refit", dest="refit", action="store_false", help="do not fit the robot with what was found"
     )
     add_common_options(parser, run=True)
-    add_device_option(parser)
+    add_device_option(parser, needs="torch for CUDA")
     options = take_common_options(vars(parser.parse_args()))
     options["device"] = options["device"] or "cpu"
 

@@ -8,10 +8,10 @@ from typing import Any
 _TASK = "registered environment, module:Name, FILE.py:Name, or a model file"
 
 
-def add_device_option(parser: argparse.ArgumentParser) -> None:
-    """Where a command simulates."""
+def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco[gpu]") -> None:
+    """Where a command simulates, and what a GPU needs."""
     parser.add_argument(
-        "--device", metavar="DEVICE", help="cpu (default), or a GPU: cuda:0, cuda:1, ...; needs pace-mujoco[gpu]"
+        "--device", metavar="DEVICE", help=f"cpu (default), or a GPU: cuda:0, cuda:1, ...; needs {needs}"
     )
 
 
