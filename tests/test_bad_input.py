@@ -51,6 +51,7 @@ RECORDINGS = {
     # what is wrong: (file name, writer, task, what the message says)
     "no such file": ("none.npz", None, BENCH, r"none\.npz: no such file"),
     "a folder": ("folder.npz", lambda path: path.mkdir(), BENCH, r"folder\.npz.*(folder|directory)"),
+    "a loop of links": ("loop.npz", lambda path: path.symlink_to(path.name), BENCH, r"loop\.npz"),
     "not an archive": ("torn.npz", text("PK nonsense"), BENCH, r"torn\.npz.*(cannot be read|damaged|no .*npz)"),
     "an empty file": ("void.npz", text(""), BENCH, r"void\.npz.*(cannot be read|empty|no .*npz)"),
     "another format": ("leg.mat", text("x"), BENCH, r"leg\.mat.*\.csv"),

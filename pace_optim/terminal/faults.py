@@ -14,7 +14,13 @@ _NO_MEMORY = re.compile(r"allocate memory|bad_alloc|bad allocation|[Cc]ould not 
 
 def is_of_input(error: BaseException) -> bool:
     """Whether the user can mend it."""
-    return isinstance(error, ValueError | KeyError | OSError | MemoryError) or lacks_memory(error)
+    is_input = isinstance(error, ValueError | KeyError | OSError | MemoryError)
+    return is_input or lacks_memory(error) or _is_loop(error)
+
+
+def _is_loop(error: BaseException) -> bool:
+    """Whether a path is a link to itself: Python 3.11 and 3.12 have a RuntimeError for it where they resolve one."""
+    return isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from ")
 
 
 def lacks_memory(error: BaseException) -> bool:
