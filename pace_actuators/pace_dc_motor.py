@@ -183,9 +183,13 @@ class PaceDCMotor:
         self.update_time_lags(delay)
         self._delays.set_lead(self._lead)
         self.effects = self._make_effects(dt)
-        held = not cfg.implicit and cfg.delay_mode == "command"
-        self._feeds_back = held and self.effects is not None and self.effects.has("feedback")
         self.update_effects()
+
+    @property
+    def _feeds_back(self) -> bool:
+        """Whether an effect lets the torque of a loop that is held follow the motion in between."""
+        held = not self.cfg.implicit and self.cfg.delay_mode == "command"
+        return held and self.effects is not None and self.effects.has("feedback")
 
     @property
     def num_joints(self) -> int:

@@ -1,8 +1,6 @@
-"""The single-joint simulation as one kernel moves as itself: on a GPU, and what g++ makes of the same C."""
+"""The single-joint simulation as one kernel moves as itself, on a GPU and on the processor."""
 
-import ctypes
 import shutil
-import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,40 +10,16 @@ from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_p
 
 from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.on_gpu import KernelSideBySide, fits_on
+from pace_optim.diagnosis.fitting.by_kernels import KernelSideBySide, fits_on
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.one_kernel import NotTraceableError
+from pace_optim.one_kernel.host import HostKernels, host_kernels
 from pace_optim.one_kernel.nvrtc import kernels_of
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STEPS = 80
 """Control steps that are simulated."""
-
-
-class HostKernels:
-    """The same source for the processor, compiled in one go."""
-
-    def __init__(self, folder):
-        self.folder, self.functions = folder, {}
-
-    def compile(self, sources):
-        new = [source for source in dict.fromkeys(sources) if source not in self.functions]
-        if not new:
-            return
-        parts = [
-            f"namespace n{i} {{{source.replace('simulate(', f'simulate_{i}(')}\n}}\n" for i, source in enumerate(new)
-        ]
-        path = self.folder / f"k{len(self.functions)}.cpp"
-        path.write_text("#include <math.h>\n" + "".join(parts))
-        library = path.with_suffix(".so")
-        subprocess.run(["g++", "-O0", "-ffp-contract=off", "-shared", "-fPIC", path, "-o", library], check=True)
-        loaded = ctypes.CDLL(str(library))
-        self.functions.update({source: getattr(loaded, f"simulate_{i}") for i, source in enumerate(new)})
-
-    def launch(self, source, threads, width, arguments):
-        values = [ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int(a) for a in arguments]
-        self.functions[source](*values)
 
 
 @pytest.fixture(scope="module", params=["processor", "GPU"])
@@ -56,9 +30,10 @@ def kernels(request, tmp_path_factory):
             pytest.skip("needs a GPU and torch for CUDA")
         device = torch.device("cuda", 0)
         return {"compiler": kernels_of(device), "device": device}
-    if shutil.which("g++") is None:
-        pytest.skip("needs g++")
-    return {"compiler": HostKernels(tmp_path_factory.mktemp("kernels")), "device": torch.device("cpu")}
+    if shutil.which("c++") is None:
+        pytest.skip("needs a compiler of C++")
+    folder = tmp_path_factory.mktemp("kernels")
+    return {"compiler": HostKernels(shutil.which("c++"), folder), "device": torch.device("cpu")}
 
 
 def slots_of(problem, start, *sets):
@@ -189,3 +164,37 @@ def test_no_recording_leaves_a_trace_in_the_drives(kernels, bench):
     other.simulate([values[None]], where)
     other._kernels = None
     assert torch.equal(one.simulate([values[None]], where), other.simulate([values[None]], where).cpu())
+
+
+def test_a_processor_without_a_compiler_simulates_the_drives_themselves(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    host_kernels.cache_clear()
+    try:
+        assert host_kernels() is None and fits_on("cpu", DEFAULT).batch is SideBySide
+    finally:
+        host_kernels.cache_clear()
+
+
+def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_again(monkeypatch, tmp_path):
+    if shutil.which("c++") is None:
+        pytest.skip("needs a compiler of C++")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    host_kernels.cache_clear()
+    try:
+        source = 'extern "C" void simulate(double* x) { *x *= 2.0; }'
+        for _ in range(2):
+            kernels = host_kernels.__wrapped__()
+            kernels.compile([source])
+            value = torch.tensor(21.0, dtype=torch.float64)
+            kernels.launch(source, 1, 1, [value])
+            assert float(value) == 42.0
+        folder = tmp_path / "pace" / "kernels"
+        assert len(list(folder.iterdir())) == 1 and folder.stat().st_mode & 0o777 == 0o700
+        with pytest.raises(NotTraceableError):
+            kernels.compile(["this is no C"])
+        assert len(list(folder.iterdir())) == 1
+        folder.chmod(0o777)  # others could put code there
+        host_kernels.__wrapped__().compile([source])
+        assert len(list(folder.iterdir())) == 1
+    finally:
+        host_kernels.cache_clear()

@@ -18,9 +18,9 @@ from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
+from pace_optim.diagnosis.fitting.by_kernels import fits_on
 from pace_optim.diagnosis.fitting.denormals import flushed_denormals
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.on_gpu import fits_on
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import check_long_enough
 from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
@@ -242,13 +242,13 @@ def search_effects(
         run: The whole robot's own fit, if there is one.
         cfg: Its numbers.
         log: Gets every decision.
-        fits: Fits models; ``None``: on the processor.
+        fits: Fits models; ``None``: as on the processor.
 
     Raises:
         ValueError: If the validation recordings are too short to judge by.
     """
     cfg = cfg or DiagnosisCfg()
-    fits = fits or Fits(cfg=cfg)
+    fits = fits or fits_on("cpu", cfg)
     check_long_enough(problem.dataset.validation, problem.control_dt, cfg=cfg.judging)
     twins, base, effort = fit_base(fits, problem, physical, candidates, say)
     data = check_data(fits, problem, twins, base, run)

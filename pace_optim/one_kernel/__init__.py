@@ -2,8 +2,8 @@
 
 Nothing is written twice. One control step of the same ``PaceDCMotor``, effects and ``TwinSimulation`` runs on symbols
 (``symbols``, ``operations``) in place of tensors; what they record (``tape``) is the program of one joint, which is
-written as C (``source``) and compiled for the GPU (``nvrtc``). Numbers are float64, and multiplications are not fused
-with additions, as on a processor.
+written as C (``source``) and compiled for a GPU (``nvrtc``) or the processor (``host``). Numbers are float64, and
+multiplications are not fused with additions.
 """
 
 from pace_optim.one_kernel.batch import KernelRollout

@@ -1,4 +1,4 @@
-"""Many models of the joints, simulated side by side on a GPU."""
+"""Many models of the joints, simulated side by side by compiled kernels: on a GPU, or on the processor."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.one_kernel import KernelRollout, NotTraceableError
 from pace_optim.one_kernel.batch import Compiler
+from pace_optim.one_kernel.host import host_kernels
 from pace_optim.one_kernel.nvrtc import kernels_of
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -20,7 +21,7 @@ from pace_optim.single_joint_model.problem import TwinProblem
 class KernelSideBySide(SideBySide):
     """A :class:`SideBySide` whose errors come from kernels and stay on their device.
 
-    Where a kernel cannot do what an effect of the user's does, the processor simulates as ever.
+    Where a kernel cannot do what an effect of the user's does, the drives themselves simulate as ever.
     """
 
     def __init__(
@@ -70,11 +71,16 @@ class KernelSideBySide(SideBySide):
 def fits_on(device: str, cfg: DiagnosisCfg) -> Fits:
     """What fits models on a device: ``"cpu"``, or a GPU as ``"cuda:0"``.
 
+    On a processor with a compiler of C++ the same kernels run there; without one, the drives themselves do.
+
     Raises:
         ValueError: If torch finds no such GPU.
     """
     if device == "cpu":
-        return Fits(cfg=cfg)
+        compiler = host_kernels()
+        if compiler is None:
+            return Fits(cfg=cfg)
+        return Fits(cfg=cfg, batch=partial(KernelSideBySide, compiler=compiler, device=torch.device("cpu")))
     own = torch.device(device)
     if not torch.cuda.is_available() or (own.index or 0) >= torch.cuda.device_count():
         raise ValueError(

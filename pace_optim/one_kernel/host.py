@@ -1,0 +1,108 @@
+"""Compiles the same C for the processor, by the machine's own compiler, and runs it."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pace_optim.one_kernel.tape import NotTraceableError
+
+_COMPILERS = ("c++", "g++", "clang++")
+_OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
+"""A multiplication and an addition are rounded one by one, as everywhere else."""
+
+
+class HostKernels:
+    """Kernels by their source, each compiled once for a user and a compiler."""
+
+    def __init__(self, compiler: str, folder: Path):
+        """With a compiler of C++, and a folder of the user's alone that keeps what it has made."""
+        self._command = [compiler, *_OPTIONS]
+        info = os.stat(compiler)
+        self._key = f"{self._command} {info.st_size} {info.st_mtime_ns}"
+        self._folder = folder
+        self._functions: dict[str, Any] = {}
+
+    def compile(self, sources: Sequence[str]) -> None:
+        """Compile those that are new, side by side.
+
+        Raises:
+            NotTraceableError: If the compiler refuses one.
+        """
+        new = [source for source in dict.fromkeys(sources) if source not in self._functions]
+        if not new:
+            return
+        with ThreadPoolExecutor(min(len(new), os.cpu_count() or 1)) as pool:
+            for source, path in zip(new, pool.map(self._compiled, new), strict=True):
+                self._functions[source] = ctypes.CDLL(str(path)).simulate
+
+    def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
+        """Run a compiled kernel over all its joints.
+
+        Args:
+            source: Its source.
+            threads: Not used: ``arguments`` tell how many joints there are.
+            width: Not used.
+            arguments: Tensors, which are handed over by address, and whole numbers.
+        """
+        self._functions[source](
+            *(
+                ctypes.c_void_p(each.data_ptr()) if isinstance(each, torch.Tensor) else ctypes.c_int(each)
+                for each in arguments
+            )
+        )
+
+    def _compiled(self, source: str) -> Path:
+        path = self._folder / f"{hashlib.sha256((self._key + source).encode()).hexdigest()}.so"
+        if not path.exists():
+            with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".tmp", delete=False) as file:
+                begun = Path(file.name)
+            try:
+                subprocess.run([*self._command, "-", "-o", str(begun)], input=source.encode(), check=True, stderr=-1)
+                os.replace(begun, path)  # whole or not at all: other processes may want the same
+            except (OSError, subprocess.CalledProcessError) as error:
+                raise NotTraceableError(f"{self._command[0]}: {error}") from error
+            finally:
+                begun.unlink(missing_ok=True)
+        return path
+
+
+@cache
+def host_kernels() -> HostKernels | None:
+    """The kernels of the processor; ``None`` where no compiler of C++ is installed."""
+    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
+    return None if compiler is None else HostKernels(compiler, _own_folder())
+
+
+def _own_folder() -> Path:
+    """A folder that only the user can write to: kept, or for this process where there is none to keep."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(home) / "pace" / "kernels"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = folder.stat()
+        if (
+            info.st_uid == os.getuid()
+            and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+            and os.access(folder, os.W_OK)
+        ):
+            return folder
+    except OSError:
+        pass
+    _TEMPORARY.append(tempfile.TemporaryDirectory(prefix="pace_kernels_"))
+    return Path(_TEMPORARY[-1].name)
+
+
+_TEMPORARY: list[tempfile.TemporaryDirectory] = []
