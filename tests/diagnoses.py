@@ -12,6 +12,7 @@ from problems import BENCH, CALM, DT, chirp, env_cfg, make_problem, physical, re
 from run_folders import JOINTS, make_result
 
 from pace_actuators.effects import Effect, get_effect
+from pace_actuators.files import write_json
 from pace_envs import set_physics_dt
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.fits import Fits
@@ -24,7 +25,6 @@ from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
 from pace_optim.single_joint_model import reference_path, twin_problem
-from pace_optim.terminal.atomic import write_json
 
 
 def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from pace_actuators.files import write_json, write_tensors
 from pace_optim.run.history import History
 from pace_optim.run.result import FitResult
-from pace_optim.terminal.atomic import write_json, write_tensors
 
 JOINTS = ("hip", "knee", "ankle")
 UNITS = {

@@ -12,13 +12,13 @@ from problems import BENCH, record
 from run_folders import JOINTS, make_result, make_trajectory, write_run
 
 import pace_optim.fit as fit_module
+from pace_actuators.files import write_tensors
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.fit import fit
 from pace_optim.recording import Load, save_recording
 from pace_optim.report import write_report
 from pace_optim.report.sections.failure import _worst_place
 from pace_optim.run.settings import FitSettings
-from pace_optim.terminal.atomic import write_tensors
 
 ROOT = Path(__file__).parents[1]
 

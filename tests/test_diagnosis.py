@@ -15,6 +15,7 @@ from problems import BENCH, DT
 from run_folders import make_result
 
 from pace_actuators.effects import get_effect
+from pace_actuators.files import write_json
 from pace_optim.diagnosis import candidate_effects
 from pace_optim.diagnosis.candidates.screening import _explained
 from pace_optim.diagnosis.diagnose import search_effects
@@ -26,7 +27,6 @@ from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.telling.next_experiment import rivals_of
 from pace_optim.diagnosis.verdict.verdict import explained_joints, ranking, verdict
-from pace_optim.terminal.atomic import write_json
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

@@ -13,11 +13,11 @@ import torch
 from matplotlib import pyplot
 from run_folders import write_run
 
+from pace_actuators.files import write_json, write_tensors
 from pace_envs import load_env_cfg
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.replay import replay
 from pace_optim.run.settings import FitSettings
-from pace_optim.terminal.atomic import write_json, write_tensors
 
 ROOT = Path(__file__).parents[1]
 OLD, NEW = "26_01_01_00-00-00", "26_02_01_00-00-00"

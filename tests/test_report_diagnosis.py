@@ -6,8 +6,8 @@ from diagnoses import make_diagnosis
 from run_folders import JOINTS, make_result, write_run
 from test_report import NASTY, page_of
 
+from pace_actuators.files import write_json
 from pace_optim.report import write_report
-from pace_optim.terminal.atomic import write_json
 
 
 def folder_with(path, content):

@@ -10,6 +10,7 @@ from run_folders import write_run
 from test_report import page_of
 
 from pace_actuators.effects import get_effect
+from pace_actuators.files import write_json
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.fits import Fits
@@ -19,7 +20,6 @@ from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.report.sizes import size_text
-from pace_optim.terminal.atomic import write_json
 from pace_optim.uncertainty.uncertainty import sandwich
 
 GAIN = get_effect("torque_gain")

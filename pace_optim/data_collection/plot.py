@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from pace_actuators.files import write_atomically
 from pace_optim.excitation import Trajectory
-from pace_optim.terminal.atomic import write_atomically
 
 _TARGET, _TARGET_ALONE, _MEASURED, _LIMIT = "#b4b9bf", "#5f6368", "#1f5fa8", "#c0392b"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pace_optim.terminal.atomic import write_atomically
+from pace_actuators.files import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

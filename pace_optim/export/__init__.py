@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.files import write_atomically
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf
 from pace_optim.export.mjlab_native import mjlab_native_python
 from pace_optim.export.newton import newton_python
-from pace_optim.terminal.atomic import write_atomically
 
 __all__ = ["FORMATS", "Export", "export"]
 

@@ -8,7 +8,14 @@ from collections.abc import Mapping
 
 from pace_actuators import IdentifiedDrives
 from pace_optim.export import newton_template
-from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
+from pace_optim.export.plain_drive import (
+    GAIN_EFFECTS,
+    PlainDrive,
+    effect_notes,
+    is_undetermined,
+    plain_drives,
+    whole_steps_note,
+)
 
 _START = "# --- the page starts here\n"
 
@@ -64,12 +71,7 @@ def _parts(drive: PlainDrive) -> dict[str, float]:
 
 
 def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
-    dt, delay = drives.at.physics_dt, max((drive.delay_s for drive in plain.values()), default=0.0)
-    notes = []
-    if delay:
-        steps = delay / dt
-        lost = "" if abs(steps - round(steps)) < 1e-6 else f", {1e3 * round(steps) * dt:.3g} ms"
-        notes.append(f"delay of {1e3 * delay:.3g} ms: {round(steps)} whole steps of {1e3 * dt:g} ms{lost}.")
+    dt, notes = drives.at.physics_dt, whole_steps_note(drives, plain)
     most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
     notes.append(
         f"encoder bias (up to {most:.3g} rad): in const_effort. Targets are the encoder's, joint positions are true: "

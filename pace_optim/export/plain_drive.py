@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pace_actuators import IdentifiedDrives
@@ -131,3 +131,13 @@ def _of_effect(drives: IdentifiedDrives, name: str) -> dict[str, float]:
 
 def _what(kind: type[Effect]) -> str:
     return kind.equation or (kind.__doc__ or "").strip().splitlines()[0]
+
+
+def whole_steps_note(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
+    """What becomes of the delay in a simulator that delays by whole steps; nothing where there is none."""
+    dt, delay = drives.at.physics_dt, max((drive.delay_s for drive in plain.values()), default=0.0)
+    if not delay:
+        return []
+    steps = delay / dt
+    lost = "" if abs(steps - round(steps)) < 1e-6 else f", {1e3 * round(steps) * dt:.3g} ms"
+    return [f"delay of {1e3 * delay:.3g} ms: {round(steps)} whole steps of {1e3 * dt:g} ms{lost}."]

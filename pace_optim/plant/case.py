@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pace_actuators.files import write_atomically
 from pace_optim.recording import save_recording
-from pace_optim.terminal.atomic import write_atomically
 
 from .draw import Drawn, draw_visible, with_background
 from .hidden import effect_named

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pace_optim.terminal.atomic import write_atomically
+from pace_actuators.files import write_atomically
 
 from .page import render
 from .run_data import RunData

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import file_at
+from pace_actuators.files import file_at, write_atomically
 from pace_optim.recording.keys import FACTS, JOINT_SERIES, did_you_mean, listed
-from pace_optim.terminal.atomic import write_atomically
 
 from .words import CURRENTS, TIME_UNITS, UNITS
 
