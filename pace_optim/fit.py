@@ -44,7 +44,7 @@ from pace_optim.uncertainty.assessment import assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.uncertainty.other_solutions import with_other_solutions
-from pace_optim.uncertainty.undetermined import held_at_prior, undetermined, without
+from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without, without_delay
 from pace_optim.uncertainty.warnings import fit_warnings
 
 _HYBRID_POPULATION = 48
@@ -441,6 +441,12 @@ class _Fit:
             outcome = replace(outcome, x=x)
             uncertainty, every = assess(problem, self.assessor, self.colouring, x)
             uncertainty = without(uncertainty, left_open, space)
+        if not far and outcome.stop_reasons != ["interrupted"]:
+            none = without_delay(problem, outcome.x, uncertainty, left_open, _NEAR)
+            if none is not None:
+                outcome = replace(outcome, x=none)
+                uncertainty, every = assess(problem, self.assessor, self.colouring, none)
+                uncertainty = without(uncertainty, [*left_open, DELAY], space)
         uncertainty = with_other_solutions(uncertainty, self.descents, space)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}

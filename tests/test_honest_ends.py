@@ -15,12 +15,21 @@ from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.export import FORMATS
 from pace_optim.fit import fit
 from pace_optim.optimizers.least_squares import LeastSquaresCfg
-from pace_optim.recording import save_recording
+from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive, save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.uncertainty.honest_end import far_end, times_noise
 from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.undetermined import at_prior, held_at_prior, prior, undetermined, without
+from pace_optim.uncertainty.undetermined import (
+    DELAY,
+    at_prior,
+    held_at_prior,
+    prior,
+    undetermined,
+    without,
+    without_delay,
+)
 from pace_optim.uncertainty.warnings import fit_warnings
 
 
@@ -136,3 +145,33 @@ def test_what_is_asked_of_a_drive_and_what_gravity_takes_are_told():
     assert servo["asked_rms"] < servo["asked_peak"] and servo["speed_peak"] == pytest.approx(
         np.abs(speed).max(), rel=0.1
     )
+
+
+def test_a_delay_that_is_not_told_from_none_is_none():
+    """Beside large gains it would take damping and inertia along."""
+
+    def ended(true, found, std):
+        recording = record(chirp(2.0), {**TRUTH, "delay": true})
+        noise = np.random.default_rng(0).normal(0, 1e-4, recording.dof_pos.shape)
+        problem = make_problem(replace(recording, dof_pos=recording.dof_pos + noise))
+        x = problem.space.to_normalised(physical(problem, {**TRUTH, "delay": found}))
+        bars = np.where([label == DELAY for label in problem.space.labels], std, 0.0)
+        return problem, x, uncertainty(problem, std=bars)
+
+    near = LeastSquaresCfg(score_tolerance=0.02)
+    problem, x, unsure = ended(0.0, 0.003, 0.002)
+    none = without_delay(problem, x, unsure, [], near)
+    assert float(problem.space.to_physical(none)[problem.space["delay"]]) == 0.0
+    assert without_delay(problem, x, unsure, [DELAY], near) is None
+    assert without_delay(*ended(0.0, 0.003, 0.001), [], near) is None
+    assert without_delay(*ended(1.0, 1.0, 2.0), [], near) is None  # where none costs much
+
+
+def test_a_limit_that_the_recording_contradicts_is_the_first_warning(tmp_path):
+    slow = replace(record(chirp(1.0), TRUTH), drive=Drive(velocity_limit=np.array([0.1])))
+    problem = load_problem(BENCH, data=[save_recording(tmp_path / "fast.npz", slow)])
+    (told,) = problem.contradictions
+    assert "Correct velocity_limit" in told
+    rmse = {"train": {"all": 1e-3}, "validation": {"all": 1e-2}}
+    warnings = fit_warnings(problem, physical(problem, TRUTH), uncertainty(problem), rmse)
+    assert warnings[0] == told and len(warnings) > 1

@@ -44,6 +44,8 @@ class Problem:
     delay_mode: Literal["command", "effort"]
     control_dt: float
     """Control step [s]."""
+    contradictions: tuple[str, ...] = ()
+    """Limits that are stated of the drives and that the recordings contradict, in sentences."""
     device: str = "cpu"
     """Where environments are built."""
     measured: MeasuredDrives = field(default_factory=MeasuredDrives)
@@ -207,6 +209,7 @@ def load_problem(
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
+        contradictions=_contradictions(env, [*recordings, *held_out]),
     )
     env.close()
     return problem
@@ -266,12 +269,14 @@ def _configured(
 
 def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings with what is to be told of their drives' loops."""
+    loops = check_loops(env, recordings)
+    return [replace(r, notes=(*r.notes, loop)) if loop else r for r, loop in zip(recordings, loops, strict=True)]
+
+
+def _contradictions(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Limits of the drives that the recordings contradict."""
     limits = of_joints(env, "velocity_limit"), of_joints(env, "effort_limit")
-    notes = [
-        [*([loop] if loop else []), *contradicted_limits(recording, *limits)]
-        for recording, loop in zip(recordings, check_loops(env, recordings), strict=True)
-    ]
-    return [replace(r, notes=(*r.notes, *own)) for r, own in zip(recordings, notes, strict=True)]
+    return tuple(f"{r.name}: {text}" for r in recordings for text in contradicted_limits(r, *limits))
 
 
 def as_vector(problem: Problem, values: dict) -> torch.Tensor:

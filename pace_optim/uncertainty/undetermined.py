@@ -11,6 +11,7 @@ import torch
 
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import effect_cfgs
+from pace_envs.tasks.pace import GLOBAL
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.choices import UNKNOWN_FACTS
 from pace_optim.optimizers.jacobian import colour
@@ -22,6 +23,12 @@ from pace_optim.uncertainty.uncertainty import Uncertainty
 
 HARDLY_KNOWN = 0.5
 """A standard deviation above this part of the bound range leaves a parameter open."""
+
+
+DELAY = f"delay/{GLOBAL}"
+"""Label of the delay."""
+_SURE = 2.0
+"""Standard deviations that tell a delay from none."""
 
 
 def undetermined(problem: Problem, uncertainty: Uncertainty, far: bool = False) -> list[str]:
@@ -75,6 +82,29 @@ def held_at_prior(
     return at_prior(problem, x, silent), silent
 
 
+def without_delay(
+    problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, held: Sequence[str], cfg: LeastSquaresCfg
+) -> torch.Tensor | None:
+    """A vector without a delay, the rest fitted again, where none is as good; else ``None``.
+
+    A delay cannot be below 0. One that is told from 0 neither by its error bar nor by the error takes damping and
+    inertia along where a drive's gains are large: kd of delay is inertia, kp of it viscous friction.
+
+    Args:
+        problem: What was fitted.
+        x: The result, normalised (size,).
+        uncertainty: There.
+        held: Labels of what is held at its prior already.
+        cfg: How the rest is fitted.
+    """
+    space = problem.space
+    at = space.labels.index(DELAY)
+    delay, std = float(space.to_physical(x)[at]), float(uncertainty.std[at])
+    if DELAY in held or float(space.lower[at]) != 0 or not 0 < delay <= _SURE * std:
+        return None
+    return _fitted_beside(problem, x, [*held, DELAY], cfg)
+
+
 def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: LeastSquaresCfg) -> torch.Tensor | None:
     """The vector with some entries at their prior and the rest fitted again; ``None`` where it is not as good."""
     physical = problem.space.to_physical(at_prior(problem, x, labels))
@@ -123,11 +153,12 @@ def prior(problem: Problem) -> torch.Tensor:
 
 
 def without(uncertainty: Uncertainty, labels: Sequence[str], space: ParameterSpace) -> Uncertainty:
-    """The same with neither error bars nor likes of some parameters, as they are held."""
+    """The same with neither error bars, bounds nor likes of some parameters, as they are held."""
     held = set(labels)
     std = np.where([label in held for label in space.labels], np.nan, uncertainty.std)
     correlation = uncertainty.correlation.copy()
     correlation[np.isnan(std)] = np.nan
     correlation[:, np.isnan(std)] = np.nan
     groups = tuple(group for group in uncertainty.indistinguishable if not held & set(group))
-    return replace(uncertainty, std=std, correlation=correlation, indistinguishable=groups)
+    at_bound = tuple(label for label in uncertainty.at_bound if label not in held)
+    return replace(uncertainty, std=std, correlation=correlation, indistinguishable=groups, at_bound=at_bound)

@@ -41,6 +41,7 @@ def fit_warnings(
     """
     change = _change_at_half_the_step(problem, physical, rmse)
     return [
+        *problem.contradictions,
         *problem.measured.warnings,
         *_overfit(rmse, change),
         *_sampled_commands(problem, rmse, uncertainty),
