@@ -67,6 +67,7 @@ def main() -> None:
             command.add_argument("--seed", type=int, default=0)
         if name == "diagnose":
             command.add_argument("--max_effects", type=int, default=3, help="largest number of effects to add")
+            command.add_argument("--device", default="cpu", help="where single joints are simulated: cpu or cuda:0")
     args = parser.parse_args()
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     args.run(args)
@@ -112,7 +113,7 @@ def fit_command(args: argparse.Namespace) -> None:
 def diagnose_command(args: argparse.Namespace) -> None:
     """Diagnose the newest run of a robot."""
     run = newest_run(ROBOTS[args.robot], args.log_dir)
-    found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects))
+    found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects, device=args.device))
     print(f"{found.verdict}: {found.summary}")
     for name, joint in found.joints.items():
         before, after = (1e3 * joint[f"validation_rmse_{when}"] for when in ("before", "after"))

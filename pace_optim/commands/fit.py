@@ -107,7 +107,7 @@ def main() -> None:
         from pace_optim.diagnosis import DiagnosisSettings
 
         print(flush=True)
-        run_and_tell(DiagnosisSettings(run=folder))
+        run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
         print(f"run: {folder}")
 
