@@ -14,7 +14,8 @@ from problems import (
     record,
 )
 
-from pace_optim.optimizers.jacobian import Colouring, colour, jacobian, perturbed
+from pace_optim.optimizers.jacobian import Colouring, Jacobian, colour, jacobian, perturbed
+from pace_optim.problem.evaluator import Residuals
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}
 
@@ -124,3 +125,20 @@ def test_an_entry_whose_bounds_are_equal_has_no_derivative():
     problem = make_problem(record(truth=TRUTH, cfg=cfg), cfg=cfg)
     columns = differentiate(problem, somewhere(problem), coloured(problem))
     assert not columns.column(2).any() and columns.column(1).any()
+
+
+@pytest.mark.parametrize("samples", [1120, 1403])
+def test_the_normal_equations_are_the_same_however_the_residuals_lie_in_memory(samples):
+    """A resumed fit computes them in a batch of another size: rounded otherwise, it ended 1e-9 elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    batch = torch.rand(samples, 8, 1, 1, generator=generator, dtype=torch.float64)
+    columns = torch.rand(4, samples, 1, 1, generator=generator, dtype=torch.float64)
+    colouring = Colouring(colours=tuple((entry,) for entry in range(4)), joints=((0,),) * 4)
+    every = batch.permute(1, 0, 2, 3)
+    where, step = torch.ones(samples, 1, dtype=torch.bool), torch.arange(samples)
+    found = [
+        Jacobian(residuals=Residuals(error=error, where=where, step=step), columns=columns, colouring=colouring)
+        for error in (every[5:6], every[5:6].clone(memory_format=torch.contiguous_format), every.contiguous()[5:6])
+    ]
+    (hessian, gradient), *others = [each.normal_equations() for each in found]
+    assert all(torch.equal(hessian, h) and torch.equal(gradient, g) for h, g in others)

@@ -94,8 +94,11 @@ class Jacobian:
         row_of = {entry: c for c, entries in enumerate(self.colouring.colours) for entry in entries}
         for joint in range(self.columns.shape[-1]):
             entries = [entry for entry in range(size) if joint in self.colouring.joints[entry]]
+            # laid out alike whatever they are views of: products are rounded by layout, and a resumed fit's are to be
+            # those of one that was not interrupted
             block = self.columns[[row_of[entry] for entry in entries], ..., joint].reshape(len(entries), -1)
-            error = self.residuals.error[0, ..., joint].reshape(-1)
+            block, error = block.contiguous(), self.residuals.error[0, ..., joint].reshape(-1)
+            error = error.clone(memory_format=torch.contiguous_format)
             at = torch.tensor(entries)
             hessian[at[:, None], at] += block @ block.T
             gradient[at] += block @ error
