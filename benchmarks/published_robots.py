@@ -61,7 +61,7 @@ def errors(result: dict, truth: Truth) -> dict[str, dict]:
         }
         worst = max(off, key=lambda name: off[name]) if off else None
         value = {} if worst is None else {"error": off[worst], "joint": worst, "std": std[worst]}
-        if worst is not None and group != "encoder_bias":
+        if worst is not None and group != "encoder_bias" and std[worst] is not None:
             value["std"] /= abs(right[truth.joints.index(worst)])
         above = [name for name, error in off.items() if error > 0.02]
         rows[group] = {**value, "undetermined": undetermined, "above_2_percent": above}
@@ -124,6 +124,11 @@ def run(args: argparse.Namespace) -> None:
     print(table([row]))
 
 
+def bar(factor: float, std: float | None) -> str:
+    """An error bar; a parameter at its bound has none."""
+    return "?" if std is None else f"{factor * std:.1g}"
+
+
 def table(rows: list[dict]) -> str:
     """Rows as a table of Markdown."""
     lines = [
@@ -137,11 +142,11 @@ def table(rows: list[dict]) -> str:
             continue
         groups = fit["errors"]
         cells = [
-            "none" if "error" not in groups[g] else f"{100 * groups[g]['error']:.2g} % ± {100 * groups[g]['std']:.1g}"
+            "none" if "error" not in groups[g] else f"{100 * groups[g]['error']:.2g} % ± {bar(100, groups[g]['std'])}"
             for g in GROUPS[:3]
         ]
         bias = groups["encoder_bias"]
-        cells.append("none" if "error" not in bias else f"{1e3 * bias['error']:.2g} ± {1e3 * bias['std']:.1g}")
+        cells.append("none" if "error" not in bias else f"{1e3 * bias['error']:.2g} ± {bar(1e3, bias['std'])}")
         left = sum(len(groups[g]["undetermined"]) for g in GROUPS)
         found = next((row[key] for key in row if key.startswith("diagnose_")), None)
         kind = next((key.removeprefix("diagnose_") for key in row if key.startswith("diagnose_")), "")
