@@ -1,5 +1,6 @@
 """A fit's result becomes drives of other environments."""
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from problems import chirp, make_problem, record
+from problems import BENCH, chirp, make_problem, record
 from torque_sequence import DT, GAINS, JOINTS, write_result
 
 from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
@@ -20,6 +21,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.fit import fit
+from pace_optim.recording import save_recording
 from pace_optim.run.result import drive_in_force
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.training_replay import replay_in_training
@@ -392,6 +394,25 @@ def test_the_command_line_replays(anymal_run):
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()[2:-2]] == list(JOINTS)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_replay_where_it_was_fitted_has_its_error_whatever_rate_and_step(every, tmp_path):
+    """A log slower than the control step has samples at some steps only, and the fit's finer step is the replay's."""
+    whole = record(CHIRP, noise=1e-4)
+    rows = slice(None, None, every)
+    changes = {name: getattr(whole, name)[rows] for name in ("time", "dof_pos", "des_dof_pos")}
+    path = save_recording(tmp_path / "slow.npz", dataclasses.replace(whole, **changes))
+    settings = FitSettings(
+        task=BENCH,
+        data=[str(path)],
+        optimizer="least_squares",
+        check_consistency=False,
+        physics_dt=0.00125,
+        log_dir=str(tmp_path),
+    )
+    found = replay_in_training(fit(settings)[1])
+    assert found.largest_change < 1e-3
 
 
 def test_gains_that_differ_between_recordings_are_not_the_drives():

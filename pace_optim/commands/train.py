@@ -5,6 +5,8 @@ import os
 # Before torch is imported: threads that wait for work must not keep the cores from the physics, or from other programs.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from pace_actuators import IdentifiedDrives
+from pace_envs.registration import registered_tasks
 from pace_envs.rl import RunSettings, resume, train
 from pace_optim.problem.processes import own_device
 from pace_optim.terminal.cli import make_parser
@@ -41,7 +43,26 @@ def main() -> None:
         folder = resume(run, args["max_iterations"], task=args["task"], device=asked and device)
     else:
         if args["task"] is None:
-            raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
+            args["task"] = _task_for(args["identified"])
         folder = train(RunSettings(**args, device=device))
     if folder is not None:
         print(f"run: {folder}")
+
+
+def _task_for(identified: str | None) -> str:
+    """The task in which the robot of a fit walks.
+
+    Raises:
+        ValueError: If there is none, or no fit is given.
+    """
+    walking = [task for task in registered_tasks() if "-Velocity-" in task]
+    if identified is None:
+        raise ValueError(f"--task is missing. Available: {', '.join(walking)}, or a task of yours (module:Task).")
+    fitted = IdentifiedDrives.load(identified).task
+    task = fitted.replace("-v0", "-Velocity-v0")
+    if task not in walking:
+        raise ValueError(
+            f"{identified} is a fit of {fitted}, which has no task to train in. Available: {', '.join(walking)}, or a "
+            "task of yours: --task module:Task or FILE.py:Task."
+        )
+    return task

@@ -14,6 +14,7 @@ from pace_actuators import IdentifiedDrives
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
+from pace_envs.registration import set_physics_dt
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.recordings import read_all
@@ -88,7 +89,9 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     result = FitResult.load(folder)
     if not isinstance(fitted_cfg, PaceSim2realEnvCfg):
         raise ValueError(f"{settings.task} is no identification task: {folder} cannot be replayed.")
-    cfg = cfg or fitted_cfg
+    if cfg is None:
+        cfg = copy.deepcopy(fitted_cfg)
+        set_physics_dt(cfg, result.physics_dt, "the fit's physics step")
     env_cfg = _held_robot(fitted_cfg, cfg, folder)
     control_dt = _control_dt(env_cfg)
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
@@ -102,15 +105,16 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     env = ManagerBasedRLEnv(_with_envs(env_cfg, dataset.num_recordings))
     error = _errors(env, Rollout(env, dataset, _AsItIs()))  # type: ignore[arg-type]
     env.close()
-    where = dataset.sampled[: len(error)]
-    residuals = Residuals(error=error[None] * where[None, :, :, None], where=where, step=torch.arange(len(error)))
+    step = dataset.sampled.any(dim=1).nonzero()[:, 0]  # logs may be slower than the control step
+    where = dataset.sampled[step]
+    residuals = Residuals(error=error[None] * where[None, :, :, None], where=where, step=step)
     return TrainingReplay(
         joint_names=tuple(result.joint_names),
         control_dt=control_dt,
         fitted_control_dt=IdentifiedDrives.load(folder).at.control_dt,
         fitted=result.rmse,
         replayed={
-            part: rmse_by_joint(residuals, mask[: len(error)], tuple(result.joint_names))
+            part: rmse_by_joint(residuals, mask[step], tuple(result.joint_names))
             for part, mask in (("train", dataset.train), ("validation", dataset.validation))
         },
     )
@@ -166,7 +170,7 @@ def _with_envs(cfg: PaceSim2realEnvCfg, num_envs: int) -> PaceSim2realEnvCfg:
 
 
 def _errors(env: ManagerBasedRLEnv, rollout: Rollout) -> torch.Tensor:
-    """q_sim - bias - q_measured at every step, (T, R, n) [rad]."""
+    """q_sim - bias - q_measured at every step with a sample, (K, R, n) [rad]."""
     robot, data = env.scene["robot"], rollout.dataset
     bias = torch.zeros(env.num_envs, robot.num_joints, dtype=torch.float64)
     for actuator in robot.actuators.values():
