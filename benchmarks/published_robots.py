@@ -171,7 +171,7 @@ def main() -> None:
     one.add_argument("--seconds", type=float, default=SECONDS)
     one.add_argument("--max_frequency", type=float, default=10.0)
     one.add_argument("--seed", type=int, default=0)
-    one.add_argument("--step", type=float, default=0.0005, help="physics step of the recording [s]")
+    one.add_argument("--step", type=float, default=0.0001, help="physics step of the recording [s]")
     one.add_argument("--own_step", action="store_true", help="step and integrator of the file")
     one.add_argument("--hide", choices=HIDDEN, help="record and diagnose a hidden effect too")
     one.add_argument("--no_diagnosis", action="store_true")
