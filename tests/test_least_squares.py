@@ -71,7 +71,7 @@ def test_near_the_end_derivatives_are_kept_and_a_step_costs_its_trials_only():
     evaluator.residuals = lambda physical, where=None: (sizes.append(len(physical)), simulate(physical, where))[1]
     best = refine(problem, evaluator=evaluator)[0]
     neighbours = len(colour(problem.space, problem.trees, problem.joint_names).colours)
-    assert sizes[-2:] == [4, 4] and sizes[0] == 1 + neighbours
+    assert sizes.count(4) >= 2 and sizes[-1] == 4 and sizes[0] == 1 + neighbours
     again = refine(problem, best.x)[0]  # its derivatives are those at the end
     assert again.score > (1 - LeastSquaresCfg().creep_tolerance) * best.score  # what a descent leaves
 

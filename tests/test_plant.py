@@ -76,6 +76,7 @@ def test_the_plant_shares_no_code_with_the_model(path):
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "import" in path.name:
             names = [node.value]
         foreign = [name for name in names if name.startswith(("pace_actuators", "torch", "pace_optim.problem.rollout"))]
+        foreign = [name for name in foreign if name != "pace_actuators.files"]  # writes files, knows no drive
         assert not foreign, f"{path.name} imports {foreign}"
 
 

@@ -19,7 +19,9 @@ _CREEPING = 4
 _GIVEN = 5
 _SMALLEST_DAMPING = 1e-9
 _NEAR = 1e-2
-"""A step that is expected to lower the score by less than this part of it hardly changes the derivatives."""
+"""A step that is expected to lower the score by less than this part of it hardly changes the derivatives, ..."""
+_KEPT = 0.5
+"""and they are kept while steps gain this part of what is expected of them."""
 
 
 @dataclass(kw_only=True)
@@ -246,6 +248,7 @@ def _advance(
         if not np.isfinite(descent.score):
             descent.score = float(scores[0])
         descent.look(batch[0], residuals, step, colouring)
+        descent.scores = descent.scores or [descent.score]
     else:
         rows = [0, *range(len(batch) - len(_DAMPING_TRIALS) + 1, len(batch))]
         best = int(scores[rows].argmin())
@@ -267,13 +270,15 @@ def _advance(
                 descent.stop_reason = "converged"
         elif fresh:
             descent.damping *= 1e3
-        else:
-            descent.jacobian = None
-        if expected < cfg.score_tolerance * descent.score or (fresh and descent.stalled >= _STALLED):
-            descent.stop_reason = "converged"
-    descent.scores.append(descent.score)
-    if descent.stop_reason is None and _creeps(descent.scores, cfg.creep_tolerance):
-        descent.stop_reason = "converged"
+        if not fresh and gain < _KEPT * expected:
+            descent.jacobian = None  # the derivatives are those of elsewhere: look around
+        stands = expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED
+        descent.scores.append(descent.score)
+        if stands or _creeps(descent.scores, cfg.creep_tolerance):
+            if fresh:
+                descent.stop_reason = "converged"
+            else:  # look around before it ends
+                descent.jacobian = None
     if descent.score <= cfg.target_score:
         descent.stop_reason = f"score below {cfg.target_score:g}"
     elif not np.isfinite(descent.score):
