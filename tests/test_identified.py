@@ -20,6 +20,7 @@ from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_rep
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
+from pace_optim.commands.train import _task_for
 from pace_optim.fit import fit
 from pace_optim.recording import save_recording
 from pace_optim.run.result import drive_in_force
@@ -348,6 +349,16 @@ def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
     assert (stiff.sim.integrator, stiff.scene.robot.actuators["legs"].control_decimation) == ("rk4", 5)
     coarse = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.005))
     assert (coarse.sim.dt, coarse.decimation) == (0.005, 4)
+
+
+def test_the_task_to_train_in_is_that_of_the_fit_s_robot_or_what_there_is_is_told(result):
+    assert _task_for(str(result)) == WALK
+    content = json.loads(result.read_text())
+    result.write_text(json.dumps(content | {"task": "/tmp/head.xml"}))
+    with pytest.raises(ValueError, match=r"fit of /tmp/head\.xml, which has no task to train in.*Pace-Go2-Velocity-v0"):
+        _task_for(str(result))
+    with pytest.raises(ValueError, match="--task is missing"):
+        _task_for(None)
 
 
 def test_error_bars_without_a_result_are_refused():

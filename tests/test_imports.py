@@ -20,7 +20,7 @@ DOWNSTREAM = {
 
 FLOORS = {
     "pace_optim": (
-        ["choices", "terminal", "recording", "excitation"],
+        ["terminal", "recording", "excitation"],
         ["robot_logs", "plant", "export", "measured_effort"],
         ["problem"],
         ["optimizers", "single_joint_model", "one_kernel"],

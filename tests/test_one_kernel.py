@@ -193,8 +193,14 @@ def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_
         with pytest.raises(NotTraceableError):
             kernels.compile(["this is no C"])
         assert len(list(folder.iterdir())) == 1
+        other = source.replace("2.0", "3.0")
+        kernels._compiled(other).write_bytes(b"damaged")
+        with pytest.raises(NotTraceableError):  # the drives themselves go on, and the next one compiles it again
+            kernels.compile([other])
+        kernels.compile([other])
+        assert len(list(folder.iterdir())) == 2
         folder.chmod(0o777)  # others could put code there
-        host_kernels.__wrapped__().compile([source])
-        assert len(list(folder.iterdir())) == 1
+        host_kernels.__wrapped__().compile([source.replace("2.0", "4.0")])
+        assert len(list(folder.iterdir())) == 2
     finally:
         host_kernels.cache_clear()

@@ -3,7 +3,7 @@
 import os
 import sys
 
-from pace_optim.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
+from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
 

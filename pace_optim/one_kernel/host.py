@@ -22,6 +22,8 @@ from pace_optim.one_kernel.tape import NotTraceableError
 _COMPILERS = ("c++", "g++", "clang++")
 _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
 """A multiplication and an addition are rounded one by one, as everywhere else."""
+_TEMPORARY: list[tempfile.TemporaryDirectory] = []
+"""Folders of this process, removed at its end."""
 
 
 class HostKernels:
@@ -39,14 +41,18 @@ class HostKernels:
         """Compile those that are new, side by side.
 
         Raises:
-            NotTraceableError: If the compiler refuses one.
+            NotTraceableError: If the compiler refuses one, or what it makes cannot be loaded.
         """
         new = [source for source in dict.fromkeys(sources) if source not in self._functions]
         if not new:
             return
         with ThreadPoolExecutor(min(len(new), os.cpu_count() or 1)) as pool:
             for source, path in zip(new, pool.map(self._compiled, new), strict=True):
-                self._functions[source] = ctypes.CDLL(str(path)).simulate
+                try:
+                    self._functions[source] = ctypes.CDLL(str(path)).simulate
+                except (OSError, AttributeError) as error:  # a folder from which nothing may run, a damaged file
+                    path.unlink(missing_ok=True)
+                    raise NotTraceableError(f"{path}: {error}") from error
 
     def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
         """Run a compiled kernel over all its joints.
@@ -93,16 +99,10 @@ def _own_folder() -> Path:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = folder.stat()
-        if (
-            info.st_uid == os.getuid()
-            and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-            and os.access(folder, os.W_OK)
-        ):
+        others_write = bool(info.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+        if info.st_uid == os.getuid() and not others_write and os.access(folder, os.W_OK):
             return folder
-    except OSError:
+    except (OSError, AttributeError):  # no such folder, or a system without such owners
         pass
     _TEMPORARY.append(tempfile.TemporaryDirectory(prefix="pace_kernels_"))
     return Path(_TEMPORARY[-1].name)
-
-
-_TEMPORARY: list[tempfile.TemporaryDirectory] = []

@@ -14,7 +14,6 @@ from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
-from pace_optim.choices import DELAY_MODES
 from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.drive_steps import check_loops, of_joints, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
@@ -27,6 +26,7 @@ from pace_optim.problem.unknown_facts import lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
+from pace_optim.terminal.choices import DELAY_MODES
 
 
 @dataclass(kw_only=True, eq=False)

@@ -11,8 +11,8 @@ import numpy as np
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
-from pace_optim.choices import UNKNOWN_FACTS
 from pace_optim.recording import Recording
+from pace_optim.terminal.choices import UNKNOWN_FACTS
 
 LIMITS = {
     "effort_limit": "torque_limit.effort",

@@ -8,9 +8,9 @@ from typing import Any
 
 from pace_actuators.files import checked, read_json, refuse
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.choices import OPTIMIZERS
 from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
+from pace_optim.terminal.choices import OPTIMIZERS
 
 
 @dataclass(kw_only=True)

@@ -1,1 +1,1 @@
-"""What reaches disk and screen: atomic writes, messages, progress."""
+"""What reaches disk and screen: options, messages, progress."""

@@ -13,11 +13,11 @@ from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace import GLOBAL
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
-from pace_optim.choices import UNKNOWN_FACTS
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
+from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.uncertainty.other_solutions import AS_GOOD
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
