@@ -20,6 +20,9 @@ BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
 
 CURE = "Fit again."
 
+_LONGEST = 100.0
+"""Between two control steps [s]: of no drive, and so that numbers of steps are numbers."""
+
 
 @dataclass(kw_only=True)
 class DriveResult:
@@ -76,8 +79,19 @@ class DriveResult:
         for name in BASE_FIELDS:
             self._expect(name, self.joint_names, source)
         self._expect("delay", [ALL], source)
-        if not (self.delay_s >= 0 and self.control_dt > 0 and self.physics_dt > 0):
-            refuse(source, "delay_s, control_dt and physics_dt must be > 0", CURE)
+        for name in ("armature", "viscous_friction", "friction", "delay"):
+            for key, value in self.parameters[name].items():
+                if value < 0:
+                    refuse(source, f"{name} of {key} is {value:g}, expected at least 0", CURE)
+        if self.delay_s < 0:
+            refuse(source, f"delay_s is {self.delay_s:g}, expected at least 0 [s]", CURE)
+        if not 1e-9 < self.physics_dt <= self.control_dt * (1 + 1e-6) <= _LONGEST:
+            refuse(
+                source,
+                f"physics_dt is {self.physics_dt:g} and control_dt {self.control_dt:g}; expected times above 0, the "
+                f"first no longer than the second, and neither above {_LONGEST:g} [s]",
+                CURE,
+            )
         self._check_correlation(source)
 
     def _expect(self, name: str, keys: Sequence[str], source: object) -> None:

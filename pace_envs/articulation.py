@@ -15,7 +15,7 @@ from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, pick, zeros_like
 from pace_envs.joint_layout import JointLayout
 from pace_envs.link_model import LinkModel
-from pace_envs.model_file import read_model_file
+from pace_envs.model_file import compile_model, read_model_file
 from pace_envs.simulation import Simulation
 
 
@@ -23,9 +23,10 @@ def load_robot_spec(cfg: ArticulationCfg) -> mujoco.MjSpec:
     """Read a robot's MJCF; its base is fixed or floating as the configuration says.
 
     Raises:
-        ValueError: If the file is missing or no MJCF.
+        ValueError: If the file is missing or no usable MJCF.
     """
     spec = read_model_file(cfg.mjcf_path).spec
+    compile_model(spec, cfg.mjcf_path)  # a fault of the file is told with its name
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if cfg.fix_base:
         for joint in free:

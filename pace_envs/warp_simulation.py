@@ -13,6 +13,7 @@ import mujoco
 import torch
 
 from pace_envs.constraint_counts import most_constraints, most_contacts
+from pace_envs.devices import find_device
 from pace_envs.simulation import EnvIds, Simulation
 
 _INSTALL = 'pip install "pace-mujoco[gpu]"'
@@ -129,13 +130,8 @@ class WarpSimulation(Simulation):
     # ------------------------------------------------------------------ inside
 
     def _find_device(self) -> torch.device:
+        device = find_device(self.cfg.device)
         self._warp, self._mjw = _packages()
-        device = torch.device(self.cfg.device)
-        if device.type not in ("cpu", "cuda"):
-            raise ValueError(f"device is {self.cfg.device!r}, expected 'cpu' or 'cuda:0', 'cuda:1', ….")
-        if device.type == "cuda":
-            _check_cuda(device)
-            device = torch.device("cuda", device.index or 0)
         return device
 
     def _start(self) -> None:
@@ -231,14 +227,3 @@ def _packages() -> tuple[ModuleType, ModuleType]:
     warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # not a line for every kernel
     warp.init()
     return warp, mujoco_warp
-
-
-def _check_cuda(device: torch.device) -> None:
-    if not torch.cuda.is_available():
-        raise ValueError(
-            f"device is {str(device)!r}, but torch finds no CUDA. Install a driver and torch for CUDA, or use --device "
-            "cpu."
-        )
-    count = torch.cuda.device_count()
-    if (device.index or 0) >= count:
-        raise ValueError(f"device is {str(device)!r}, but there are {count} GPUs: cuda:0 to cuda:{count - 1}.")

@@ -1,5 +1,6 @@
 """Bad input to scripts/fit.py: one line that names the fault and its cure, exit status 2, nothing half-written."""
 
+import json
 import re
 import runpy
 import shutil
@@ -12,10 +13,13 @@ import pytest
 import torch
 from problems import ANYMAL, BENCH, env_cfg, record
 
+from pace_actuators import IdentifiedDrives
 from pace_envs.tasks.pace import Parameter, test_bench
 from pace_optim.fit import fit
-from pace_optim.recording import save_recording
+from pace_optim.recording import load_recording, save_recording
+from pace_optim.run.history import History
 from pace_optim.run.settings import FitSettings
+from pace_optim.run.tensors import read_trajectory
 from pace_optim.terminal.cli import run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -103,7 +107,7 @@ OPTIONS = {
     "half an environment": (["--task", BENCH, "--num_envs", "1.5"], "--num_envs: invalid int value: '1.5'"),
     "no generations": (["--task", BENCH, "--max_iteration", "0"], "max_iteration is 0, expected at least 1"),
     "a negative sigma": (["--task", BENCH, "--sigma", "-0.5"], r"sigma is -0\.5, expected a number > 0"),
-    "a sigma that is no number": (["--task", BENCH, "--sigma", "nan"], "sigma is nan, expected a number > 0"),
+    "a sigma that is no number": (["--task", BENCH, "--sigma", "nan"], "--sigma: 'nan' is not a finite number"),
     "an epsilon of zero": (["--task", BENCH, "--epsilon", "0"], "epsilon is 0.0, expected a number > 0"),
     "a negative seed": (["--task", BENCH, "--seed", "-1"], "seed is -1, expected at least 0"),
     "a physics step that is no fraction": (
@@ -222,6 +226,52 @@ def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, 
     else:
         (run / name).write_text(content)
     assert expected in fails("--resume", "run")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("control_dt", 1e308, "control_dt 1e+308"),
+        ("physics_dt", 0.1, "the first no longer than the second"),
+        ("delay_s", -1.0, "delay_s is -1"),
+        ("parameters/friction", {"all": -1.0}, "friction of all is -1"),
+    ],
+)
+def test_a_result_that_no_drive_can_have_is_told_with_its_file(key, value, expected, finished, tmp_path):
+    content = json.loads((finished / "result.json").read_text())
+    *inner, last = key.split("/")
+    (content[inner[0]] if inner else content)[last] = value
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"result\.json: .*{re.escape(expected)}"):
+        IdentifiedDrives.load(tmp_path)
+
+
+def test_names_in_lists_of_their_own_are_told_with_their_file(tmp_path):
+    path = save_recording(tmp_path / "r.csv", record())
+    facts = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").is_file() else {}
+    path.with_suffix(".json").write_text(json.dumps(facts | {"joint_names": ["servo", ["arm"]]}))
+    with pytest.raises(ValueError, match=r"r\.json: joint_names differs from the one in r\.csv"):
+        load_recording(path)
+
+
+def test_scores_of_different_length_are_told_with_their_file(finished, tmp_path):
+    content = json.loads((finished / "history.json").read_text()) | {"search_mean": []}
+    (tmp_path / "history.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"history\.json: search_best, search_mean.* differ in length \(1, 0, 1, 1\)"):
+        History.load(tmp_path / "history.json")
+
+
+@pytest.mark.parametrize("damage", ["flags that are none", "a loop of links"])
+def test_trajectories_that_are_none_are_told_with_their_file(damage, finished, tmp_path):
+    path = tmp_path / "best_trajectory.pt"
+    if damage == "a loop of links":
+        path.symlink_to(path.name)
+    else:
+        content = torch.load(finished / path.name)
+        content["recordings"][0]["torque_enable"] = "on"
+        torch.save(content, path)
+    with pytest.raises(ValueError, match=r"best_trajectory\.pt.*(torque_enable is no series|link to nothing)"):
+        read_trajectory(tmp_path)
 
 
 def test_a_robots_sample_that_is_missing_is_named(fails, monkeypatch):

@@ -227,7 +227,7 @@ BAD = [
     (["--task", "no_such_module:Robot-v0"], "no_such_module"),
     ([*BENCH, "--excitation", "chrip"], "Did you mean 'chirp'"),
     ([*BENCH, "--duration", "0"], "The duration is 0 s"),
-    ([*BENCH, "--duration", "long"], "invalid float value"),
+    ([*BENCH, "--duration", "long"], "not a finite number"),
     ([*BENCH, "--max_frequency", "300"], "200 Hz"),
     ([*BENCH, "--min_frequency", "nan"], "nan"),
     ([*BENCH, "--parameter", "frction=0.1"], "Did you mean 'friction'"),

@@ -1,7 +1,9 @@
 """A configuration from a model file alone."""
 
 import importlib.util
+import re
 import sys
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -163,6 +165,30 @@ def test_what_no_drive_can_follow_is_refused_in_one_line(tmp_path, change, messa
         text = text.replace('<muscle name="r" joint="rail" gear="50" ctrlrange="-1 1"/>', '<muscle joint="rail"/>')
     with pytest.raises(ValueError, match=message):
         cfg_of(tmp_path, text)
+
+
+@pytest.mark.parametrize("key", ["damping", "frictionloss", "armature"])
+def test_a_value_that_is_no_number_is_told_with_its_file(tmp_path, key):
+    text = re.sub(f'{key}="[^"]*"', f'{key}="nan"', ARM)
+    with pytest.raises(ValueError, match=rf"robot\.xml has a value that is not a number .*dof_{key}"):
+        cfg_of(tmp_path, text)
+
+
+def test_a_file_that_has_become_unusable_is_named_where_a_robot_is_made(tmp_path):
+    cfg = cfg_of(tmp_path, ARM)
+    path = Path(cfg.scene.robot.mjcf_path)
+    path.write_text(ARM.replace('<geom fromto="0 0 0 0.2 0 0"/>', ""))
+    with pytest.raises(ValueError, match=f"MuJoCo cannot compile {re.escape(str(path))}: .*mass"):
+        made(cfg)
+
+
+@pytest.mark.parametrize("text", ["nan", "fast"])
+@pytest.mark.parametrize("key", ["lower", "effort", "velocity"])
+def test_a_urdfs_limit_that_is_no_number_is_told_with_its_joint(tmp_path, key, text):
+    limit = " ".join(f'{k}="{text if k == key else 1}"' for k in ("lower", "upper", "effort", "velocity"))
+    urdf = f'<robot name="a"><joint name="elbow" type="revolute"><limit {limit}/></joint></robot>'
+    with pytest.raises(ValueError, match=rf"robot\.urdf: <limit {key}='{text}'> of joint 'elbow' is not a number"):
+        cfg_of(tmp_path, urdf, "robot.urdf")
 
 
 XACRO = "http://www.ros.org/wiki/xacro"

@@ -35,7 +35,7 @@ def _needs_warp(request: pytest.FixtureRequest) -> None:
 def test_a_missing_gpu_or_package_is_told_in_one_sentence():
     if torch.cuda.is_available():
         pytest.skip("there is a GPU here")
-    with pytest.raises(ValueError, match=r"MuJoCo Warp, which is not installed|torch finds no CUDA"):
+    with pytest.raises(ValueError, match=r"MuJoCo Warp, which is not installed|torch finds no GPU"):
         make_simulation(SimulationCfg(device="cuda:0"), None, 1)  # type: ignore[arg-type]
 
 

@@ -364,6 +364,8 @@ def test_the_task_to_train_in_is_that_of_the_fit_s_robot_or_what_there_is_is_tol
 def test_error_bars_without_a_result_are_refused():
     with pytest.raises(ValueError, match="--identified"):
         load_cfg(RunSettings(task=WALK, randomize_identified=1.0))
+    with pytest.raises(ValueError, match="randomize_identified is -1, expected a finite number >= 0"):
+        load_cfg(RunSettings(task=WALK, identified="any", randomize_identified=-1.0))
 
 
 @pytest.fixture(scope="module")

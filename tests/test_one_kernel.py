@@ -9,6 +9,7 @@ import torch
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
+from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.by_kernels import KernelSideBySide, fits_on
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
@@ -149,9 +150,15 @@ def test_the_processor_simulates_what_no_kernel_can(kernels, bench, monkeypatch)
     assert torch.equal(expected, got.cpu()) and got.device == kernels["device"]
 
 
-def test_a_device_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match="torch finds"):
-        fits_on("cuda:99", DEFAULT)
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("cuda:99", "torch finds|there are"), ("inf", "expected cpu"), ("os:x", "expected cpu"), ("meta", "expected")],
+)
+def test_a_device_that_is_not_there_is_refused(name, message):
+    with pytest.raises(ValueError, match=message):
+        fits_on(name, DEFAULT)
+    with pytest.raises(ValueError, match=message):
+        make_simulation(SimulationCfg(device=name), None, 1)
 
 
 def test_no_recording_leaves_a_trace_in_the_drives(kernels, bench):

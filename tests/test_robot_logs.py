@@ -367,6 +367,22 @@ def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path
 
 
 @pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (("= 40.0", "= -1"), "stiffness of hip is -1"),
+        (('des_dof_pos = "c2"\n', ""), "knee: no command"),
+        (("[joints.knee]", "[joints.ankle]"), "has no dof_pos of knee"),
+    ],
+)
+def test_what_is_wrong_with_a_map_is_told_with_its_name(tmp_path, change, expected):
+    (tmp_path / "map.toml").write_text(MAP.replace(*change))
+    header = ["clock", "m1", "m2", "c1", "c2", "i1"]
+    path = rows(header, [STAMPS / 1e6, POS[:, 0], POS[:, 1], *HELD.T, np.zeros(COUNT)], tmp_path / "leg.csv")
+    with pytest.raises(ValueError, match=rf"leg\.csv.*map\.toml.*{expected}"):
+        load_recordings(path, ROBOT, read_map(tmp_path / "map.toml"))
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (('unit = "deg"', 'unit = "degrees"'), ["joints.hip.dof_pos.unit is 'degrees'", "deg"]),

@@ -26,7 +26,7 @@ def file_at(path: str | Path, cure: str) -> Path:
         if path.is_file():
             with path.open("rb"):
                 return path
-        found = "is no file" if path.exists() else "does not exist"
+        found = "is no file" if path.exists() else "is a link to nothing" if path.is_symlink() else "does not exist"
     except (OSError, ValueError) as error:  # a loop of links, a name too long or with a zero in it, no permission
         found = f"cannot be read ({getattr(error, 'strerror', None) or error})"
     raise ValueError(f"{path} {found}. {cure}") from None

@@ -18,7 +18,7 @@ from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
 from pace_envs.from_model.scaling import base_bounds, gains, motion, runs_continuously, sample_values
-from pace_envs.model_file import ModelFile, read_model_file
+from pace_envs.model_file import ModelFile, compile_model, read_model_file
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
@@ -54,10 +54,7 @@ def read_robot(path: str | Path) -> Robot:
         ValueError: If the file is missing, is no model, or has no joints that a drive could move.
     """
     file = read_model_file(path)
-    try:
-        model = file.spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile {path}: {error}") from None
+    model = compile_model(file.spec, path)
     drives, notes = read_drives(model)
     names = [drive.joint for drive in drives] or _to_drive(model, file)
     if not names:

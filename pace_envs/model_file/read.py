@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
 from pace_envs.model_file.urdf import UrdfFacts, read_urdf
@@ -66,6 +67,23 @@ def read_model_file(path: str | Path) -> ModelFile:
     notes = [*(() if facts is None else facts.notes), *leave_out_meshes(spec, path)]
     leave_out_surfaces(spec, path)
     return ModelFile(path=path, spec=spec, notes=tuple(notes), urdf=facts)
+
+
+def compile_model(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
+    """Compile a model, whose file messages name.
+
+    Raises:
+        ValueError: If MuJoCo cannot, or a value is not a number.
+    """
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile {path}: {error}") from None
+    values = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    bad = [n for n, v in values.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f" and np.isnan(v).any()]
+    if bad:
+        raise ValueError(f"{path} has a value that is not a number (NaN), in the model's {', '.join(bad)}. Correct it.")
+    return model
 
 
 def _write_urdf_facts(spec: mujoco.MjSpec, facts: UrdfFacts) -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 MOVING = ("revolute", "continuous", "prismatic")
+_NUMBERS = {
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+    "mimic": ("multiplier", "offset"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +51,7 @@ def read_urdf(text: str, path: Path) -> UrdfFacts:
         path: Its file, for messages.
 
     Raises:
-        ValueError: If it is no URDF, or still a xacro.
+        ValueError: If it is no URDF, still a xacro, or a number in it is none.
     """
     try:
         root = ElementTree.fromstring(text)
@@ -53,6 +59,7 @@ def read_urdf(text: str, path: Path) -> UrdfFacts:
         raise ValueError(f"{path} is no readable XML: {error}.") from None
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise ValueError(f"{path} is a xacro, not yet a URDF. Expand it first: xacro {path.name} > robot.urdf")
+    _check_numbers(root, path)
     meshes = _without_meshes(root)
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
@@ -85,6 +92,21 @@ def _without_meshes(root: ElementTree.Element) -> list[str]:
         extension = ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler")
     extension.set("fusestatic", "false")  # a fixed link keeps its name: loads are bolted to it
     return list(dict.fromkeys(meshes))
+
+
+def _check_numbers(root: ElementTree.Element, path: Path) -> None:
+    for joint in root.findall("joint"):
+        for tag, keys in _NUMBERS.items():
+            element = joint.find(tag)
+            for key in keys if element is not None else ():
+                text = element.get(key, "0")
+                try:
+                    good = not math.isnan(float(text))
+                except ValueError:
+                    good = False
+                if not good:
+                    name = joint.get("name", "")
+                    raise ValueError(f"{path}: <{tag} {key}={text!r}> of joint {name!r} is not a number. Correct it.")
 
 
 def _velocity_limits(root: ElementTree.Element) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -74,6 +75,9 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
 
 def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
     """Physics step and drives as the settings say; prints what a reader should know of it."""
+    scale = settings.randomize_identified
+    if scale is not None and not 0 <= scale < math.inf:
+        raise ValueError(f"randomize_identified is {scale:g}, expected a finite number >= 0 of standard deviations.")
     if settings.identified is None:
         if settings.randomize_identified is not None:
             raise ValueError("randomize_identified needs identified drives: name a result.json with --identified.")

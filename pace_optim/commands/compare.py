@@ -6,7 +6,13 @@ import torch
 
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
+from pace_optim.terminal.options import (
+    add_common_options,
+    add_device_option,
+    add_log_options,
+    number,
+    take_common_options,
+)
 
 
 def main() -> None:
@@ -20,7 +26,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run, as fit.py prints it")
     parser.add_argument("--data", nargs="+", default=[], metavar="FILE", help="simulate these recordings instead")
     add_log_options(parser)
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="simulate at this physics step instead")
+    parser.add_argument("--physics_dt", type=number, metavar="S", help="simulate at this physics step instead")
     add_common_options(parser, run=True)
     add_device_option(parser)
     options = take_common_options(vars(parser.parse_args()))

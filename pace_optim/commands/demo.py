@@ -15,7 +15,7 @@ from pace_optim.report import write_report
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_overwrite_option
+from pace_optim.terminal.options import add_overwrite_option, number
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--effect", default="stribeck_friction", help="what is hidden (default stribeck_friction)")
     parser.add_argument("--effect_joints", default=".*KFE", metavar="REGEX", help="where (default: the knees)")
     parser.add_argument("--seed", type=int, default=0, help="of the hidden parameters and the noise")
-    parser.add_argument("--duration", type=float, default=6.0, metavar="S", help="of each recording (default 6)")
+    parser.add_argument("--duration", type=number, default=6.0, metavar="S", help="of each recording (default 6)")
     parser.add_argument("--log_dir", type=Path, default=LOG_DIR, help="where all goes (default logs/demo)")
     add_overwrite_option(parser)
     args = parser.parse_args()

@@ -7,7 +7,7 @@ import torch
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
     )
     parser.add_argument("--only", action="store_true", help="try nothing but --effects")
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="physics step (default: half a control step)")
+    parser.add_argument("--physics_dt", type=number, metavar="S", help="physics step (default: half a control step)")
     refit = parser.add_mutually_exclusive_group()
     refit.add_argument(
         "--refit",

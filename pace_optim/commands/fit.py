@@ -5,7 +5,13 @@ import sys
 
 from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
-from pace_optim.terminal.options import add_common_options, add_device_option, add_log_options, take_common_options
+from pace_optim.terminal.options import (
+    add_common_options,
+    add_device_option,
+    add_log_options,
+    number,
+    take_common_options,
+)
 
 _WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--diagnose", "--headless", "--device")
 """Options that a resumed run takes; it has the others from its start."""
@@ -43,19 +49,19 @@ def main() -> None:
     )
     parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
-    parser.add_argument("--epsilon", type=float, help="stop at this relative spread of a generation's scores")
-    parser.add_argument("--sigma", type=float, help="initial standard deviation of the search, normalised")
+    parser.add_argument("--epsilon", type=number, help="stop at this relative spread of a generation's scores")
+    parser.add_argument("--sigma", type=number, help="initial standard deviation of the search, normalised")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--max_duration",
-        type=float,
+        type=number,
         metavar="S",
         help="fit at most so much of each recording, where it moves the joints most (default: what can be)",
     )
     parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
+    parser.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
     parser.add_argument(
-        "--drive_dt", type=float, metavar="S", help="time between two runs of the drives' own controllers (PD loops)"
+        "--drive_dt", type=number, metavar="S", help="time between two runs of the drives' own controllers (PD loops)"
     )
     parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
     parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")

@@ -15,6 +15,7 @@ from pace_optim.terminal.options import (  # noqa: E402
     add_common_options,
     add_device_option,
     add_overwrite_option,
+    number,
     take_common_options,
 )
 
@@ -30,9 +31,11 @@ def main() -> None:
     add_common_options(parser, run=True)
     add_device_option(parser)
     parser.add_argument("--num_envs", type=int, default=256, help="robots that are judged (default 256)")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="how long (default 20)")
+    parser.add_argument("--seconds", type=number, default=20.0, metavar="S", help="how long (default 20)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", type=float, nargs=3, metavar=("VX", "VY", "WZ"), help="one command for all robots")
+    parser.add_argument(
+        "--command", type=number, nargs=3, metavar=("VX", "VY", "WZ"), help="one command for all robots"
+    )
     parser.add_argument("--video", metavar="FILE", help="film of the first robot, .mp4 or .gif; without a screen too")
     parser.add_argument("--viewer", action="store_true", help="open a window instead")
     parser.add_argument("--export", metavar="DIR", help="write the policy as TorchScript and ONNX")
@@ -43,7 +46,7 @@ def main() -> None:
         metavar="RUN",
         help="instead, replay the recordings of this fit in --task (default: its own environment), the base held",
     )
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="with --replay: step of physics and drives")
+    parser.add_argument("--physics_dt", type=number, metavar="S", help="with --replay: step of physics and drives")
     args = take_common_options(vars(parser.parse_args()))
     run, physics_dt = args.pop("replay"), args.pop("physics_dt")
     if run is not None:

@@ -10,7 +10,7 @@ from pace_optim.report.motion import motions_of
 from pace_optim.report.replay_page import write_replay
 from pace_optim.report.run_data import RunData
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_overwrite_option
+from pace_optim.terminal.options import add_overwrite_option, number
 
 VIEWERS = ("browser", "mujoco", "none")
 
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, metavar="FILE", help="the page (default: replay.html in RUN)")
     add_overwrite_option(parser)
     parser.add_argument("--recording", metavar="NAME", help="what MuJoCo's viewer shows (default: the worst)")
-    parser.add_argument("--speed", type=float, default=1.0, help="of MuJoCo's viewer, 1 is real time")
+    parser.add_argument("--speed", type=number, default=1.0, help="of MuJoCo's viewer, 1 is real time")
     args = parser.parse_args()
 
     own = Path(args.run) / "replay.html"

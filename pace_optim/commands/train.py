@@ -10,7 +10,7 @@ from pace_envs.registration import registered_tasks
 from pace_envs.rl import RunSettings, resume, train
 from pace_optim.problem.processes import own_device
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_device_option, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
 
 
 def main() -> None:
@@ -28,9 +28,11 @@ def main() -> None:
     parser.add_argument("--randomize", action="store_true", help="train with pushes, over many frictions and loads")
     parser.add_argument("--identified", metavar="FILE", help="train with the drives of this fit: its result.json")
     parser.add_argument(
-        "--randomize_identified", type=float, metavar="K", help="drives within K of their error bars (usually 1)"
+        "--randomize_identified", type=number, metavar="K", help="drives within K of their error bars (usually 1)"
     )
-    parser.add_argument("--physics_dt", type=float, metavar="S", help="step of physics and drives (default: the fit's)")
+    parser.add_argument(
+        "--physics_dt", type=number, metavar="S", help="step of physics and drives (default: the fit's)"
+    )
     parser.add_argument(
         "--start_from", metavar="CHECKPOINT", help="go on from this policy in a new run, such as with other drives"
     )

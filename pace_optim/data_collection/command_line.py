@@ -12,7 +12,7 @@ from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
 from pace_optim.terminal.cli import Parser, make_parser
-from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, number, take_common_options
 
 from .cfg import CollectionCfg
 
@@ -38,9 +38,9 @@ def make_collection_parser() -> Parser:
     add("--output", type=Path, metavar="FILE", help=".npz, .pt or .csv (default data/<robot>/<excitation>.npz)")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", default="chirp", metavar="NAME", help=f"(default chirp) {kinds}")
-    motion.add_argument("--duration", type=float, metavar="S", help="of each trajectory (default: as listed above)")
-    motion.add_argument("--min_frequency", type=float, default=0.1, metavar="HZ", help="of the band (default 0.1)")
-    motion.add_argument("--max_frequency", type=float, default=10.0, metavar="HZ", help="of the band (default 10)")
+    motion.add_argument("--duration", type=number, metavar="S", help="of each trajectory (default: as listed above)")
+    motion.add_argument("--min_frequency", type=number, default=0.1, metavar="HZ", help="of the band (default 0.1)")
+    motion.add_argument("--max_frequency", type=number, default=10.0, metavar="HZ", help="of the band (default 10)")
     motion.add_argument("--seed", type=int, default=0, metavar="N", help="of the motion and the noise (default 0)")
     motion.add_argument(
         "--optimize",
@@ -50,7 +50,7 @@ def make_collection_parser() -> Parser:
     )
     motion.add_argument(
         "--reach",
-        type=float,
+        type=number,
         default=1.0,
         metavar="FACTOR",
         help="with --optimize, width of the range of targets as a multiple of PaceCfg.excitation's (default 1)",
@@ -76,18 +76,18 @@ def make_collection_parser() -> Parser:
     robot.add_argument(
         "--effect_joints", default=".*", metavar="REGEX", help="joints that have the effects (default: all)"
     )
-    robot.add_argument("--stiffness", type=float, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
-    robot.add_argument("--damping", type=float, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
+    robot.add_argument("--stiffness", type=number, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
+    robot.add_argument("--damping", type=number, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
     robot.add_argument("--delay_mode", metavar="MODE", help="command or effort: what the delay delays")
-    robot.add_argument("--physics_dt", type=float, metavar="S", help="finer physics step under the same control rate")
-    robot.add_argument("--load_mass", type=float, metavar="KG", help="test bench: mass at the end of the arm")
-    robot.add_argument("--load_length", type=float, metavar="M", help="test bench: length of the arm")
-    robot.add_argument("--arm_mass", type=float, metavar="KG", help="test bench: mass of the arm")
+    robot.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
+    robot.add_argument("--load_mass", type=number, metavar="KG", help="test bench: mass at the end of the arm")
+    robot.add_argument("--load_length", type=number, metavar="M", help="test bench: length of the arm")
+    robot.add_argument("--arm_mass", type=number, metavar="KG", help="test bench: mass of the arm")
     robot.add_argument(
         "--added_mass", action="append", default=[], metavar="BODY=KG", help="mass added to a body; may be repeated"
     )
     encoder = parser.add_argument_group("encoder")
-    encoder.add_argument("--noise", type=float, default=0.0, metavar="RAD", help="standard deviation (default 0)")
+    encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
     encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
     files = parser.add_argument_group("files")
     add_overwrite_option(files)

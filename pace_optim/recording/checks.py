@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .data import Recording
-from .facts import drive_of, joint_names_of, load_of
+from .facts import as_array, drive_of, joint_names_of, load_of
 from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, SERIES, closest, listed
 from .stamps import seconds_of
 
@@ -102,10 +102,7 @@ def _check_keys(fields: Mapping[str, Any], source: str, found: Sequence[str]) ->
 
 def _numeric(key: str, value: Any, source: str) -> np.ndarray:
     """Return `value` as float64; every float32 and every usual integer is kept exactly."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # ragged lists
-        array = np.asarray(None)
+    array = as_array(value)
     if array.dtype.kind not in "iuf":
         raise ValueError(
             f"{source}: {key} holds {array.dtype}, not numbers; expected floats. Store {key} as an array of floats."
@@ -115,7 +112,7 @@ def _numeric(key: str, value: Any, source: str) -> np.ndarray:
 
 def _stamps(key: str, value: Any, source: str) -> tuple[np.ndarray, float, str]:
     """Stamps [s], the clock at zero [s], and what kind of stamps they were."""
-    array = np.asarray(value)
+    array = as_array(value)
     if array.dtype.kind not in "UMiuf":
         array = _numeric(key, value, source)
     if array.ndim != 1:
@@ -156,7 +153,7 @@ def _origin(value: Any, of_stamps: float, source: str) -> float:
         return of_stamps
     if of_stamps:
         raise ValueError(f"{source}: holds time_origin, but time is Unix time already. Leave time_origin out.")
-    array = np.atleast_1d(np.asarray(value))
+    array = np.atleast_1d(as_array(value))
     if array.shape == (1,) and array.dtype.kind in "UM":
         return _stamps("time_origin", array, source)[1]
     if array.shape != (1,) or array.dtype.kind not in "iuf" or not np.isfinite(array[0]):
@@ -187,7 +184,7 @@ def _joint_series(key: str, value: Any, stamps: str, time: np.ndarray, source: s
 
 
 def _torque_enable(value: Any, num_samples: int, source: str) -> np.ndarray:
-    array = np.asarray(value)
+    array = as_array(value)
     if array.dtype.kind not in "biuf" or not np.all((array == 0) | (array == 1)):
         raise ValueError(
             f"{source}: torque_enable holds values other than true and false (0 and 1). "

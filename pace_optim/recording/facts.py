@@ -16,6 +16,14 @@ _MAY_BE_INFINITE = ("effort_limit", "saturation_effort", "velocity_limit")
 _MAY_BE_ZERO = ("stiffness", "damping", "load_mass", "arm_mass")
 
 
+def as_array(value: Any) -> np.ndarray:
+    """A value of a file as an array; lists that make none give an array of ``None``, which no check takes."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.asarray(None)
+
+
 def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     """Return the file's joint names as a tuple, () when it has none.
 
@@ -57,10 +65,7 @@ def load_of(fields: Mapping[str, Any], source: str) -> Load:
 def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], num_joints: int, source: str) -> np.ndarray:
     if isinstance(value, Mapping):
         value = _in_column_order(key, value, joint_names, source)
-    try:
-        array = np.asarray(value)
-    except ValueError:  # a ragged list
-        array = np.asarray(None)
+    array = as_array(value)
     if array.dtype.kind not in "iuf":
         raise ValueError(
             f"{source}: {key} is {value!r}; expected a number, a list of {num_joints} numbers in the order "
@@ -110,7 +115,7 @@ def _added_mass(value: Any, source: str) -> dict[str, float]:
 
 
 def _number(key: str, value: Any, source: str, label: str = "") -> float:
-    array = np.asarray(value)
+    array = as_array(value)
     if array.dtype.kind not in "iuf" or array.size != 1:
         raise ValueError(f"{source}: {label or key} is {value!r}; expected one number. Correct it.")
     _check_range(label or key, key, number := float(array.reshape(())), source)

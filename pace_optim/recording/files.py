@@ -18,6 +18,7 @@ from pace_optim.terminal.arrays import read_arrays
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
 from .data import Recording
+from .facts import as_array
 from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean, listed
 
 SUFFIXES = (".pt", ".npz", ".csv")
@@ -182,4 +183,4 @@ def _same(one: Any, other: Any) -> bool:
         one = json.loads(one)
     if isinstance(one, dict) or isinstance(other, dict):
         return one == other
-    return np.array_equal(np.asarray(one), np.asarray(other))
+    return np.array_equal(as_array(one), as_array(other))

@@ -29,7 +29,9 @@ def write_replay(folder: str | Path, output: Path | None = None) -> Path:
     run.model()
     section = replay(run)
     if section is None:
-        raise ValueError(f"{folder} holds no trajectories to replay: the fit that made it has not ended. Resume it.")
+        raise ValueError(
+            f"{folder / 'best_trajectory.pt'} does not exist: the fit that made {folder} has not ended. Resume it."
+        )
     path = output or folder / "replay.html"
     write_atomically(path, lambda file: file.write(render(run, [section], figures=False).encode()))
     return path

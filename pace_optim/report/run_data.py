@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ class RunData:
             ValueError: If it has no result, or a file is damaged.
         """
         result = FitResult.load(folder)
-        trajectory = {} if not (folder / "best_trajectory.pt").exists() else read_trajectory(folder)
+        trajectory = read_trajectory(folder) if os.path.lexists(folder / "best_trajectory.pt") else {}
         names = tuple(trajectory.get("joint_names", result.joint_names))
         if names != tuple(result.joint_names):
             refuse(folder / "best_trajectory.pt", "joint_names are not those of result.json", _CURE)
@@ -77,7 +78,7 @@ class RunData:
         return cls(
             folder=folder,
             result=result,
-            history=History.load(folder / "history.json") if (folder / "history.json").exists() else None,
+            history=History.load(folder / "history.json") if os.path.lexists(folder / "history.json") else None,
             joint_names=names,
             recordings=tuple(_recording(content) for content in trajectory.get("recordings", [])),
             bounds=read_bounds(folder),
@@ -152,4 +153,4 @@ def _recording(content: dict[str, Any]) -> RecordingData:
 
 
 def _read_json(path: Path) -> Any | None:
-    return read_json(path, _CURE) if path.exists() else None
+    return read_json(path, _CURE) if os.path.lexists(path) else None

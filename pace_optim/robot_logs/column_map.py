@@ -55,6 +55,8 @@ class ColumnMap:
     """Its unit: s, ms, us or ns; "": as guessed."""
     facts: Mapping[str, Any] = field(default_factory=dict)
     """Facts of the recording: stiffness, added_mass, ..."""
+    source: str = field(default="", compare=False)
+    """The file it was read from, for messages."""
 
 
 _CURE = "Give --columns a column map, as pace import writes it."
@@ -87,6 +89,7 @@ def read_map(path: Path) -> ColumnMap:
         time=str(time.get("column", "")),
         time_unit=unit,
         facts=facts,
+        source=str(path),
     )
 
 

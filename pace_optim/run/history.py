@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from pace_actuators.files import checked, read_json
+from pace_actuators.files import checked, read_json, refuse
 
 
 @dataclass(kw_only=True)
@@ -35,7 +35,12 @@ class History:
             ValueError: If it is missing or damaged.
         """
         cure = "Fit again, or go on with the run: it is written anew."
-        return checked(cls, read_json(path, cure), path, cure)
+        history = checked(cls, read_json(path, cure), path, cure)
+        for stage in ("search", "refine"):
+            own = {name: len(value) for name, value in asdict(history).items() if name.startswith(stage)}
+            if len(set(own.values())) > 1:
+                refuse(path, f"{', '.join(own)} differ in length ({', '.join(map(str, own.values()))})", cure)
+        return history
 
     def places(self) -> tuple[list[int], list[int]]:
         """Which of all iterations, counted from 1 by simulated steps, those of the search and of the refinement are."""

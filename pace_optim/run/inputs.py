@@ -76,8 +76,8 @@ def check_same_configuration(run: Run, problem: Problem) -> None:
     for part in run.resolved:
         if part not in _NOT_TO_COMPARE and (found := first_difference(run.resolved[part], now.get(part))):
             raise ValueError(
-                f"The environment's {part} has changed since the run was started: {found}. Put it back, or start a new "
-                "fit."
+                f"The environment's {part} has changed since the run was started: {found} in "
+                f"{run.folder / 'settings.json'}. Put it back, or start a new fit."
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
         ValueError: If it is missing or damaged; the message names the key.
     """
     path = folder / "best_trajectory.pt"
-    if not path.exists():
+    if not os.path.lexists(path):
         raise ValueError(
             f"{folder} has no {path.name} yet: the fit has not ended. Wait, or go on with "
             f"scripts/fit.py --resume {folder}"
@@ -47,9 +48,10 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
         shape = (len(time), joints)
         if not _is_series(entry[name], 2, finite=name != "sim_dof_pos") or tuple(entry[name].shape) != shape:
             refuse(where, f"{name} is no series of finite numbers of shape {shape}", _ANEW)
-    train = entry["train"]
-    if not (isinstance(train, torch.Tensor) and train.dtype == torch.bool and train.shape == time.shape):
-        refuse(where, f"train is no series of true and false of shape {tuple(time.shape)}", _ANEW)
+    for name in ("train", "torque_enable"):
+        flags = entry[name] if name == "train" else entry.get(name, entry["train"])
+        if not (isinstance(flags, torch.Tensor) and flags.dtype == torch.bool and flags.shape == time.shape):
+            refuse(where, f"{name} is no series of true and false of shape {tuple(time.shape)}", _ANEW)
 
 
 def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
@@ -59,7 +61,7 @@ def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
         ValueError: If it is damaged.
     """
     path = folder / "config.pt"
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
     content = _dict(read_tensors(path, _ANEW), path, ("parameters", "bounds_params"))
     labels, bounds = content["parameters"], content["bounds_params"]

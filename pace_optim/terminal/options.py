@@ -3,9 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import Any
 
 _TASK = "registered environment, module:Name, FILE.py:Name, or a model file"
+
+
+def number(text: str) -> float:
+    """Type of options that hold a number.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is none, or not finite.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return value
 
 
 def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco[gpu]") -> None:

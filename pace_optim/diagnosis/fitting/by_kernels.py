@@ -8,6 +8,7 @@ from functools import partial
 
 import torch
 
+from pace_envs.devices import find_device
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
@@ -74,18 +75,12 @@ def fits_on(device: str, cfg: DiagnosisCfg) -> Fits:
     On a processor with a compiler of C++ the same kernels run there; without one, the drives themselves do.
 
     Raises:
-        ValueError: If torch finds no such GPU.
+        ValueError: If there is no such device.
     """
-    if device == "cpu":
+    own = find_device(device)
+    if own.type == "cpu":
         compiler = host_kernels()
         if compiler is None:
             return Fits(cfg=cfg)
-        return Fits(cfg=cfg, batch=partial(KernelSideBySide, compiler=compiler, device=torch.device("cpu")))
-    own = torch.device(device)
-    if not torch.cuda.is_available() or (own.index or 0) >= torch.cuda.device_count():
-        raise ValueError(
-            f"device is {device!r}, but torch finds {torch.cuda.device_count()} GPUs with CUDA. Install a driver and "
-            "torch for CUDA, or use --device cpu."
-        )
-    own = torch.device("cuda", own.index or 0)
+        return Fits(cfg=cfg, batch=partial(KernelSideBySide, compiler=compiler, device=own))
     return Fits(cfg=cfg, batch=partial(KernelSideBySide, compiler=kernels_of(own), device=own), on_gpu=True)
