@@ -96,17 +96,15 @@ def _without_meshes(root: ElementTree.Element) -> list[str]:
 
 def _check_numbers(root: ElementTree.Element, path: Path) -> None:
     for joint in root.findall("joint"):
-        for tag, keys in _NUMBERS.items():
-            element = joint.find(tag)
-            for key in keys if element is not None else ():
-                text = element.get(key, "0")
+        for element in joint:
+            for key in _NUMBERS.get(element.tag, ()):
                 try:
-                    good = not math.isnan(float(text))
+                    good = not math.isnan(float(element.get(key, "0")))
                 except ValueError:
                     good = False
                 if not good:
-                    name = joint.get("name", "")
-                    raise ValueError(f"{path}: <{tag} {key}={text!r}> of joint {name!r} is not a number. Correct it.")
+                    what = f"<{element.tag} {key}={element.get(key)!r}> of joint {joint.get('name', '')!r}"
+                    raise ValueError(f"{path}: {what} is not a number. Correct it.")
 
 
 def _velocity_limits(root: ElementTree.Element) -> dict[str, float]:
