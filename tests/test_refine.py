@@ -32,6 +32,13 @@ def test_the_beginning_is_the_first_quarter_of_the_training_samples(problem):
     assert bool(chosen[: int(chosen.sum())].all())
 
 
+def test_the_beginning_of_a_long_recording_is_no_longer_than_is_enough(problem, monkeypatch):
+    dataset = make_dataset(problem.dataset.recordings, train_fraction=0.7)
+    monkeypatch.setattr("pace_optim.recording.dataset._ENOUGH", 50)
+    chosen = dataset.beginning(BEGINNING)
+    assert int(chosen.sum()) == 50 and bool((chosen[:50] & dataset.train[:50]).all())
+
+
 def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem, colouring):
     plain, refined = problem.training_evaluator(), problem.training_evaluator()
     least_squares(plain, colouring, [centre(problem)])
