@@ -135,11 +135,15 @@ class Simulation:
         self.qpos = self.bind("qpos")
         self.qvel = self.bind("qvel")
         self.qfrc_applied = self.bind("qfrc_applied")
-        self.qfrc_bias = self.bind("qfrc_bias")
         self._constants_changed = False
         self._expanded: dict[str, torch.Tensor] = {}
         self._link_fields: dict[str, torch.Tensor] = {}
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
+
+    @cached_property
+    def qfrc_bias(self) -> torch.Tensor:
+        """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m]."""
+        return self.bind("qfrc_bias")
 
     def bind(self, field: str) -> torch.Tensor:
         """A live tensor over an ``MjData`` field, shape (num_envs, ...).

@@ -39,20 +39,6 @@ class WarpSimulation(Simulation):
     data: Any
     warp_model: Any
 
-    @property
-    def qfrc_bias(self) -> torch.Tensor:  # type: ignore[override]
-        """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m].
-
-        Whoever has read it once gets it right after every reset; nobody else pays for that.
-        """
-        self._bound.add("qfrc_bias")
-        return self._qfrc_bias
-
-    @qfrc_bias.setter
-    def qfrc_bias(self, value: torch.Tensor) -> None:
-        self._qfrc_bias = value
-        self._bound.discard("qfrc_bias")
-
     def bind(self, field: str) -> torch.Tensor:
         """A live tensor over a field of the data, shape (num_envs, ...)."""
         if not hasattr(self.data, field):

@@ -116,9 +116,9 @@ def _swap_all(recorder: Places, rollout: Rollout, actuator: PaceDCMotor) -> None
     recorder.put(sim, "_steps", 0)
     for key in _SIMULATION:
         recorder.swap(sim, key, 0, recorder.dof_columns)
-    for name, value in sim._fields.items():
+    for name, value in sim._expanded.items():
         if value.ndim == 2:
-            recorder.swap(sim._fields, name, 0, recorder.dof_columns)
+            recorder.swap(sim._expanded, name, 0, recorder.dof_columns)
     for parameter in sim._model_values:
         recorder.swap(sim._model_values, parameter, 0, sim._place(recorder.dof_columns))
     for key in _DATA:

@@ -34,20 +34,12 @@ class TwinSimulation(Simulation):
             num_envs: Number of environments, a multiple of the path's recordings.
             path: The reference.
         """
-        self.cfg, self.num_envs, self.path = cfg, num_envs, path
-        self.device = torch.device("cpu")
-        self._take_joints(path.columns, spec)
-        self.batch = None
-        model = self.model
-        self._fields: dict[str, torch.Tensor] = {}
-        self.qpos = torch.zeros(num_envs, model.nq, dtype=torch.float64)
-        self.qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
-        self.qfrc_applied = torch.zeros(num_envs, model.nv, dtype=torch.float64)
-        self._implicit = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self.path = path
+        super().__init__(cfg, spec, num_envs)
+        self._implicit = torch.zeros_like(self.qvel)
         self._is_implicit = False
-        self._constants_changed = False
         self._steps = 0
-        self._as_in_model = torch.equal(self._columns, torch.arange(model.nv))
+        self._as_in_model = torch.equal(self._columns, torch.arange(self.model.nv))
         self._shape = (-1, path.position.shape[1], len(self._columns))
         self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
@@ -111,12 +103,16 @@ class TwinSimulation(Simulation):
         result[:, self._columns] = load.neg_().view(len(result), -1)
         return result
 
+    def bind(self, field: str) -> torch.Tensor:
+        """A field of the state, at zero, (num_envs, ...): nobody else holds it."""
+        return torch.zeros(self.num_envs, self.model.nq if field == "qpos" else self.model.nv, dtype=self.dtype)
+
     def expand(self, field: str) -> torch.Tensor:
         """The values per simulation of a field of the model; of those, the twins use what drives write."""
-        if field not in self._fields:
+        if field not in self._expanded:
             value = torch.as_tensor(np.array(getattr(self.model, field)))
-            self._fields[field] = value.expand(self.num_envs, *value.shape).clone()
-        return self._fields[field]
+            self._expanded[field] = value.expand(self.num_envs, *value.shape).clone()
+        return self._expanded[field]
 
     def write_passive(
         self,
@@ -180,17 +176,21 @@ class TwinSimulation(Simulation):
     def close(self) -> None:
         """Nothing to release."""
 
-    def _take_joints(self, columns: torch.Tensor, spec: mujoco.MjSpec) -> None:
-        """Set the model, without joints that are not on the path, and where those that are have their columns."""
-        self.model = self._compile(spec)
+    def _start(self) -> None:
+        """No simulation of the whole model runs."""
+
+    def _compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        """The model without joints that are not on the path; says where those that are have their columns."""
+        columns, self.model = self.path.columns, super()._compile(spec)
         names = [self.model.joint(self.model.dof_jntid[column]).name for column in columns.tolist()]
         alone = self._stands_alone[columns]
         if others := [joint for joint in spec.joints if joint.name not in names]:
             for element in [*spec.sensors, *spec.equalities, *spec.tendons, *others]:
                 spec.delete(element)
-            self.model = self._compile(spec)
+            self.model = super()._compile(spec)
         self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in names])
         self._stands_alone = torch.zeros(self.model.nv, dtype=torch.bool).index_put((self._columns,), alone)
+        return self.model
 
     def _interval(self) -> tuple[int, int]:
         """The present control step, and which physics step of it begins; both stay where the reference ends."""
