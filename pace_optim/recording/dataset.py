@@ -11,7 +11,6 @@ import torch
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.sessions import session_starts
 
-
 _ENOUGH = 20_000
 """Samples of a beginning at most, 20 s at 1 kHz: the descent on everything that follows finds the rest."""
 
