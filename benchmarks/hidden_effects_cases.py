@@ -19,8 +19,7 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.by_kernels import fits_on
-from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.fits import Fits, fits_on
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines

@@ -4,6 +4,7 @@ import ast
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from diagnoses import errors_of, make_search, with_effects
@@ -67,7 +68,7 @@ def test_another_comparison_decides_otherwise():
     left = {effects[0]: errors_of(1.2e-3, roll=1), effects[1]: errors_of(3e-3, roll=1), None: errors_of(1e-3)}
     log: list[Decision] = []
     search = make_search(lambda of: left[of.tried], log=log.append)
-    drop_last(search, Branch(problem=None, now=now, errors=left[None]))
+    drop_last(search, Branch(problem=SimpleNamespace(on_joints=lambda _: None), now=now, errors=left[None]))
     first = log[0]
     assert first.taken == ["stribeck_friction"] == replayed(first)  # 1.2 times is less than a further effect must bring
     lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1.1, clear=1.1))
@@ -117,7 +118,7 @@ def test_whoever_is_given_numbers_passes_them_on():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):
                 arguments = [*node.args.args, *node.args.kwonlyargs]
-                names = [a.arg for a in arguments if a.arg in ("cfg", "at_bound", "beyond")]
+                names = [a.arg for a in arguments if a.arg == "cfg"]
                 if names and path.name != "replay.py":
                     given[node.name] = [a.arg for a in arguments].index(names[0])
             elif isinstance(node, ast.Call):
@@ -125,5 +126,5 @@ def test_whoever_is_given_numbers_passes_them_on():
     for path, name, call in calls:
         if name in given and name not in ("__init__", "Fits"):
             passed = [k.arg for k in call.keywords]
-            count = len(call.args) + (isinstance(call.func, ast.Attribute) and name in ("at_bounds", "judged", "beats"))
-            assert {"cfg", "at_bound", "beyond"} & set(passed) or count > given[name], f"{path}:{call.lineno}: {name}"
+            count = len(call.args) + (isinstance(call.func, ast.Attribute) and name in ("judged", "beats"))
+            assert "cfg" in passed or count > given[name], f"{path}:{call.lineno}: {name}"

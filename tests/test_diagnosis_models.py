@@ -155,8 +155,8 @@ def test_where_an_encoder_sits_is_chosen_and_not_walked_to(bench):
     assert fits[0].model.free[0].tolist() == [True] * (len(BASE) + 2) + [False]
     link, motor = fits
     assert [float(f.model.to_physical(f.x)[0, -1]) for f in fits] == [0.0, 1.0]
-    assert float(link.merged(motor, torch.tensor([False])).physical[0, -1]) == 0.0
-    assert float(link.merged(motor, yes).physical[0, -1]) == 1.0
+    assert float(link.with_joints(torch.tensor([False]), motor).physical[0, -1]) == 0.0
+    assert float(link.with_joints(yes, motor).physical[0, -1]) == 1.0
     assert model.structure_held(STRIBECK, physical) is model  # it has nothing of the kind
 
 

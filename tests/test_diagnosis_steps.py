@@ -147,7 +147,8 @@ def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
 def two_joints(bench):
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
-    return replace(one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1))
+    bounds = {side: getattr(one, side).repeat(2, 1) for side in ("lower", "upper")}
+    return replace(one, has=none, slides=one.slides.repeat(2), **bounds)
 
 
 @pytest.mark.parametrize("stood_out", [True, False])  # beside neighbours that moved wrongly

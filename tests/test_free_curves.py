@@ -121,7 +121,7 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
         best = curves.errors[curves.best(0)]
         outcome = replace(outcome, final_errors=replace(best, square=times * best.square))
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
-    monkeypatch.setattr("pace_optim.diagnosis.verdict.free_curves.SomeJoints.refitted", lambda *_: fits)
+    monkeypatch.setattr(Fits, "on_joints", lambda *_: fits)
     found = fit_curves(Fits(), outcome, FLOOR)
     assert found.instead.tolist() == [instead]
     outcome = take_curves(outcome, found)
@@ -158,9 +158,8 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     """A spring explains joint a and little of c, a curve joint b; d is at the floor."""
     spring, curve = get_effect("parallel_spring"), get_effect("friction_over_speed")
     one, four = JointModel.base(run.problem), torch.arange(4)
-    model = replace(
-        one, has=torch.zeros(0, 4, dtype=torch.bool), lower=one.lower.expand(4, -1), upper=one.upper.expand(4, -1)
-    )
+    all_of_them = {"lower": one.lower.expand(4, -1), "upper": one.upper.expand(4, -1), "slides": one.slides.expand(4)}
+    model = replace(one, has=torch.zeros(0, 4, dtype=torch.bool), **all_of_them)
     values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
     with_curve = model.extended(values, curve, four < 3, torch.full((4, len(curve.parameters)), 0.1).double())
     with_spring = model.extended(

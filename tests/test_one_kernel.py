@@ -11,7 +11,7 @@ from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_p
 from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.by_kernels import KernelSideBySide, fits_on
+from pace_optim.diagnosis.fitting.fits import fits_on
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.one_kernel import NotTraceableError
@@ -51,14 +51,15 @@ def slots_of(problem, start, *sets):
 
 
 def both(problem, models, kernels, training=True):
-    """Errors of models by the simulation and by kernels, which tell what they cannot do; two candidates of each."""
+    """Errors of models by the simulation and by kernels, two candidates of each."""
     slots = [Slot(model=model, rows=2) for model, _ in models]
     rows = [torch.stack([values, values * 1.01]) for _, values in models]
-    batches = SideBySide(problem, slots, training), KernelSideBySide(problem, slots, training, **kernels)
+    batches = SideBySide(problem, slots, training), SideBySide(problem, slots, training, **kernels)
     where = (batches[0].dataset.train if training else batches[0].dataset.sampled).clone()
     where[STEPS:] = False
-    expected, got = (SideBySide.simulate(batch, rows, where, 2) for batch in batches)
-    again = SideBySide.simulate(batches[1], rows, where, 2)
+    expected, got = (batch.simulate(rows, where, 2) for batch in batches)
+    again = batches[1].simulate(rows, where, 2)
+    assert batches[1]._kernels is not None  # they did what the drives do
     assert torch.equal(got, again)
     return expected, got.cpu()
 
@@ -140,14 +141,12 @@ class Branching(Effect):
 def test_the_processor_simulates_what_no_kernel_can(kernels, bench, monkeypatch):
     monkeypatch.setitem(registry._EFFECTS, Branching.name, Branching)
     models = slots_of(bench.problem, bench.start, [Branching])
-    with pytest.raises(NotTraceableError, match="any"):
-        both(bench.twins, models, kernels)
     slots, values = [Slot(model=model, rows=1) for model, _ in models], [own[None] for _, own in models]
-    batches = SideBySide(bench.twins, slots, True), KernelSideBySide(bench.twins, slots, True, **kernels)
+    batches = SideBySide(bench.twins, slots, True), SideBySide(bench.twins, slots, True, **kernels)
     where = batches[0].dataset.train.clone()
     where[20:] = False
     expected, got = (batch.simulate(values, where) for batch in batches)
-    assert torch.equal(expected, got.cpu()) and got.device == kernels["device"]
+    assert torch.equal(expected, got.cpu()) and got.device == kernels["device"] and batches[1]._kernels is None
 
 
 @pytest.mark.parametrize(
@@ -165,7 +164,7 @@ def test_no_recording_leaves_a_trace_in_the_drives(kernels, bench):
     """A batch that was simulated by kernels goes on as one that was not."""
     model, values = slots_of(bench.problem, bench.start, [get_effect("backlash")])[1]
     slots = [Slot(model=replace(model), rows=1)]
-    one, other = SideBySide(bench.twins, slots, True), KernelSideBySide(bench.twins, slots, True, **kernels)
+    one, other = SideBySide(bench.twins, slots, True), SideBySide(bench.twins, slots, True, **kernels)
     where = one.dataset.train.clone()
     where[30:] = False
     other.simulate([values[None]], where)
@@ -177,7 +176,8 @@ def test_a_processor_without_a_compiler_simulates_the_drives_themselves(monkeypa
     monkeypatch.setenv("PATH", str(tmp_path))
     host_kernels.cache_clear()
     try:
-        assert host_kernels() is None and fits_on("cpu", DEFAULT).batch is SideBySide
+        assert host_kernels() is None
+        assert fits_on("cpu", DEFAULT).batch.keywords["compiler"] is None
     finally:
         host_kernels.cache_clear()
 

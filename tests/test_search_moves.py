@@ -72,7 +72,7 @@ def stays(problem, now):
 
 
 def moves(problem, now):
-    return SimpleNamespace(), now
+    return SimpleNamespace(on_joints=some), now
 
 
 class InWorld(FakeFits):
@@ -95,6 +95,11 @@ def base_model(n=1):
     )
 
 
+def some(joints):
+    """The problem of some joints."""
+    return SimpleNamespace(joints=joints.nonzero()[:, 0].tolist())
+
+
 def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
@@ -102,7 +107,7 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
     model = base_model(n)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * model.upper), [ELASTICITY, MOUNT, GAIN, SPRING]
-    problem = SimpleNamespace(on_joints=lambda joints: SimpleNamespace(joints=joints))
+    problem = SimpleNamespace(on_joints=some)
     search = Search(
         effects=candidates,
         effort=5 * floor,
@@ -114,7 +119,7 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
         log=log,
         try_effects=world.try_effects,
     )
-    outcome = add_effects(search, problem, base, lambda now, _: torch.zeros(now.model.has.shape))
+    outcome = add_effects(search, problem, base, lambda now: torch.zeros(now.model.has.shape))
     assert torch.equal(outcome.final_errors.mse, world.errors(SimpleNamespace(), [outcome.final])[0].mse)
     return outcome, world
 

@@ -15,7 +15,6 @@ from pace_optim.diagnosis.beginning.base_fit import joint_vectors
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.choice import choose
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.recording import Load
 from pace_optim.single_joint_model import reference_path, twin_problem
@@ -64,7 +63,7 @@ def legs():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_they_move_as_they_do_among_all(legs, training):
-    part, base = SomeJoints(these(*CHOSEN)), JointModel.base(legs.problem)
+    part, base = these(*CHOSEN), JointModel.base(legs.problem)
     every = [True] * N
     models = [
         with_effects(base, 1.1 * legs.values),
@@ -79,7 +78,7 @@ def test_they_move_as_they_do_among_all(legs, training):
         return batch.simulate([m.model.to_physical(m.x)[None] for m in models], batch.dataset.sampled)
 
     whole = errors(legs.twins, models)
-    alone = errors(part.of_problem(legs.twins), [part.of_fit(model) for model in models])
+    alone = errors(legs.twins.on_joints(part), [model.on_joints(part) for model in models])
     assert alone.shape == (*whole.shape[:-1], len(CHOSEN)) and float(whole.abs().max()) > 1e-4
     assert torch.equal(alone, whole[..., list(CHOSEN)])
 
@@ -94,8 +93,8 @@ def test_their_bounds_are_their_own():
 
 
 def test_all_joints_are_the_problem_itself(legs):
-    part, now = SomeJoints(these(*range(N))), with_effects(JointModel.base(legs.problem), legs.values)
-    assert part.of_problem(legs.twins) is legs.twins and part.of_fit(now) is now
+    every, now = these(*range(N)), with_effects(JointModel.base(legs.problem), legs.values)
+    assert legs.twins.on_joints(every) is legs.twins and now.on_joints(every) is now
 
 
 def test_what_ties_joints_together_does_not_keep_them_from_being_taken_out(legs):
@@ -121,8 +120,7 @@ def test_they_come_back_and_leave_the_others_as_they_were(legs):
     base, which = JointModel.base(legs.problem), these(*CHOSEN)
     left = these(0, 1, 2).tolist()
     now = with_effects(base, legs.values, (ELASTICITY, left, [300.0, 1.0, 1.0]), (GAIN, these(5).tolist(), [-0.2]))
-    part = SomeJoints(which)
-    own = part.of_fit(now)
+    own = now.on_joints(which)
     assert own.model.effects == (ELASTICITY,) and own.model.has.tolist() == [[True, False, False]]  # 5 is not there
     values = torch.tensor([[0.1], [0.2], [0.3]], dtype=torch.float64)
     at = own.model.to_physical(own.x)
@@ -131,15 +129,12 @@ def test_they_come_back_and_leave_the_others_as_they_were(legs):
     fitted = replace(own, model=model, x=model.to_normalised(at), score=torch.tensor([1.0, 2.0, 3.0]).double())
     after = errors_of(4.0, 5.0, 6.0)
     trial = make_trial(FRICTION, 2, 1e-4)
-    found = part.round_of_all(
-        Round(
-            trials=[[], [], [trial]],
-            chosen=[None, GAIN, FRICTION],
-            rivals=[[], [], [GAIN]],
-            models={FRICTION: fitted},
-        ),
-        now,
-    )
+    found = Round(
+        trials=[[], [], [trial]],
+        chosen=[None, GAIN, FRICTION],
+        rivals=[[], [], [GAIN]],
+        models={FRICTION: fitted},
+    ).among_all(which, now)
     assert found.chosen == [None] * 3 + [GAIN] + [None] * 4 + [FRICTION] + [None] * 3
     assert found.rivals[8] == [GAIN] and [vars(t) for t in found.trials[8]] == [vars(trial) | {"joint": 8}]
     back = found.models[FRICTION]
@@ -151,7 +146,7 @@ def test_they_come_back_and_leave_the_others_as_they_were(legs):
     assert whole[[1, 3], back.model.columns(FRICTION)].flatten().tolist() == pytest.approx([0.1, 0.2])
     assert whole[[0, 1], back.model.columns(ELASTICITY)].flatten().tolist() == pytest.approx([300.0, 1.0, 1.0] * 2)
     assert back.score[which].tolist() == [1.0, 2.0, 3.0]
-    square = part._errors_of_all(after, errors_of(*[1.0] * N)).square[1]
+    square = errors_of(*[1.0] * N).with_joints(which, after).square[1]
     assert square.tolist() == [25.0 if j == 3 else 16.0 if j == 1 else 36.0 if j == 8 else 1.0 for j in range(N)]
 
 

@@ -18,9 +18,8 @@ from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.by_kernels import fits_on
 from pace_optim.diagnosis.fitting.denormals import flushed_denormals
-from pace_optim.diagnosis.fitting.fits import Fits
+from pace_optim.diagnosis.fitting.fits import Fits, fits_on
 from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
 from pace_optim.diagnosis.fitting.validation import check_long_enough
 from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS

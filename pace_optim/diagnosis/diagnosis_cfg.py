@@ -45,8 +45,6 @@ class FittingCfg:
     """The reference is renewed, or windows are left out, again where that lowered the error to less than this part."""
     renewals: int = 4
     """At most so many times: what was fitted along the motion of a wrong model gives a better one, and so on."""
-    at_bound: float = 0.998
-    """Normalised values beyond this are at a bound."""
     thinned: float = 0.8
     """With less than this part of the models still on their way, only those are simulated. Changes time alone."""
     stiff_cost: float = 3.0

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
+import torch
+
 from pace_actuators.effects import EffectCfg
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.problem.evaluator import Evaluator
@@ -32,11 +34,13 @@ class TwinProblem(Problem):
         trained = self.dataset.trained()
         return self._evaluator(self.dataset.select(trained), self.path.select(trained))
 
-    def on_joints(self, joints: Sequence[int]) -> TwinProblem:
-        """The same of some of the joints, by index, without effects: the others cost nothing."""
-        names = [self.joint_names[j] for j in joints]
-        cfg = self.plain_cfg.on_joints(names)
-        part = replace(self, plain_cfg=cfg, dataset=self.dataset.on_joints(joints), path=self.path.on_joints(joints))
+    def on_joints(self, joints: torch.Tensor) -> TwinProblem:
+        """The same of some of the joints, (n,) bool, without effects: the others cost nothing."""
+        if bool(joints.all()):
+            return self
+        places = joints.nonzero()[:, 0].tolist()
+        cfg = self.plain_cfg.on_joints([self.joint_names[j] for j in places])
+        part = replace(self, plain_cfg=cfg, dataset=self.dataset.on_joints(places), path=self.path.on_joints(places))
         return part.with_effects(()).with_physics_dt(self.physics_dt)
 
     def with_effects(self, effects: Sequence[EffectCfg | str]) -> TwinProblem:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.candidates.screening import free_columns, simulated_probes
+from pace_optim.diagnosis.candidates.screening import simulated_probes
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -73,7 +73,7 @@ def _of_model(
     count = Counter(effect for effect, _ in probes)
     parts = torch.tensor([1 / math.sqrt(count[effect]) for effect, _ in probes], dtype=torch.float64)
     independent = max(2.0, float(where.sum()) * problem.control_dt / fits.cfg.candidates.independent_s)
-    jacobian, numbers = free_columns(seen, fits.cfg.fitting.at_bound), len(seen.tried.parameters)
+    jacobian, numbers = seen.free_jacobian, len(seen.tried.parameters)
     result = torch.full((seen.model.num_joints,), -torch.inf, dtype=torch.float64)
     for j in range(seen.model.num_joints):
         may = torch.tensor([bool(seen.model.allowed_joints(effect)[j]) for effect, _ in probes], dtype=torch.float64)

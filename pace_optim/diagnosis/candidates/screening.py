@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
+from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.side_by_side import Slot
 from pace_optim.diagnosis.model.fitted import Fitted
@@ -63,7 +63,7 @@ def _screened(
     cfg = fits.cfg
     steps = where.any(dim=1).nonzero()[:, 0][:: cfg.fitting.stride]
     fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg.candidates), -1)
-    scores, sizes = _explained(now.error, free_columns(now, cfg.fitting.at_bound), changes, fold, cfg.candidates.folds)
+    scores, sizes = _explained(now.error, now.free_jacobian, changes, fold, cfg.candidates.folds)
     result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
         allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
@@ -94,7 +94,7 @@ def absorbed_effects(
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
     probes, changes, _ = simulated_probes(fits, problem, now, suspects, effort, beside)
-    jacobian = free_columns(now, fits.cfg.fitting.at_bound)
+    jacobian = now.free_jacobian
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it absorbs nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
@@ -103,16 +103,10 @@ def absorbed_effects(
         for j in range(now.model.num_joints):
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()
             columns = columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12)
-            seen = own - _solve(_bordered(columns, own), len(columns)) @ columns
+            seen = own - _solve(_gram(torch.cat([columns, own[None]]))) @ columns
             if float(seen.norm()) > cfg.seen * float(own.norm()):
                 result[effect][j] = False
     return {effect: joints for effect, joints in result.items() if bool(joints.any())}
-
-
-def _bordered(columns: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Gram matrix of some columns and, last, a target."""
-    together = torch.cat([columns, target[None]])
-    return together @ together.T
 
 
 def simulated_probes(
@@ -171,17 +165,6 @@ def _folds(time: torch.Tensor, recordings: int, cfg: CandidatesCfg) -> torch.Ten
     return ((time / cfg.fold_s).long()[:, None] + torch.arange(recordings)) % cfg.folds
 
 
-def free_columns(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
-    """The Jacobian (P, K, R, n), without entries that sit at a bound: beyond that normalised value."""
-    if now.jacobian is None:
-        raise ValueError("This needs a model that was fitted with keep_jacobian.")
-    columns = now.jacobian.clone()
-    fixed = (now.x.abs() > at_bound) | ~now.model.free
-    for j, p in fixed.nonzero().tolist():
-        columns[p, ..., j] = 0.0
-    return columns
-
-
 def _explained(
     error: torch.Tensor, jacobian: torch.Tensor, changes: torch.Tensor, fold: torch.Tensor, folds: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -198,46 +181,36 @@ def _explained(
     scores = torch.zeros(len(changes), n, dtype=torch.float64)
     sizes = torch.zeros_like(scores)
     for j in range(n):
-        per_fold = []
-        columns = torch.cat([jacobian[..., j], error[None, ..., j]])
+        columns = torch.cat([jacobian[..., j], changes[..., j], error[None, ..., j]])
         scale = columns.flatten(1).norm(dim=1).clamp(min=1e-12)
         columns = columns / scale[:, None, None]
-        probes = changes[..., j]
-        amplitude = probes.flatten(1).norm(dim=1).clamp(min=1e-12)
-        probes = probes / amplitude[:, None, None]
-        for f in range(folds):
-            at = fold == f
-            a, s = columns[:, at], probes[:, at]
-            per_fold.append(((a @ a.T).double(), (s @ a.T).double(), s.square().sum(dim=1, dtype=torch.float64)))
-        base = _cross_validated([g for g, _, _ in per_fold], size)
-        for i in range(len(changes)):
-            if float(amplitude[i]) < 1e-9:
+        grams = torch.stack([_gram(columns[:, fold == f]) for f in range(folds)])
+        own = [*range(size), len(columns) - 1]
+        base = _cross_validated(grams[:, own][:, :, own])
+        for i in range(size, size + len(changes)):
+            if float(scale[i]) < 1e-9:
                 continue
-            grams = []
-            for g, s, square in per_fold:
-                whole = torch.empty(size + 2, size + 2, dtype=torch.float64)
-                order = [*range(size), size + 1]
-                whole[torch.tensor(order)[:, None], torch.tensor(order)] = g
-                whole[size, order] = whole[order, size] = s[i]
-                whole[size, size] = square[i]
-                grams.append(whole)
-            total = _cross_validated(grams, size + 1)
-            scores[i, j] = 1 - total / base
-            beta = _solve(torch.stack(grams).sum(dim=0), size + 1)
-            sizes[i, j] = -float(beta[size] * scale[size] / amplitude[i])
+            own = [*range(size), i, len(columns) - 1]
+            with_it = grams[:, own][:, :, own]
+            scores[i - size, j] = 1 - _cross_validated(with_it) / base
+            sizes[i - size, j] = -float(_solve(with_it.sum(dim=0))[size] * scale[-1] / scale[i])
     return scores, sizes
 
 
-def _cross_validated(grams: list[torch.Tensor], size: int) -> float:
-    """Squared error of regressing the last column on the first ``size``, each fold by the others."""
-    whole, total = torch.stack(grams).sum(dim=0), 0.0
+def _gram(columns: torch.Tensor) -> torch.Tensor:
+    return (columns @ columns.T).double()
+
+
+def _cross_validated(grams: torch.Tensor) -> float:
+    """Squared error of regressing the last column on the others, each fold by the others, of (folds, m, m)."""
+    whole, total = grams.sum(dim=0), 0.0
     for gram in grams:
-        beta = _solve(whole - gram, size)
-        a, b, c = gram[:size, :size], gram[:size, -1], gram[-1, -1]
-        total += float(c - 2 * beta @ b + beta @ a @ beta)
+        beta = torch.cat([_solve(whole - gram), torch.tensor([-1.0], dtype=gram.dtype)])
+        total += float(beta @ gram @ beta)
     return max(total, 1e-30)
 
 
-def _solve(gram: torch.Tensor, size: int) -> torch.Tensor:
-    a = gram[:size, :size] + _RIDGE * torch.eye(size, dtype=torch.float64)
-    return torch.linalg.solve(a, gram[:size, -1])
+def _solve(gram: torch.Tensor) -> torch.Tensor:
+    """Coefficients of the last column by the others, of their Gram matrix."""
+    a = gram[:-1, :-1] + _RIDGE * torch.eye(len(gram) - 1, dtype=gram.dtype)
+    return torch.linalg.solve(a, gram[:-1, -1])

@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 
 from pace_actuators.effects import Effect
+from pace_envs.devices import find_device
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
 from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors
 from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.one_kernel.host import host_kernels
+from pace_optim.one_kernel.nvrtc import kernels_of
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
@@ -115,6 +119,22 @@ class Fits:
         cfg = self.cfg.judging
         return [block_errors(error, where[: errors.shape[1]], problem.control_dt, cfg=cfg) for error in errors]
 
+    def on_joints(
+        self, problem: TwinProblem, starts: Sequence[Fitted], joints: torch.Tensor, errors: BlockErrors
+    ) -> tuple[list[Fitted], list[BlockErrors]]:
+        """Fit models of all joints on some of them, and their errors; the others stay as they are, and cost nothing.
+
+        Args:
+            problem: All joints.
+            starts: The models.
+            joints: Which are fitted, (n,) bool.
+            errors: What the other joints' errors are.
+        """
+        part = problem.on_joints(joints)
+        fitted = self.coarse_to_fine(part, [start.on_joints(joints) for start in starts])
+        after = [errors.with_joints(joints, own) for own in self.validation_errors(part, fitted)]
+        return [start.with_joints(joints, own) for start, own in zip(starts, fitted, strict=True)], after
+
     def trimmed(self, problem: TwinProblem, now: Fitted, joints: torch.Tensor) -> Fitted | None:
         """A model fitted where it is not far worse than elsewhere; ``None`` where it is about as good in all windows.
 
@@ -199,3 +219,17 @@ def _again(
         return list(models)
     fitted = iter(fit([each for each, yes in zip(models, which, strict=True) if yes]))
     return [next(fitted) if yes else each for each, yes in zip(models, which, strict=True)]
+
+
+def fits_on(device: str, cfg: DiagnosisCfg) -> Fits:
+    """What fits models on a device: ``"cpu"``, or a GPU as ``"cuda:0"``.
+
+    On a processor with a compiler of C++ the same kernels run there; without one, the drives themselves do.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    own = find_device(device)
+    if own.type == "cpu":
+        return Fits(cfg=cfg, batch=partial(SideBySide, compiler=host_kernels(), device=own))
+    return Fits(cfg=cfg, batch=partial(SideBySide, compiler=kernels_of(own), device=own), on_gpu=True)

@@ -11,8 +11,12 @@ import torch
 
 from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.one_kernel import KernelRollout, NotTraceableError
+from pace_optim.one_kernel.batch import Compiler
 from pace_optim.problem.rollout import Rollout
 from pace_optim.single_joint_model.problem import TwinProblem
+
+_PROCESSOR = torch.device("cpu")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,13 +33,23 @@ class SideBySide:
     An effect costs only in the environments of the slots that have it.
     """
 
-    def __init__(self, problem: TwinProblem, slots: Sequence[Slot], training: bool):
-        """Build the environment.
+    def __init__(
+        self,
+        problem: TwinProblem,
+        slots: Sequence[Slot],
+        training: bool,
+        *,
+        compiler: Compiler | None = None,
+        device: torch.device = _PROCESSOR,
+    ):
+        """Build the environment, and what runs it.
 
         Args:
             problem: The joints simulated alone; its own effects are not used.
             slots: The models.
             training: Whether only recordings that are trained on are simulated.
+            compiler: Compiles kernels that simulate; without one the drives themselves do, on the processor.
+            device: Where kernels run; errors stay there.
         """
         self.slots = list(slots)
         self._runs = _runs([slot.model.effects for slot in slots])
@@ -44,6 +58,17 @@ class SideBySide:
         self.dataset = evaluator.dataset
         self._num_candidates = sum(slot.rows for slot in slots)
         self.rollout: Rollout = evaluator.rollout(self._num_candidates)
+        self._device = device
+        self._kernels = None if compiler is None else self._kernel_rollout(compiler)
+
+    def _kernel_rollout(self, compiler: Compiler) -> KernelRollout:
+        """What simulates by kernels: slots with the same effects share one."""
+        count, parts, begin = self.dataset.num_recordings, [], 0
+        for _, own in itertools.groupby(self.slots, key=lambda slot: slot.model.effects):
+            end = begin + count * sum(slot.rows for slot in own)
+            parts.append(range(begin, end))
+            begin = end
+        return KernelRollout(self.rollout, parts, compiler, self._device)
 
     @torch.inference_mode()
     def simulate(self, physical: Sequence[torch.Tensor], where: torch.Tensor, stride: int = 1) -> torch.Tensor:
@@ -57,9 +82,12 @@ class SideBySide:
         Returns:
             (candidates, K, R, n) float32 [rad], zero where there is no sample; the slots one after another.
         """
-        bias = self._begin(physical, where)
         steps = where.any(dim=1).nonzero()[:, 0][::stride]
-        errors = self._errors(bias, steps)
+        try:
+            errors = self._errors(self._begin(physical, where), steps)
+        except NotTraceableError:  # what an effect of the user's does is nothing for a kernel
+            self._kernels = None
+            errors = self._errors(self._begin(physical, where), steps)
         errors *= where[steps][:, None, :, None].to(errors.device)
         return errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
 
@@ -77,12 +105,16 @@ class SideBySide:
 
     def _errors(self, bias: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
         """Simulated less measured positions at some control steps, (K, candidates, R, n) float32 [rad]."""
+        if self._kernels is not None:
+            sim = self._kernels.positions(steps).view(len(steps), *bias.shape)
+            measured = self.dataset.measured[steps].to(self._device)
+            return sim.sub_(bias.to(self._device)).sub_(measured[:, None]).float()
         index = {int(step): i for i, step in enumerate(steps)}
         errors = torch.zeros(len(steps), *bias.shape, dtype=torch.float32)
         for step, sim in self.rollout.samples():
             if step in index:
                 errors[index[step]] = (sim.view(bias.shape) - bias).sub_(self.dataset.measured[step])
-        return errors
+        return errors.to(self._device)
 
     def split(self, values: torch.Tensor) -> list[torch.Tensor]:
         """The parts of something with one row per candidate, slot by slot."""

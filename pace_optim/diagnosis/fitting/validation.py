@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -22,6 +22,16 @@ class BlockErrors:
     def mse(self) -> torch.Tensor:
         """Of each joint, (n,) [rad²]."""
         return (self.square * self.weight[:, None]).sum(dim=0) / self.weight.sum()
+
+    def on_joints(self, joints: torch.Tensor) -> BlockErrors:
+        """Those of some joints, (n,) bool."""
+        return replace(self, square=self.square[:, joints])
+
+    def with_joints(self, joints: torch.Tensor, own: BlockErrors) -> BlockErrors:
+        """The same with other errors of some joints, (n,) bool: of these alone, or of all."""
+        square = self.square.clone()
+        square[:, joints] = own.square[:, joints] if own.square.shape[1] == len(joints) else own.square
+        return replace(self, square=square)
 
 
 def block_errors(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import torch
+
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.diagnosis.fitting.validation import BlockErrors
@@ -80,6 +82,17 @@ class Round:
             others = [t for t in trials[j] if t.effect is not trial.effect]
             trials[j] = sorted([trial, *others], key=lambda t: t.mse_after)
         return replace(self, trials=trials)
+
+    def among_all(self, joints: torch.Tensor, now: Fitted) -> Round:
+        """A round of some joints, (n,) bool, as one of all, whose model is known: nothing was tried on the others."""
+        n, places = len(joints), joints.nonzero()[:, 0].tolist()
+        trials: list[Sequence[Trial]] = [()] * n
+        chosen: list[type[Effect] | None] = [None] * n
+        rivals: list[Sequence[type[Effect]]] = [()] * n
+        for j, own, choice, others in zip(places, self.trials, self.chosen, self.rivals, strict=True):
+            trials[j], chosen[j], rivals[j] = [replace(trial, joint=j) for trial in own], choice, others
+        models = {e: replace(now.with_joints(joints, own), tried=e) for e, own in self.models.items()}
+        return Round(trials=trials, chosen=chosen, rivals=rivals, models=models)
 
     def _with(self, joint: int, new: type[Effect] | None, rivals: Sequence[type[Effect]]) -> Round:
         chosen, every = list(self.chosen), list(self.rivals)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.candidates.screening import free_columns
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.model.fitted import Fitted
 
 _RIDGE = 1e-9
 
 
-def unevenness(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
+def unevenness(now: Fitted) -> torch.Tensor:
     """What each effect could explain of a joint's squared training error if its size differed between recordings.
 
     With e the error, J its derivatives by the other parameters, and S_r those by the effect's on recording r alone,
@@ -22,7 +20,6 @@ def unevenness(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch
 
     Args:
         now: A model, fitted, with its Jacobian.
-        at_bound: Normalised values beyond this are at a bound.
 
     Returns:
         (effects, n); zero where a joint does not have the effect, and where there are fewer than three recordings.
@@ -33,7 +30,7 @@ def unevenness(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch
     result = torch.zeros(now.model.has.shape, dtype=torch.float64)
     if not bool(now.model.has.any()):
         return result
-    columns = free_columns(now, at_bound)
+    columns = now.free_jacobian
     if now.error is None:
         raise ValueError("The sizes in each recording need a model that was fitted with keep_jacobian.")
     if now.error.shape[1] <= 2:

@@ -8,6 +8,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.uncertainty.uncertainty import AT_BOUND
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,21 +40,52 @@ class Fitted:
         """Physical values, (n, P)."""
         return self.model.to_physical(self.x)
 
-    def merged(self, other: Fitted, joints: torch.Tensor) -> Fitted:
-        """The same with another fit of the same effects on some joints, (n,) bool, and what is known of it there."""
+    @property
+    def free_jacobian(self) -> torch.Tensor:
+        """The Jacobian, zero where a parameter is held or at a bound.
 
-        def either(one: torch.Tensor | None, two: torch.Tensor | None) -> torch.Tensor | None:
-            return one if one is None or two is None else torch.where(joints, two, one)
+        Raises:
+            ValueError: If there is none.
+        """
+        if self.jacobian is None:
+            raise ValueError("This needs a model that was fitted with keep_jacobian.")
+        moves = self.model.free & (self.x.abs() <= 1 - AT_BOUND)
+        return self.jacobian * moves.T[:, None, None]
 
-        lower, upper = (
-            torch.where(joints[:, None], getattr(other.model, side), getattr(self.model, side))
-            for side in ("lower", "upper")
-        )
+    def on_joints(self, joints: torch.Tensor) -> Fitted:
+        """The fit of some joints, (n,) bool, with the effects that any of them has."""
+        if bool(joints.all()):
+            return self
+        model, entries = self.model.on_joints(joints)
         return replace(
             self,
-            model=replace(self.model, lower=lower, upper=upper),
-            x=torch.where(joints[:, None], other.x, self.x),
-            score=torch.where(joints, other.score, self.score),
-            jacobian=either(self.jacobian, other.jacobian),
-            error=either(self.error, other.error),
+            model=model,
+            x=self.x[joints][:, entries],
+            score=self.score[joints],
+            jacobian=None if self.jacobian is None else self.jacobian[entries][..., joints],
+            error=None if self.error is None else self.error[..., joints],
         )
+
+    def with_joints(self, joints: torch.Tensor, own: Fitted) -> Fitted:
+        """The same with some joints, (n,) bool, as another fit has them; derivatives stay where no effect comes along.
+
+        Args:
+            joints: Which joints.
+            own: Of these joints alone, or of all.
+        """
+        if bool(joints.all()):
+            return replace(own, tried=self.tried)
+        own = own.on_joints(joints) if own.model.num_joints == len(joints) else own
+        model, entries = self.model.with_joints(joints, own.model)
+        more = torch.zeros(len(self.x), model.size - self.model.size, dtype=self.x.dtype)
+        x, score = torch.cat([self.x, more], dim=1), self.score.clone()
+        x[joints.nonzero(), torch.tensor(entries)] = own.x
+        score[joints] = own.score
+        result = Fitted(model=model, x=x, score=score, tried=self.tried)
+        if self.jacobian is None or self.error is None or own.jacobian is None or own.error is None or more.numel():
+            return result
+        part = torch.zeros_like(self.jacobian[..., joints])
+        part[entries] = own.jacobian
+        jacobian, error = self.jacobian.clone(), self.error.clone()
+        jacobian[..., joints], error[..., joints] = part, own.error
+        return replace(result, jacobian=jacobian, error=error)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.uncertainty import AT_BOUND
 
 BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
 """The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
@@ -96,6 +96,22 @@ class JointModel:
             barred={effect: barred[joints] for effect, barred in self.barred.items()},
         )
         return model, entries
+
+    def with_joints(self, joints: torch.Tensor, own: JointModel) -> tuple[JointModel, list[int]]:
+        """The same with some joints, (n,) bool, as a model of those alone has them; and where its entries are."""
+        model = self
+        for effect in own.effects:
+            model = model.with_effect(effect, torch.zeros_like(joints))
+        has, lower, upper = model.has.clone(), model.lower.clone(), model.upper.clone()
+        has[:, joints] = False
+        entries = list(range(len(BASE)))
+        for row, effect in enumerate(own.effects):
+            has[model.effects.index(effect), joints] = own.has[row]
+            columns = model.columns(effect)
+            entries += range(columns.start, columns.stop)
+        at = joints.nonzero(), torch.tensor(entries)
+        lower[at], upper[at] = own.lower, own.upper
+        return replace(model, has=has, lower=lower, upper=upper), entries
 
     def with_effect(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
         """The same with an effect on some joints, (n,) bool, beside those that have it already."""
@@ -202,22 +218,21 @@ class JointModel:
                 excluded |= those
         return ~excluded
 
-    def at_bounds(self, x: torch.Tensor, beyond: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
+    def at_bounds(self, x: torch.Tensor) -> torch.Tensor:
         """Joints with an effect whose size has run into a bound, (effects, n) bool.
 
         A size is what vanishes at a null; the bound that is the null, or next to an infinite one, does not count.
 
         Args:
             x: Normalised, (n, P).
-            beyond: From where normalised values are at a bound.
         """
         result = torch.zeros_like(self.has)
         for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
             for parameter, value in zip(effect.parameters, x[:, self.columns(effect)].unbind(dim=1), strict=True):
                 if parameter.null is not None and parameter.null > parameter.lower:
-                    result[row] |= has & (value <= -beyond)
+                    result[row] |= has & (value < AT_BOUND - 1)
                 if parameter.null is not None and parameter.null < parameter.upper:
-                    result[row] |= has & (value >= beyond)
+                    result[row] |= has & (value > 1 - AT_BOUND)
         return result
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:

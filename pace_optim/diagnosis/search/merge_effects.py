@@ -12,7 +12,6 @@ from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
 from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.judging.decisions import decision
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
@@ -38,7 +37,7 @@ def merge_effects(search: Search, branch: Branch) -> Branch:
         starts.append(Fitted.start(model, physical, tried=effect))
         masks.append(here)
     which = torch.stack(masks).any(dim=0)
-    fitted, blocks = SomeJoints(which).refitted(search.fits, branch.problem, starts, errors)
+    fitted, blocks = search.fits.on_joints(branch.problem, starts, which, errors)
     after, models = dict(zip(options, blocks, strict=True)), dict(zip(options, fitted, strict=True))
 
     def pays(several_beside: type[Effect], joint: int) -> bool:
@@ -46,12 +45,12 @@ def merge_effects(search: Search, branch: Branch) -> Branch:
         return judge(after[several_beside], errors, joint, tried, first=False, cfg=cfg).significant
 
     enough = {effect: [j for j in joints if not pays(effect, j)] for effect, joints in options.items()}
-    model, physical, taken = now.model, now.physical, {}
+    merged, taken = now, {}
     for j in {j for joints in enough.values() for j in joints}:
         fitting = [effect for effect, joints in enough.items() if j in joints]
         best = min(fitting, key=lambda effect: (-len(enough[effect]), float(after[effect].mse[j])))
-        here = torch.arange(model.num_joints) == j
-        model, physical = exchanged(model, physical, here, own, models[best], best, len(BASE))
+        here = torch.arange(now.model.num_joints) == j
+        merged = merged.with_joints(here, models[best])
         rounds = [this.settled(j, best if at == 0 else None) for at, this in enumerate(rounds)]
         taken[j] = best.name
     search.log(
@@ -67,10 +66,9 @@ def merge_effects(search: Search, branch: Branch) -> Branch:
     )
     if not taken:
         return branch
-    start, iterations = Fitted.start(model, physical), search.cfg.fitting.again
-    one = search.fits.side_by_side(branch.problem.in_windows(), [start], iterations)[0]
-    merged = search.along_own_motion(replace(branch, rounds=tuple(rounds)), one)
-    return replace_effects(search, merged) if search.cfg.has("replace") else merged
+    one = search.fits.side_by_side(branch.problem.in_windows(), [merged], search.cfg.fitting.again)[0]
+    branch = search.along_own_motion(replace(branch, rounds=tuple(rounds)), one)
+    return replace_effects(search, branch) if search.cfg.has("replace") else branch
 
 
 def _options(now: Fitted, rounds: Sequence[Round], cfg: JudgingCfg) -> dict[type[Effect], list[int]]:

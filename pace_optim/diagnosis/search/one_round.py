@@ -11,7 +11,7 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.evidence import log_evidence
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, CandidatesCfg
+from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
@@ -54,8 +54,7 @@ def try_effects(
     say(f"refitting with {_names(list(begun))}")
     fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
     if cfg.has("widen_bounds"):
-        beyond = cfg.fitting.at_bound
-        fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), say, beyond)
+        fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), say)
     models = dict(zip(begun, fitted, strict=True))
     after = dict(zip(begun, fits.validation_errors(problem, fitted), strict=True))
     tried = len(effects) * now.model.num_joints
@@ -145,7 +144,6 @@ def beyond_bounds(
     fitted: Sequence[Fitted],
     refit: Callable[[list[Fitted]], list[Fitted]],
     say: Callable[[str], None],
-    at_bound: float = DEFAULT.fitting.at_bound,
 ) -> list[Fitted]:
     """The fits, those again that an effect's bound holds back, with bounds as wide as physics allows.
 
@@ -153,14 +151,13 @@ def beyond_bounds(
         fitted: The present model with each effect.
         refit: Fits models from where they start.
         say: Shows how far it is.
-        at_bound: Normalised values beyond this are at a bound.
     """
     result, stuck, starts = list(fitted), [], []
     for k, each in enumerate(fitted):
         effect = each.tried
         if effect is None or effect not in each.model.effects:
             continue
-        joints = each.model.at_bounds(each.x, at_bound)[each.model.effects.index(effect)]
+        joints = each.model.at_bounds(each.x)[each.model.effects.index(effect)]
         model = each.model.widened(effect, joints)
         if torch.equal(model.lower, each.model.lower) and torch.equal(model.upper, each.model.upper):
             continue
@@ -218,7 +215,7 @@ def _begun(
     result: dict[type[Effect] | None, Fitted] = {}
     for each in fits.side_by_side(coarse, starts, cfg.fitting.again, part=cfg.fitting.part):
         best = result.setdefault(each.tried, each)
-        result[each.tried] = best.merged(each, each.score < best.score)
+        result[each.tried] = best.with_joints(each.score < best.score, each)
     return result
 
 

@@ -11,7 +11,6 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.comparison import judge, within
 from pace_optim.diagnosis.judging.decisions import decision
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Branch, Search
 
@@ -90,8 +89,8 @@ class LeftOut:
             Fitted.start(now.model.without_effect(effect, joints), now.physical, tried=effect)
             for effect, joints in effects.items()
         ]
-        part = SomeJoints(torch.stack(list(effects.values())).any(dim=0))
-        fitted, after = part.refitted(search.fits, branch.problem, starts, branch.errors)
+        which = torch.stack(list(effects.values())).any(dim=0)
+        fitted, after = search.fits.on_joints(branch.problem, starts, which, branch.errors)
         return cls(
             tried=tried, fitted=dict(zip(effects, fitted, strict=True)), errors=dict(zip(effects, after, strict=True))
         )
@@ -105,12 +104,10 @@ def _without(search: Search, branch: Branch, left: LeftOut, dropped: Mapping[int
     """The branch without an effect on some joints, fitted along the same motion."""
     if not dropped:
         return branch
-    model, x = branch.now.model, branch.now.x.clone()
+    now = branch.now
     for j, effect in dropped.items():
-        model = model.without_effect(effect, torch.arange(model.num_joints) == j)
-        x[j] = left.fitted[effect].x[j]
-    start, iterations = Fitted.start(model, model.to_physical(x)), search.cfg.fitting.settle
-    now = search.fits.side_by_side(branch.problem, [start], iterations, keep_jacobian=True)[0]
+        now = now.with_joints(torch.arange(len(now.x)) == j, left.fitted[effect])
+    now = search.fits.side_by_side(branch.problem, [now], search.cfg.fitting.settle, keep_jacobian=True)[0]
     return replace(branch, now=now, errors=search.fits.validation_errors(branch.problem, [now])[0])
 
 

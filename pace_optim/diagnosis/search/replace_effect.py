@@ -13,7 +13,6 @@ from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
 from pace_optim.diagnosis.judging.comparison import within
 from pace_optim.diagnosis.judging.decisions import decision
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.state import Branch, Search
@@ -37,7 +36,7 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
     starts = [_start(now, rounds, effect, joints) for effect, joints in exchanges.items()]
     which = torch.zeros(now.model.num_joints, dtype=torch.bool)
     which[[j for joints in exchanges.values() for j in joints]] = True
-    fitted, blocks = SomeJoints(which).refitted(search.fits, branch.problem, starts, errors)
+    fitted, blocks = search.fits.on_joints(branch.problem, starts, which, errors)
     after, models = dict(zip(exchanges, blocks, strict=True)), dict(zip(exchanges, fitted, strict=True))
     chosen = _choose(now, errors, exchanges, {effect: block.mse for effect, block in after.items()}, cfg)
     search.log(
@@ -52,14 +51,13 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
     )
     if not chosen:
         return branch
-    model, physical = now.model, now.physical
+    other = now
     for j, effect in chosen.items():
-        (old, at), here = exchanges[effect][j], torch.arange(model.num_joints) == j
-        model, physical = exchanged(model, physical, here, [old], models[effect], effect, now.model.size)
+        _, at = exchanges[effect][j]
+        other = other.with_joints(torch.arange(len(now.x)) == j, models[effect])
         alike = within(float(errors.mse[j]), float(after[effect].mse[j]), cfg.alike)
         rounds[at] = rounds[at].exchanged(j, effect, tie=alike)
-    start, iterations = Fitted.start(model, physical), search.cfg.fitting.again
-    other = search.fits.side_by_side(branch.problem.in_windows(), [start], iterations)[0]
+    other = search.fits.side_by_side(branch.problem.in_windows(), [other], search.cfg.fitting.again)[0]
     return search.along_own_motion(replace(branch, rounds=tuple(rounds)), other)
 
 

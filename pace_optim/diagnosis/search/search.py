@@ -18,7 +18,7 @@ def add_effects(
     search: Search,
     problem: TwinProblem,
     base: Fitted,
-    size_consistency: Callable[[Fitted, float], torch.Tensor] = unevenness,
+    size_consistency: Callable[[Fitted], torch.Tensor] = unevenness,
 ) -> Outcome:
     """Look for the effects that are missing.
 
@@ -43,7 +43,7 @@ def add_effects(
         base_errors=errors,
         final=branch.now,
         final_errors=branch.errors,
-        unevenness=size_consistency(branch.now, cfg.fitting.at_bound),
+        unevenness=size_consistency(branch.now),
         rounds=[*branch.rounds, *([] if found is None else [found])],
         cfg=cfg,
     )

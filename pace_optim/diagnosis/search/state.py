@@ -13,7 +13,6 @@ from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.decisions import Decision, Log, decision, unlogged
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -92,17 +91,17 @@ class Search:
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
             return None
         self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
-        part = SomeJoints(open_joints)
+        places = open_joints.nonzero()[:, 0].tolist()
 
         def log(own: Decision) -> None:
             facts = own.facts | {"effect": depth + 1}
-            self.log(replace(own, joints=[part.indices[j] for j in own.joints], facts=facts))
+            self.log(replace(own, joints=[places[j] for j in own.joints], facts=facts))
 
         found = self.try_effects(
             self.fits,
-            part.of_problem(branch.problem),
-            part.of_fit(branch.now),
-            part.of_errors(branch.errors),
+            branch.problem.on_joints(open_joints),
+            branch.now.on_joints(open_joints),
+            branch.errors.on_joints(open_joints),
             untried,
             self.effort[open_joints],
             self.floor[open_joints],
@@ -110,7 +109,7 @@ class Search:
             log,
             rough=bool(self._rough(branch.now, branch.errors.mse, cfg.judging.far).any()),
         )
-        return None if found is None else part.round_of_all(found, branch.now)
+        return None if found is None else found.among_all(open_joints, branch.now)
 
     def along_own_motion(self, branch: Branch, now: Fitted) -> Branch:
         """A branch with another model, along the motion that the robot then has."""
@@ -136,7 +135,7 @@ class Search:
         better = others.mse < errors.mse
         taken = dict.fromkeys(better.nonzero()[:, 0].tolist(), "trimmed")
         self.log(decision("trim", rough.nonzero()[:, 0].tolist(), errors, {"trimmed": others}, taken))
-        return now.merged(other, better), replace(errors, square=torch.where(better, others.square, errors.square))
+        return now.with_joints(better, other), errors.with_joints(better, others)
 
     def _rough(self, now: Fitted, mse: torch.Tensor, times: float) -> torch.Tensor:
         """Joints above so many times the floor, where contacts or springs may keep narrow derivatives back, (n,)."""

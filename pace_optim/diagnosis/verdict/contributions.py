@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
 
@@ -20,8 +19,7 @@ def contributions(fits: Fits, outcome: Outcome) -> dict[type[Effect], float]:
     if len(found) < 2:
         return {effect: 1.0 for effect, _ in found}
     without = [Fitted.start(now.model.without_effect(effect, has), now.physical, tried=effect) for effect, has in found]
-    part = SomeJoints(now.model.has.any(dim=0))
-    _, after = part.refitted(fits, outcome.problem, without, outcome.final_errors)
+    _, after = fits.on_joints(outcome.problem, without, now.model.has.any(dim=0), outcome.final_errors)
     rise = {
         effect: float((errors.mse - outcome.final_errors.mse)[has].clamp(min=0.0).sum())
         for (effect, has), errors in zip(found, after, strict=True)

@@ -15,7 +15,6 @@ from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.judging.decisions import Log, decision, unlogged
-from pace_optim.diagnosis.judging.some_joints import SomeJoints
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.state import Outcome
@@ -79,7 +78,7 @@ def fit_curves(
     effects = [each for each in known if issubclass(each, FreeForm) and each.variable in ranges]
     without = Fitted.start(outcome.base.model, outcome.base.physical)
     starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
-    models, errors = SomeJoints(joints).refitted(fits, outcome.problem, starts, outcome.base_errors)
+    models, errors = fits.on_joints(outcome.problem, starts, joints, outcome.base_errors)
     above = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
     explained = torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0)
     best = explained.argmax(dim=0)
@@ -108,27 +107,12 @@ def fit_curves(
 
 def take_curves(outcome: Outcome, curves: Curves) -> Outcome:
     """The outcome with a joint's best curve in place of its effects, where that says more."""
-    model, errors = outcome.final.model, outcome.final_errors
-    for effect in model.effects:
-        model = model.without_effect(effect, curves.instead)
-    physical = model.to_physical(outcome.final.x)
-    square, score = errors.square.clone(), outcome.final.score.clone()
+    final, errors = outcome.final, outcome.final_errors
     for j in curves.instead.nonzero()[:, 0].tolist():
-        k = curves.best(j)
-        effect, own = curves.effects[k], curves.models[k]
-        values = own.physical
-        here = torch.arange(len(physical)) == j
-        model, physical = model.extended(physical, effect, here, values[:, own.model.columns(effect)])
-        model = model.held(effect, _shape(effect), physical)
-        physical[j, : len(BASE)] = values[j, : len(BASE)]
-        square[:, j], score[j] = curves.errors[k].square[:, j], own.score[j]
-    more = torch.zeros(len(model.effects) - len(outcome.unevenness), len(physical), dtype=outcome.unevenness.dtype)
-    return replace(
-        outcome,
-        unevenness=torch.cat([outcome.unevenness, more]),
-        final=Fitted(model=model, x=model.to_normalised(physical), score=score),
-        final_errors=replace(errors, square=square),
-    )
+        here, k = torch.arange(len(curves.instead)) == j, curves.best(j)
+        final, errors = final.with_joints(here, curves.models[k]), errors.with_joints(here, curves.errors[k])
+    more = torch.zeros(len(final.model.effects) - len(outcome.unevenness), len(final.x), dtype=torch.float64)
+    return replace(outcome, unevenness=torch.cat([outcome.unevenness, more]), final=final, final_errors=errors)
 
 
 def error_map(

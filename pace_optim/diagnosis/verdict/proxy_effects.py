@@ -71,7 +71,7 @@ def _said(outcome: Outcome, names: Sequence[str], which: torch.Tensor) -> str:
 
 def _at_bounds(outcome: Outcome) -> torch.Tensor:
     model = outcome.final.model
-    return model.at_bounds(outcome.final.x, outcome.cfg.fitting.at_bound) & ~curves_in(model)
+    return model.at_bounds(outcome.final.x) & ~curves_in(model)
 
 
 def _uneven(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:

@@ -7,8 +7,6 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectParameter
-from pace_optim.diagnosis.candidates.screening import free_columns
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
@@ -36,8 +34,7 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
         return []
     if now.jacobian is None or now.error is None:
         now = fits.looked_at(outcome.problem, [now])[0]
-    at_bound = outcome.cfg.fitting.at_bound
-    std, stuck = standard_deviations(now, at_bound), now.model.at_bounds(now.x, at_bound)
+    std, stuck = standard_deviations(now), now.model.at_bounds(now.x)
     result = []
     for effect, has, held_back in zip(now.model.effects, found, stuck, strict=True):
         columns = now.model.columns(effect)
@@ -66,14 +63,13 @@ def factor_of(effect: type[Effect], parameter: EffectParameter, value: float) ->
     return value if parameter.null == 1.0 else 1.0 + value
 
 
-def standard_deviations(now: Fitted, at_bound: float = DEFAULT.fitting.at_bound) -> torch.Tensor:
+def standard_deviations(now: Fitted) -> torch.Tensor:
     """Physical standard deviations of a fitted model's parameters, (n, P); zero where one is held or at a bound.
 
     Args:
         now: Fitted, with its Jacobian: of every second control step of what is trained on.
-        at_bound: Normalised values beyond this are at a bound.
     """
-    columns, error = free_columns(now, at_bound), now.error
+    columns, error = now.free_jacobian, now.error
     if error is None:
         raise ValueError("Error bars need a model that was fitted with keep_jacobian.")
     result = torch.zeros_like(now.x)

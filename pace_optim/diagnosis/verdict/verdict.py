@@ -59,16 +59,12 @@ def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
 
 def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:
     """The outcome with the base model on all joints but these, (n,) bool."""
-    model, base = outcome.final.model, outcome.base
-    others = ~joints & model.has.any(dim=0)
-    if not bool(others.any()):
-        return outcome
-    for effect in model.effects:
-        model = model.without_effect(effect, others)
-    x, errors = outcome.final.x.clone(), outcome.final_errors
-    x[others, : base.model.size] = base.x[others]
-    square = torch.where(others, outcome.base_errors.square, errors.square)
-    return replace(outcome, final=replace(outcome.final, model=model, x=x), final_errors=replace(errors, square=square))
+    others = ~joints & outcome.final.model.has.any(dim=0)
+    return replace(
+        outcome,
+        final=outcome.final.with_joints(others, outcome.base),
+        final_errors=outcome.final_errors.with_joints(others, outcome.base_errors),
+    )
 
 
 def likes(outcome: Outcome) -> dict[str, list[str]]:
