@@ -19,7 +19,7 @@ from pace_optim.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
 from pace_optim.run.settings import FitSettings
-from pace_optim.run.tensors import read_trajectory
+from pace_optim.run.tensors import read_bounds, read_trajectory
 from pace_optim.terminal.cli import run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -259,6 +259,22 @@ def test_scores_of_different_length_are_told_with_their_file(finished, tmp_path)
     (tmp_path / "history.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"history\.json: search_best, search_mean.* differ in length \(1, 0, 1, 1\)"):
         History.load(tmp_path / "history.json")
+
+
+def test_half_a_character_is_told_with_its_file(finished, tmp_path):
+    text = (finished / "result.json").read_text()
+    (tmp_path / "result.json").write_text(text.replace('"warnings": [', '"warnings": ["\\ud800", ', 1))
+    with pytest.raises(ValueError, match=r"result\.json is no JSON \(.*surrogates not allowed"):
+        IdentifiedDrives.load(tmp_path)
+
+
+@pytest.mark.parametrize("bounds", [(1e160, 1e160), (1.0, 0.0)])
+def test_bounds_that_are_none_are_told_with_their_file(bounds, finished, tmp_path):
+    content = torch.load(finished / "config.pt")
+    content["bounds_params"][0] = torch.tensor(bounds, dtype=torch.float64)
+    torch.save(content, tmp_path / "config.pt")
+    with pytest.raises(ValueError, match=r"config\.pt: bounds_params has a lower bound above"):
+        read_bounds(tmp_path)
 
 
 @pytest.mark.parametrize("damage", ["flags that are none", "a loop of links"])

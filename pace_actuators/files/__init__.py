@@ -1,7 +1,7 @@
 """Reading files so that what is wrong with them is said by file and key, and writing them whole or not at all."""
 
 from pace_actuators.files.keeping import refuse_place, refuse_taken
-from pace_actuators.files.reading import file_at, read_json, read_tensors
+from pace_actuators.files.reading import file_at, parsed_json, read_json, read_tensors
 from pace_actuators.files.schema import checked, refuse
 from pace_actuators.files.writing import (
     json_text,
@@ -18,6 +18,7 @@ __all__ = [
     "checked",
     "file_at",
     "json_text",
+    "parsed_json",
     "read_json",
     "read_tensors",
     "refuse",

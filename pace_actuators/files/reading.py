@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
+"""An escape that may be one: two of them together make a character."""
 
 
 def file_at(path: str | Path, cure: str) -> Path:
@@ -44,10 +48,23 @@ def read_json(path: str | Path, cure: str) -> Any:
     """
     path = file_at(path, cure)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parsed_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError, OSError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise ValueError(f"{path} is no JSON ({reason}). {cure}") from None
+
+
+def parsed_json(text: str) -> Any:
+    """What a text of JSON says.
+
+    Raises:
+        ValueError: If it is no JSON, or holds half a character (a lone surrogate), which no file can be written with.
+        RecursionError: If it is nested too deeply.
+    """
+    content = json.loads(text)
+    if _HALF_CHARACTER.search(text):
+        json.dumps(content, ensure_ascii=False).encode()
+    return content
 
 
 def read_tensors(path: str | Path, cure: str) -> Any:

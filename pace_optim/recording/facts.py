@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
+
+from pace_actuators.files import parsed_json
 
 from .data import Drive, Load
 from .keys import BENCH_FACTS, DRIVE_FACTS, did_you_mean, listed
@@ -104,8 +105,8 @@ def _added_mass(value: Any, source: str) -> dict[str, float]:
     if value is None:
         return {}
     if isinstance(value, str):  # in an .npz
-        with suppress(json.JSONDecodeError):  # the message below shows what is no JSON
-            value = json.loads(value)
+        with suppress(ValueError):  # the message below shows what is no JSON
+            value = parsed_json(value)
     if not isinstance(value, Mapping) or not all(isinstance(body, str) for body in value):
         raise ValueError(
             f"{source}: added_mass is {value!r}; expected {{body: kg}} (in an .npz as JSON text). "

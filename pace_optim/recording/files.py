@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_actuators.files import read_tensors, write_atomically, writing
+from pace_actuators.files import parsed_json, read_tensors, write_atomically, writing
 from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
@@ -156,7 +156,7 @@ def add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
     if not facts_path.is_file():
         return fields
     try:
-        facts = json.loads(facts_path.read_text(encoding="utf-8-sig"))
+        facts = parsed_json(facts_path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{facts_path}: is not JSON ({error}). Correct it, or move it away from {path.name}."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.files import parsed_json
 from pace_optim.recording.keys import listed
 from pace_optim.recording.stamps import seconds_of, unix_unit
 
@@ -138,8 +138,8 @@ def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[
 
 def _info(root: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = parsed_json((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise ValueError(
             f"{root / 'meta' / 'info.json'}: cannot be read ({error}). Is this a LeRobot dataset?"
         ) from None

@@ -11,6 +11,8 @@ import torch
 from pace_actuators.files import read_tensors, refuse
 
 _ANEW = "Fit again, or go on with the run."
+_LARGEST = 1e15
+"""Beyond it differences of bounds are not numbers any more."""
 _SERIES = ("des_dof_pos", "dof_pos", "sim_dof_pos")
 
 
@@ -69,6 +71,8 @@ def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
         refuse(path, "parameters is no list of labels", _ANEW)
     if not _is_series(bounds, 2) or tuple(bounds.shape) != (len(labels), 2):
         refuse(path, f"bounds_params is no tensor of finite numbers of shape {(len(labels), 2)}", _ANEW)
+    if bool((bounds[:, 0] > bounds[:, 1]).any()) or bool((bounds.abs() > _LARGEST).any()):
+        refuse(path, "bounds_params has a lower bound above the upper one, or a bound beyond every unit", _ANEW)
     return {label: (low, high) for label, (low, high) in zip(labels, bounds.tolist(), strict=True)}
 
 

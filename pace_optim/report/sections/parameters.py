@@ -114,6 +114,8 @@ def _svg(content: str) -> str:
 
 def nice_ticks(low: float, high: float, most: int = 4) -> list[float]:
     """Round numbers between two others, at most ``most`` and a few."""
+    if not high > low:
+        return [low]
     raw = (high - low) / most
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= raw)
