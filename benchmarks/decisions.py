@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, read_decisions
-from pace_optim.diagnosis.search.replay import replayed
+from pace_optim.diagnosis.judging.rules import decided
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
     args = parser.parse_args()
     numbers = dict(each.split("=") for each in args.number)
     cfg = replace(DEFAULT, judging=replace(DEFAULT.judging, **{name: float(value) for name, value in numbers.items()}))
-    print(table({path.stem: read_decisions(path) for path in args.files}, cfg))
+    print(table({path.stem: read_decisions(path.read_text(encoding="utf-8")) for path in args.files}, cfg))
 
 
 def table(cases: Mapping[str, Sequence[Decision]], cfg: DiagnosisCfg = DEFAULT) -> str:
@@ -46,7 +46,7 @@ def table(cases: Mapping[str, Sequence[Decision]], cfg: DiagnosisCfg = DEFAULT) 
             if any(decision.taken):
                 acted[decision.rule] += 1
                 where[decision.rule].append(name)
-            if replayed(decision, cfg) != decision.taken:
+            if decided(decision, cfg) != decision.taken:
                 otherwise[decision.rule] += 1
     rows = [
         "| rule | asked | acted | cases it acted in | decided otherwise by the numbers given |",

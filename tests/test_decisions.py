@@ -17,9 +17,9 @@ from decisions import table
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
+from pace_optim.diagnosis.judging.rules import decided
 from pace_optim.diagnosis.search.moves import LAST, MOVES
 from pace_optim.diagnosis.search.pruning import drop_last
-from pace_optim.diagnosis.search.replay import replayed
 from pace_optim.diagnosis.search.state import Branch
 
 ROOT = Path(__file__).parents[1]
@@ -35,10 +35,10 @@ TELLING = {"_EFFECTS"}
 
 @pytest.mark.parametrize("path", LOGS, ids=lambda path: path.stem)
 def test_decisions_of_whole_diagnoses_come_out_as_they_did(path):
-    decisions = read_decisions(path)
+    decisions = read_decisions(path.read_text(encoding="utf-8"))
     assert decisions
     for decision in decisions:
-        assert replayed(decision) == decision.taken, decision.rule
+        assert decided(decision) == decision.taken, decision.rule
 
 
 def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
@@ -47,10 +47,10 @@ def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
         searched(*joints, log=log.append)
     path = tmp_path / "decisions.jsonl"
     path.write_bytes(as_lines(log))
-    read = read_decisions(path)
+    read = read_decisions(path.read_text(encoding="utf-8"))
     assert {decision.rule for decision in read} == {"look_ahead", "add_pair", "add_to_group"}
     for decision in read:
-        assert [bool(name) for name in replayed(decision)] == [bool(name) for name in decision.taken]
+        assert [bool(name) for name in decided(decision)] == [bool(name) for name in decision.taken]
 
 
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
@@ -70,9 +70,9 @@ def test_another_comparison_decides_otherwise():
     search = make_search(lambda of: left[of.tried], log=log.append)
     drop_last(search, Branch(problem=SimpleNamespace(on_joints=lambda _: None), now=now, errors=left[None]))
     first = log[0]
-    assert first.taken == ["stribeck_friction"] == replayed(first)  # 1.2 times is less than a further effect must bring
+    assert first.taken == ["stribeck_friction"] == decided(first)  # 1.2 times is less than a further effect must bring
     lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1.1, clear=1.1))
-    assert replayed(first, lenient) == [None]
+    assert decided(first, lenient) == [None]
 
 
 def test_every_rule_can_be_switched_off_and_no_other():
@@ -119,7 +119,7 @@ def test_whoever_is_given_numbers_passes_them_on():
             if isinstance(node, ast.FunctionDef):
                 arguments = [*node.args.args, *node.args.kwonlyargs]
                 names = [a.arg for a in arguments if a.arg == "cfg"]
-                if names and path.name != "replay.py":
+                if names:
                     given[node.name] = [a.arg for a in arguments].index(names[0])
             elif isinstance(node, ast.Call):
                 calls.append((path.name, getattr(node.func, "attr", getattr(node.func, "id", "")), node))

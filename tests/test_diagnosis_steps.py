@@ -16,8 +16,9 @@ from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.diagnosis.search.alternatives import exchanged
 from pace_optim.diagnosis.search.merge_effects import _options, merge_effects
-from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
+from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Outcome
 from pace_optim.diagnosis.telling import next_experiment
@@ -224,13 +225,12 @@ def test_where_an_encoder_sits_is_held_in_exchanges(bench):
     sides = []
     for side in (0.0, 1.0):
         elasticity = with_effects(base, bench.truth_values, (ELASTICITY, [True], [300.0, 1.0, side]))
-        physical = elasticity.model.to_physical(elasticity.x)
-        model, physical = exchanged(base, bench.truth_values, here, [], elasticity, ELASTICITY, len(BASE))
-        column = model.columns(ELASTICITY).stop - 1
-        assert not bool(model.free[0, column]) and float(physical[0, column]) == side
-        sides.append((model, elasticity))
-    model, physical = exchanged(sides[0][0], physical, here, [ELASTICITY], sides[1][1], ELASTICITY, len(BASE))
-    assert float(model.to_physical(model.to_normalised(physical))[0, column]) == 1.0  # and not where it was held before
+        now = exchanged(Fitted.start(base, bench.truth_values), here, [], elasticity, ELASTICITY)
+        column = now.model.columns(ELASTICITY).stop - 1
+        assert not bool(now.model.free[0, column]) and float(now.physical[0, column]) == side
+        sides.append((now, elasticity))
+    now = exchanged(sides[0][0], here, [ELASTICITY], sides[1][1], ELASTICITY)
+    assert float(now.physical[0, column]) == 1.0  # and not where it was held before
 
 
 def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench):

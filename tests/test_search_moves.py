@@ -10,9 +10,10 @@ from diagnoses import FakeFits, errors_of, make_search, make_trial
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.decisions import unlogged
+from pace_optim.diagnosis.judging.rules import beats
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.diagnosis.search.look_ahead import End, ends
+from pace_optim.diagnosis.search.look_ahead import ends
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Search
 
@@ -172,7 +173,7 @@ def test_another_way_is_taken_that_leaves_less_with_as_many_numbers():
 
 
 def test_a_way_ends_with_the_best_of_what_pays():
-    model = SimpleNamespace(effects=(MOUNT,), has=torch.tensor([[True, True]]), num_joints=2)
+    model = SimpleNamespace(names_of_joints=[[MOUNT.name]] * 2)
     branch = Branch(problem=None, now=SimpleNamespace(model=model), errors=errors_of(8e-3, 8e-3))
     trials = [
         make_trial(GAIN, 0, 1e-3, False),
@@ -180,8 +181,8 @@ def test_a_way_ends_with_the_best_of_what_pays():
         make_trial(ELASTICITY, 0, 5e-3, True),
     ]
     led = ends(branch, Round(trials=[trials, []], chosen=[SPRING, None], rivals=[[], []]))
-    assert [end.effects for end in led] == [{MOUNT, SPRING}, {MOUNT}]
-    assert [end.mse for end in led] == pytest.approx([9e-6, 64e-6])
+    assert [end["effects"] for end in led] == [[MOUNT.name, SPRING.name], [MOUNT.name]]
+    assert [end["mse"] for end in led] == pytest.approx([9e-6, 64e-6])
 
 
 @pytest.mark.parametrize(
@@ -197,8 +198,8 @@ def test_a_way_ends_with_the_best_of_what_pays():
     ],
 )
 def test_one_way_beats_another_by_its_error_or_its_fewer_numbers(one, other, rmse, wins):
-    own, others = (End(effects=frozenset(e), mse=r**2) for e, r in ((one, 1e-3 * rmse), (other, 1e-3)))
-    assert own.beats(others) is wins
+    own, others = ({"effects": [e.name for e in es], "mse": r**2} for es, r in ((one, 1e-3 * rmse), (other, 1e-3)))
+    assert beats(own, others) is wins
 
 
 # none of them pays alone

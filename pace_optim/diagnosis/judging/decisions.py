@@ -1,11 +1,11 @@
-"""What was decided on the way to a diagnosis, in numbers that the decision can be made from again."""
+"""What is decided on the way to a diagnosis, in numbers that the decision can be made from again."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -14,25 +14,61 @@ from pace_optim.diagnosis.fitting.validation import BlockErrors
 
 FILE = "decisions.jsonl"
 
+Taken = list[str | None]
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Decision:
-    """One decision about some joints; errors are of validation."""
+    """One decision about some joints; errors are of validation, and of these joints alone."""
 
     rule: str
-    """Which move or rule decided: ``add``, or one of ``diagnosis_cfg.RULES``."""
+    """Which move or rule decides: ``add``, or one of ``diagnosis_cfg.RULES``."""
     joints: list[int]
     """About which joints, by index."""
-    weight: list[float]
-    """Samples of each block."""
-    before: list[list[float]]
-    """Mean square error of each block [rad²], joint by joint, with the present model."""
-    after: dict[str, list[list[float] | None]]
-    """The same with each that was tried; ``None`` for joints it was not tried on."""
-    taken: list[str | None]
-    """What each joint took."""
+    before: BlockErrors
+    """With the present model."""
+    after: Mapping[str, BlockErrors]
+    """With each that was tried; not a number on joints that it was not tried on."""
     facts: dict[str, Any] = field(default_factory=dict)
     """What else the rule needs."""
+    taken: Taken = field(default_factory=list)
+    """What each joint took."""
+
+    @classmethod
+    def of(
+        cls,
+        rule: str,
+        joints: Sequence[int],
+        before: BlockErrors,
+        after: Mapping[str, BlockErrors],
+        on: Mapping[str, Sequence[int]] | None = None,
+        **facts: Any,
+    ) -> Decision:
+        """A decision to be made.
+
+        Args:
+            rule: Which rule decides.
+            joints: About which joints, by index.
+            before: The present model's errors, of all joints.
+            after: Errors of all joints with each that was tried, or without.
+            on: On which joints each was tried; all of them if not given.
+            facts: What else the rule needs.
+        """
+        here = torch.tensor(joints, dtype=torch.long)
+        tried = {name: own.on_joints(here) for name, own in after.items()}
+        for name, own in tried.items():
+            away = [place for place, j in enumerate(joints) if on is not None and j not in on[name]]
+            own.square[:, away] = math.nan
+        return cls(rule=rule, joints=list(joints), before=before.on_joints(here), after=tried, facts=facts)
+
+    def places(self, name: str) -> list[int]:
+        """Which of the joints something was tried on."""
+        return (~self.after[name].square[0].isnan()).nonzero()[:, 0].tolist()
+
+    @property
+    def taken_by(self) -> dict[int, str]:
+        """What joints took, by index, where they took something."""
+        return {j: name for j, name in zip(self.joints, self.taken, strict=True) if name is not None}
 
 
 Log = Callable[[Decision], None]
@@ -42,49 +78,40 @@ def unlogged(_: Decision) -> None:
     """Keeps nothing."""
 
 
-def decision(
-    rule: str,
-    joints: Sequence[int],
-    before: BlockErrors,
-    after: Mapping[str, BlockErrors],
-    taken: Mapping[int, str],
-    on: Mapping[str, Sequence[int]] | None = None,
-    **facts: Any,
-) -> Decision:
-    """A decision in numbers.
-
-    Args:
-        rule: Which rule decided.
-        joints: About which joints, by index.
-        before: The present model's errors, of all joints.
-        after: Errors with each that was tried, or without.
-        taken: What joints took.
-        on: On which joints each was tried; all of them if not given.
-        facts: What else the rule needs.
-    """
-    return Decision(
-        rule=rule,
-        joints=list(joints),
-        weight=before.weight.tolist(),
-        before=[_digits(before.square[:, j]) for j in joints],
-        after={
-            name: [_digits(own.square[:, j]) if on is None or j in on[name] else None for j in joints]
-            for name, own in after.items()
-        },
-        taken=[taken.get(j) for j in joints],
-        facts=facts,
-    )
-
-
-def _digits(values: torch.Tensor) -> list[float]:
-    return [float(f"{value:.8g}") for value in values.tolist()]
-
-
 def as_lines(decisions: Iterable[Decision]) -> bytes:
     """Decisions as a file, a line of JSON each."""
-    return "".join(json.dumps(asdict(each)) + "\n" for each in decisions).encode()
+    return "".join(json.dumps(_content(each)) + "\n" for each in decisions).encode()
 
 
-def read_decisions(path: Path) -> list[Decision]:
-    """The decisions of a file."""
-    return [Decision(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+def read_decisions(text: str) -> list[Decision]:
+    """The decisions of a file's text."""
+    return [_decision(**json.loads(line)) for line in text.splitlines()]
+
+
+def _content(each: Decision) -> dict[str, Any]:
+    after = {
+        name: [own if place in each.places(name) else None for place, own in enumerate(_digits(errors))]
+        for name, errors in each.after.items()
+    }
+    return {
+        "rule": each.rule,
+        "joints": each.joints,
+        "weight": each.before.weight.tolist(),
+        "before": _digits(each.before),
+        "after": after,
+        "taken": each.taken,
+        "facts": each.facts,
+    }
+
+
+def _digits(errors: BlockErrors) -> list[list[float]]:
+    """Mean square error of each block [rad²], joint by joint."""
+    return [[float(f"{value:.8g}") for value in own] for own in errors.square.T.tolist()]
+
+
+def _decision(weight: list[float], before: list, after: dict[str, list], **others: Any) -> Decision:
+    def errors(square: list) -> BlockErrors:
+        rows = [[math.nan] * len(weight) if own is None else own for own in square]
+        return BlockErrors(square=torch.tensor(rows).double().T, weight=torch.tensor(weight).double())
+
+    return Decision(before=errors(before), after={name: errors(own) for name, own in after.items()}, **others)

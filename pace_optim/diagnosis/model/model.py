@@ -69,6 +69,13 @@ class JointModel:
             result[:, self.columns(effect)] &= has[:, None]
         return result
 
+    @property
+    def names_of_joints(self) -> list[list[str]]:
+        """The effects of each joint, by name."""
+        return [
+            [effect.name for effect, has in zip(self.effects, own, strict=True) if has] for own in self.has.T.tolist()
+        ]
+
     def columns(self, effect: type[Effect]) -> slice:
         """Where an effect's entries are."""
         start = len(BASE)

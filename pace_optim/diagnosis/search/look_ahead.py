@@ -2,52 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from pace_actuators.effects import Effect
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
+from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
-from pace_optim.diagnosis.judging.comparison import within
-from pace_optim.diagnosis.judging.decisions import decision
+from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.grow import combined, grown
 from pace_optim.diagnosis.search.state import Branch, Search
 
 
-@dataclass(frozen=True, kw_only=True)
-class End:
-    """Where a way leads a joint."""
-
-    effects: frozenset[type[Effect]]
-    mse: float
-    """On validation [rad²]."""
-
-    def beats(self, other: End, *, cfg: JudgingCfg = DEFAULT.judging) -> bool:
-        """Whether to go this way in place of another: for less error, or for as little with fewer parameters."""
-        own, others = (sum(len(e.parameters) for e in end.effects) for end in (self, other))
-        if self.effects == other.effects or own > others:
-            return not within(other.mse, self.mse, cfg.alike)
-        return within(self.mse, other.mse, cfg.as_good) if own < others else self.mse < other.mse
-
-    def told(self) -> dict[str, Any]:
-        """In names and numbers."""
-        return {"effects": sorted(effect.name for effect in self.effects), "mse": self.mse}
-
-
-def ends(branch: Branch, found: Round | None) -> list[End]:
-    """Where the best of what could come next leads each joint."""
-    model, mse, result = branch.now.model, branch.errors.mse, []
-    for j in range(model.num_joints):
-        own = {effect for effect, has in zip(model.effects, model.has, strict=True) if has[j]}
-        trials = [] if found is None else [t for t in found.trials[j] if t.significant and t.mse_after < mse[j]]
+def ends(branch: Branch, found: Round | None) -> list[dict[str, Any]]:
+    """Where the best of what could come next leads each joint: its ``effects`` by name, its ``mse`` [rad²]."""
+    result = []
+    for j, (own, mse) in enumerate(zip(branch.now.model.names_of_joints, branch.errors.mse.tolist(), strict=True)):
+        trials = [] if found is None else [t for t in found.trials[j] if t.significant and t.mse_after < mse]
         best = min(trials, key=lambda trial: trial.mse_after, default=None)
-        result.append(
-            End(effects=frozenset(own), mse=float(mse[j]))
-            if best is None
-            else End(effects=frozenset({*own, best.effect}), mse=best.mse_after)
-        )
+        more, least = ([], mse) if best is None else ([best.effect.name], best.mse_after)
+        result.append({"effects": sorted({*own, *more}), "mse": least})
     return result
 
 
@@ -68,7 +41,7 @@ def further_with_next_best(
         ahead: What could come next on it.
     """
     firsts, enough = ends(first, ahead), (search.cfg.judging.far * search.floor) ** 2
-    unexplained = (first.errors.mse > enough) & (torch.tensor([end.mse for end in firsts]) > enough)
+    unexplained = (first.errors.mse > enough) & (torch.tensor([end["mse"] for end in firsts]) > enough)
     other = _next_choice(found, unexplained, search.cfg.judging)
     if other is None:
         return None
@@ -78,17 +51,21 @@ def further_with_next_best(
     way = Branch(problem=branch.problem, now=now, errors=errors, rounds=(other,))
     beyond = search.tried(way)
     others = ends(way, beyond)
-    better = [
-        yes and two.beats(one, cfg=search.cfg.judging)
-        for one, two, yes in zip(firsts, others, unexplained.tolist(), strict=True)
-    ]
     joints = unexplained.nonzero()[:, 0].tolist()
-    taken = {j: str(effect and effect.name) for j, effect in enumerate(other.chosen) if better[j]}
-    one, two = ([each[j].told() for j in joints] for each in (firsts, others))
-    search.log(decision("look_ahead", joints, first.errors, {}, taken, first=one, next=two))
-    if not any(better):
+    taken = decide(
+        "look_ahead",
+        joints,
+        first.errors,
+        {},
+        cfg=search.cfg,
+        log=search.log,
+        names=[str(effect and effect.name) for effect in (other.chosen[j] for j in joints)],
+        first=[firsts[j] for j in joints],
+        next=[others[j] for j in joints],
+    )
+    if not taken:
         return None
-    chosen = [two if yes else one for one, two, yes in zip(found.chosen, other.chosen, better, strict=True)]
+    chosen = [other.chosen[j] if j in taken else effect for j, effect in enumerate(found.chosen)]
     end = grown(search, branch, found.choosing(chosen))
     return end, beyond if _is_same(end, way) else search.tried(end)
 

@@ -9,11 +9,12 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.judging.decisions import decision
+from pace_optim.diagnosis.judging.rules import decide
+from pace_optim.diagnosis.search.alternatives import Alternatives
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.merge_effects import merge_effects
-from pace_optim.diagnosis.search.pruning import LeftOut, drop_last
+from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.state import Branch, Search
 
 Step = tuple[Branch, Round | None]
@@ -92,13 +93,13 @@ def _judged_again(
     model = end.now.model
     here = torch.zeros(model.num_joints, dtype=torch.bool)
     here[list(joints)] = True
-    without = LeftOut.of(search, end, {effect: here & model.has[model.effects.index(effect)]}).errors
+    without = Alternatives.without(search, end, {effect: here & model.has[model.effects.index(effect)]}).errors
     before = without.get(effect, end.errors)  # nothing is gained where it is not there any more
     tried, cfg = search.tried_over_joints, search.cfg.judging
     old = {j: next(t for t in found.trials[j] if t.effect is effect) for j in joints}
     trials = {j: trial.judged(before, end.errors, tried, first=False, cfg=cfg) for j, trial in old.items()}
-    taken = {j: effect.name for j, trial in trials.items() if trial.significant}
-    search.log(decision(rule, joints, before, {effect.name: end.errors}, taken, candidates=tried))
+    after = {effect.name: end.errors}
+    decide(rule, joints, before, after, cfg=search.cfg, log=search.log, candidates=tried)
     return trials
 
 

@@ -16,7 +16,7 @@ from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.choice import choose, contenders
-from pace_optim.diagnosis.judging.decisions import Log, decision
+from pace_optim.diagnosis.judging.decisions import Decision, Log
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -69,21 +69,18 @@ def try_effects(
     weighed = contenders(trials, floor, cfg=cfg.judging) if cfg.has("evidence") else [[] for _ in trials]
     evidence = _evidence(fits, problem, models, weighed, effects, effort, say)
     choice = choose(trials, evidence, cfg=cfg.judging)
-    log(
-        decision(
-            "add",
-            range(len(trials)),
-            errors,
-            {effect.name: own for effect, own in after.items()},
-            {j: effect.name for j, effect in enumerate(choice.chosen) if effect is not None},
-            {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
-            candidates=tried,
-            first=first,
-            floor=floor.tolist(),
-            evidence=[{effect.name: value for effect, value in own.items()} for own in evidence],
-            rivals=[[effect.name for effect in own] for own in choice.rivals],
-        )
+    made = Decision.of(
+        "add",
+        range(len(trials)),
+        errors,
+        {effect.name: own for effect, own in after.items()},
+        {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
+        candidates=tried,
+        first=first,
+        floor=floor.tolist(),
+        evidence=[{effect.name: value for effect, value in own.items()} for own in evidence],
     )
+    log(replace(made, taken=[None if effect is None else effect.name for effect in choice.chosen]))
     return Round(trials=choice.trials, chosen=choice.chosen, rivals=choice.rivals, models=models)
 
 

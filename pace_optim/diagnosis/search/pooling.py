@@ -8,8 +8,8 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.judging.comparison import within
-from pace_optim.diagnosis.judging.decisions import Log, decision, unlogged
+from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
 
@@ -28,12 +28,8 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
         held = _held(outcome.final, effect, has)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.fitting.settle, keep_jacobian=True)[0]
         errors = fits.validation_errors(outcome.problem, [fitted])[0]
-        with_one, with_own = (float(each.mse[has].sum()) for each in (errors, outcome.final_errors))
-        taken = within(with_one, with_own, fits.cfg.judging.as_good)
         joints = has.nonzero()[:, 0].tolist()
-        names = dict.fromkeys(joints if taken else [], effect.name)
-        log(decision("pool", joints, outcome.final_errors, {effect.name: errors}, names))
-        if taken:
+        if decide("pool", joints, outcome.final_errors, {effect.name: errors}, cfg=fits.cfg, log=log):
             outcome = replace(_pooled(outcome, fitted, effect), final_errors=errors)
     return outcome
 

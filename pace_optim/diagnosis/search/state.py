@@ -12,7 +12,8 @@ from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.decisions import Decision, Log, decision, unlogged
+from pace_optim.diagnosis.judging.decisions import Decision, Log, unlogged
+from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -132,9 +133,9 @@ class Search:
             return now, errors
         other = fits.to_whole(problem, [trimmed])[0]
         others = fits.validation_errors(problem, [other])[0]
-        better = others.mse < errors.mse
-        taken = dict.fromkeys(better.nonzero()[:, 0].tolist(), "trimmed")
-        self.log(decision("trim", rough.nonzero()[:, 0].tolist(), errors, {"trimmed": others}, taken))
+        joints = rough.nonzero()[:, 0].tolist()
+        taken = decide("trim", joints, errors, {"trimmed": others}, cfg=self.cfg, log=self.log)
+        better = torch.tensor([j in taken for j in range(len(rough))])
         return now.with_joints(better, other), errors.with_joints(better, others)
 
     def _rough(self, now: Fitted, mse: torch.Tensor, times: float) -> torch.Tensor:

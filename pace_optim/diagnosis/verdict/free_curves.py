@@ -13,8 +13,8 @@ from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
-from pace_optim.diagnosis.judging.comparison import judge
-from pace_optim.diagnosis.judging.decisions import Log, decision, unlogged
+from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.state import Outcome
@@ -87,13 +87,9 @@ def fit_curves(
     for j in joints.nonzero()[:, 0].tolist():
         k, has_effects = int(best[j]), bool(model.has[:, j].any())
         now = outcome.final_errors if has_effects else errors[0]
-        pays = judge(now, errors[1 + k], j, tried, first=not has_effects, cfg=cfg.judging).significant
-        says_more = not has_effects or float(above[1 + k, j]) < cfg.verdict.most * float(left[j])
-        instead[j] = pays and says_more and float(explained[k, j]) >= cfg.verdict.most
-        taken = {j: effects[k].name} if instead[j] else {}
-        facts = {"candidates": tried, "first": not has_effects, "floor": [float(floor[j])], "left": [float(left[j])]}
-        facts["base"] = [float(errors[0].mse[j])]
-        log(decision("curves", [j], now, {effects[k].name: errors[1 + k]}, taken, None, **facts))
+        facts: dict[str, Any] = {"candidates": tried, "first": not has_effects, "base": float(errors[0].mse[j])}
+        facts |= {"floor": float(floor[j]), "left": float(left[j])}
+        instead[j] = bool(decide("curves", [j], now, {effects[k].name: errors[1 + k]}, cfg=cfg, log=log, **facts))
     return Curves(
         joints=joints,
         effects=effects,
