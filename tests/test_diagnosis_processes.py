@@ -45,9 +45,9 @@ def test_one_effect_needs_no_second_process():
 
 
 def test_every_process_gets_about_as_much():
-    assert processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE], 2, 3.0) == [[2], [0, 1, 3]]
-    assert processes._shares([GAIN, GAIN, GAIN, None, STRIBECK, RIPPLE], 2, 3.0) == [[0, 1, 2], [3, 4, 5]]
-    assert processes._shares([GAIN, RIPPLE], 8, 3.0) == [[0], [1]]
+    assert processes._shares([GAIN, STRIBECK, ELASTICITY, RIPPLE], 2) == [[0, 2], [1, 3]]
+    assert processes._shares([GAIN, GAIN, GAIN, None, STRIBECK, RIPPLE], 2) == [[0, 1, 2], [3, 4, 5]]
+    assert processes._shares([GAIN, RIPPLE], 8) == [[0], [1]]
 
 
 def test_worker_processes_and_other_systems_do_it_alone(monkeypatch):

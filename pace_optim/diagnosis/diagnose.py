@@ -109,9 +109,7 @@ def diagnose(
         tried=[effect.name for effect in candidates],
         physics_dt=physics_dt,
         ladder=ladder(found),
-        error_map=error_map(
-            found.curves, problem.joint_names, found.outcome.base_errors, settings.cfg.verdict.worth_a_word
-        ),
+        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=settings.cfg.verdict),
         cfg=json.loads(json_text(asdict(settings.cfg))),
         wall_time_s=time.monotonic() - begin,
     )

@@ -20,12 +20,10 @@ class FittingCfg:
     whole: int = 2
     """then on whole recordings."""
     rounds: int = 3
-    """At most so many times the coarse iterations while a model still falls; the base model's reference and a
-    trimmed fit are made again as often at most."""
+    """At most so many times the coarse iterations while a model still falls; the base model's reference, that of what
+    was found, and a trimmed fit are made again as often at most."""
     again: int = 6
     """Iterations where refits begin, and of a model that was changed or moves along a new reference."""
-    settle: int = 5
-    """Iterations of a model that goes on at its own physics step, or with values held or effects left out."""
     behind: float = 2.0
     """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
     damping: float = 1e-3
@@ -43,12 +41,8 @@ class FittingCfg:
     """A model still falls whose squared error has fallen by more than this part over the last ``rounds`` iterations."""
     gain: float = 0.9
     """The reference is renewed, or windows are left out, again where that lowered the error to less than this part."""
-    renewals: int = 4
-    """At most so many times: what was fitted along the motion of a wrong model gives a better one, and so on."""
     thinned: float = 0.8
     """With less than this part of the models still on their way, only those are simulated. Changes time alone."""
-    stiff_cost: float = 3.0
-    """What a stiff effect costs, as a multiple of another one, where processes share them. Changes time alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +114,7 @@ class JudgingCfg:
     """Models up to this ratio apart are alike: the first effect must bring more, effects within it are told together,
     and an error within it of the floor is at the floor."""
     next_effect: float = 1.25
-    """What each further effect must bring."""
+    """What each further effect must bring: nearer to the floor than this none could."""
     clear: float = 1.5
     """A fall that is this large needs no more than t > ``clear_t``."""
     clear_t: float = 2.0
@@ -130,8 +124,6 @@ class JudgingCfg:
     that the newest makes superfluous, joints share one value, and a way with fewer parameters is taken."""
     weighed: float = 1.15
     """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
-    near: float = 1.3
-    """Nearer to the floor than this a further effect could not bring as much as it must."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
     to this ratio apart, a window is an outlier above this many times the median, and predictions part clearly above
@@ -150,7 +142,8 @@ class VerdictCfg:
     on something more where this part of what is left would go with a size for each recording."""
     nearly_all: float = 0.9
     """Of effects that explain more than this part, sizes do not matter. A joint is held at the robot's delay where a
-    delay of its own takes away more than this part."""
+    delay of its own takes away more than this part. A curve that leaves more than this part is not told of, nor
+    drawn."""
     uneven: float = 0.15
     """Above this unevenness an effect is a proxy. Measured: up to 0.08 for the evenest effect among many others as
     large together, 0.18 to 0.36 for proxies."""
@@ -158,8 +151,6 @@ class VerdictCfg:
     """Joints with effects that are what is missing must hold this part of the robot's error above the floor."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
-    worth_a_word: float = 0.1
-    """With less than this part explained a curve is not told of, nor drawn."""
     duration: float = 10.0
     """Of the recordings on the menu of next experiments [s]."""
     factor: float = 1.5

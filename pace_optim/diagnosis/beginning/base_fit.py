@@ -67,7 +67,7 @@ def _fit_along(
         if float((fitted.x - before.x).abs().max()) < fits.cfg.beginning.moved:
             break
     twins = twin_problem(problem, path(problem, model_effects))
-    return twins, fits.to_whole(twins, fits.side_by_side(twins.in_windows(), [fitted], cfg.settle))[0]
+    return twins, fits.to_whole(twins, fits.side_by_side(twins.in_windows(), [fitted], cfg.again))[0]
 
 
 def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:

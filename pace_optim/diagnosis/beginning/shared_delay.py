@@ -57,7 +57,7 @@ def _held(fits: Fits, twins: TwinProblem, base: Fitted, joints: torch.Tensor, de
     lower, upper = base.model.lower.clone(), base.model.upper.clone()
     lower[joints, _DELAY] = upper[joints, _DELAY] = delay
     start = Fitted.start(replace(base.model, lower=lower, upper=upper), base.physical)
-    return fits.side_by_side(twins, [start], fits.cfg.fitting.settle, keep_jacobian=True)[0]
+    return fits.side_by_side(twins, [start], fits.cfg.fitting.again, keep_jacobian=True)[0]
 
 
 def _sentence(twins: TwinProblem, delay: torch.Tensor, late: torch.Tensor) -> str:

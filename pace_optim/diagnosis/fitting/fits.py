@@ -107,7 +107,7 @@ class Fits:
         """``work(items)``: by :func:`parallel_map` on a processor, all at once on a GPU."""
         if self.on_gpu:
             return work(list(items))
-        return parallel_map(work, items, effects, self.cfg.fitting.stiff_cost)
+        return parallel_map(work, items, effects)
 
     def validation_errors(self, problem: TwinProblem, models: Sequence[Fitted]) -> list[BlockErrors]:
         """Errors of fitted models on the recordings that were not trained on."""

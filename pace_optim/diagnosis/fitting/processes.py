@@ -36,7 +36,6 @@ def parallel_map(
     work: Callable[[list[Item]], list[Result]],
     items: Sequence[Item],
     effects: Sequence[type[Effect] | None] | None = None,
-    stiff_cost: float = 1.0,
 ) -> list[Result]:
     """``work(items)``, with the items shared out among as many processes as there are processors.
 
@@ -47,13 +46,12 @@ def parallel_map(
         work: Gives one result per item, in order.
         items: What there is to do.
         effects: The effect of each item; items of one effect stay together. ``None``: each item is on its own.
-        stiff_cost: What an item of a stiff effect costs, as a multiple of another one's.
 
     Raises:
         RuntimeError: If a process ended without a result.
     """
     count = _processes()
-    shares = _dealt(len(items), count) if effects is None else _shares(effects, count, stiff_cost)
+    shares = _shares(range(len(items)) if effects is None else effects, count)
     if len(shares) < 2:
         return work(list(items))
     results: list[Result | None] = [None] * len(items)
@@ -78,26 +76,14 @@ def _processes() -> int:
     return available_processors() if forks else 1
 
 
-def _dealt(items: int, count: int) -> list[list[int]]:
-    """Indices for each process, as many for each."""
-    return [list(range(items))[k::count] for k in range(min(count, items))]
-
-
-def _shares(effects: Sequence[type[Effect] | None], count: int, stiff_cost: float) -> list[list[int]]:
-    """Indices for each process, about as much work for each; the dearest effects are dealt out first."""
-    groups: dict[type[Effect] | None, list[int]] = {}
-    for i, effect in enumerate(effects):
-        groups.setdefault(effect, []).append(i)
-    cost = {
-        effect: len(own) * (stiff_cost if effect is not None and effect.is_stiff else 1.0)
-        for effect, own in groups.items()
-    }
-    shares: list[list[int]] = [[] for _ in range(min(count, len(groups)))]
-    load = [0.0] * len(shares)
-    for effect in sorted(groups, key=lambda effect: -cost[effect]):
-        k = load.index(min(load))
-        shares[k] += groups[effect]
-        load[k] += cost[effect]
+def _shares(groups: Sequence[object], count: int) -> list[list[int]]:
+    """Indices for each process, about as many for each; those of one group together, the largest dealt out first."""
+    members: dict[object, list[int]] = {}
+    for i, group in enumerate(groups):
+        members.setdefault(group, []).append(i)
+    shares: list[list[int]] = [[] for _ in range(min(count, len(members)))]
+    for own in sorted(members.values(), key=len, reverse=True):
+        min(shares, key=len).extend(own)
     return shares
 
 

@@ -43,7 +43,7 @@ class ReferenceUpdate:
         """
         self.say("motion of the robot with what was found")
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
-        for _ in range(cfg.fitting.renewals):
+        for _ in range(cfg.fitting.rounds):
             if alone and self.away(twins, now) < cfg.beginning.near:  # gravity is linear there
                 break
             before = now.score

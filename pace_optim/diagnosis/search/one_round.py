@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -13,51 +14,36 @@ from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.choice import choose, contenders
-from pace_optim.diagnosis.judging.decisions import Decision, Log
+from pace_optim.diagnosis.judging.decisions import Decision
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
+if TYPE_CHECKING:
+    from pace_optim.diagnosis.search.state import Branch, Search
 
-def try_effects(
-    fits: Fits,
-    problem: TwinProblem,
-    now: Fitted,
-    errors: BlockErrors,
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
-    floor: torch.Tensor,
-    say: Callable[[str], None],
-    log: Log,
-    rough: bool = False,
-) -> Round | None:
+
+def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | None:
     """Screen effects, refit the promising ones on top of a model, and judge them; ``None`` if none is promising.
 
     Args:
-        fits: Fits models.
-        problem: The joints simulated alone.
-        now: The present model.
-        errors: Its errors.
-        effects: Candidates.
-        effort: Typical torque of each joint, (n,) [N m].
-        floor: RMSE of each joint that no model can go below, (n,) [rad].
-        say: Shows how far it is.
-        log: Gets the decision.
+        search: What is looked for, on the joints of the branch.
+        branch: The present model, and its errors.
         rough: Whether refits go on over wide steps.
     """
-    begun, probes = _begin(fits, problem, now, errors, effects, effort, floor, say)
+    begun, probes = _begin(search, branch)
     if not begun:
         return None
+    fits, problem, now, errors = search.fits, branch.problem, branch.now, branch.errors
     cfg, first = fits.cfg, not now.model.effects
-    say(f"refitting with {_names(list(begun))}")
+    search.say(f"refitting with {_names(list(begun))}")
     fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
     if cfg.has("widen_bounds"):
-        fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), say)
+        fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), search.say)
     models = dict(zip(begun, fitted, strict=True))
     after = dict(zip(begun, fits.validation_errors(problem, fitted), strict=True))
-    tried = len(effects) * now.model.num_joints
+    tried = search.tried_over_joints
     trials: list[list[Trial]] = [[] for _ in range(now.model.num_joints)]
     for effect, fitted_with in models.items():
         for j in now.model.allowed_joints(effect).nonzero()[:, 0].tolist():
@@ -66,8 +52,8 @@ def try_effects(
             score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
             trial = Trial(effect=effect, joint=j, screen_score=score, values=values)
             trials[j].append(trial.judged(errors, after[effect], tried, first, cfg=cfg.judging))
-    weighed = contenders(trials, floor, cfg=cfg.judging) if cfg.has("evidence") else [[] for _ in trials]
-    evidence = _evidence(fits, problem, models, weighed, effects, effort, say)
+    weighed = contenders(trials, search.floor, cfg=cfg.judging) if cfg.has("evidence") else [[] for _ in trials]
+    evidence = _evidence(search, problem, models, weighed)
     choice = choose(trials, evidence, cfg=cfg.judging)
     made = Decision.of(
         "add",
@@ -77,35 +63,27 @@ def try_effects(
         {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
         candidates=tried,
         first=first,
-        floor=floor.tolist(),
+        floor=search.floor.tolist(),
         evidence=[{effect.name: value for effect, value in own.items()} for own in evidence],
     )
-    log(replace(made, taken=[None if effect is None else effect.name for effect in choice.chosen]))
+    search.log(replace(made, taken=[None if effect is None else effect.name for effect in choice.chosen]))
     return Round(trials=choice.trials, chosen=choice.chosen, rivals=choice.rivals, models=models)
 
 
-def _begin(
-    fits: Fits,
-    problem: TwinProblem,
-    now: Fitted,
-    errors: BlockErrors,
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
-    floor: torch.Tensor,
-    say: Callable[[str], None],
-) -> tuple[dict[type[Effect], Fitted], list[Probe]]:
-    """Where refits with the promising effects start, and how all were screened; arguments as for `try_effects`."""
+def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], list[Probe]]:
+    """Where refits with the promising effects start, and how all were screened."""
+    fits, problem, now, errors, effects = search.fits, branch.problem, branch.now, branch.errors, search.effects
     cfg = fits.cfg.candidates
     seen = fits.looked_at(problem.in_windows(), [replace(now, tried=None)])[0]
-    probes = screen(fits, problem.coarse(), seen, effects, effort)
-    excess = (errors.mse - (fits.cfg.judging.alike * floor) ** 2).clamp(min=0.0)
+    probes = screen(fits, problem.coarse(), seen, effects, search.effort)
+    excess = (errors.mse - search.at_floor**2).clamp(min=0.0)
     listed = with_likes(_short_list(_promising(probes, excess, cfg.explains), excess, cfg), effects)
-    far = bool((errors.mse.sqrt() > cfg.beyond_screening * floor).any())
+    far = bool((errors.mse.sqrt() > cfg.beyond_screening * search.floor).any())
     wide = not now.model.effects or far
     begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
     if not begin:
         return {}, probes
-    say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
+    search.say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
     begun = _begun(fits, problem, now, probes, begin, far and fits.cfg.has("multistart"))
     if wide:
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
@@ -114,20 +92,17 @@ def _begin(
 
 
 def _evidence(
-    fits: Fits,
+    search: Search,
     problem: TwinProblem,
     models: Mapping[type[Effect], Fitted],
     weighed: Sequence[Sequence[type[Effect]]],
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
-    say: Callable[[str], None],
 ) -> list[dict[type[Effect], float]]:
     """Of each joint, the log evidence of effects between which its error does not decide."""
     every = list(dict.fromkeys(effect for own in weighed for effect in own))
     if not every:
         return [{} for _ in weighed]
-    say(f"weighing {_names(every)}")
-    known = log_evidence(fits, problem, {effect: models[effect] for effect in every}, effects, effort)
+    search.say(f"weighing {_names(every)}")
+    known = log_evidence(search.fits, problem, {e: models[e] for e in every}, search.effects, search.effort)
     return [{effect: float(known[effect][j]) for effect in own} for j, own in enumerate(weighed)]
 
 

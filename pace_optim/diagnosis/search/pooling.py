@@ -26,7 +26,7 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
         if effect.shared or int(has.sum()) < 2:
             continue
         held = _held(outcome.final, effect, has)
-        fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.fitting.settle, keep_jacobian=True)[0]
+        fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.fitting.again, keep_jacobian=True)[0]
         errors = fits.validation_errors(outcome.problem, [fitted])[0]
         joints = has.nonzero()[:, 0].tolist()
         if decide("pool", joints, outcome.final_errors, {effect.name: errors}, cfg=fits.cfg, log=log):

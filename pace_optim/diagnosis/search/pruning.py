@@ -53,6 +53,6 @@ def _dropped(search: Search, left: Alternatives, dropped: Mapping[int, type[Effe
     branch = left.branch
     if not dropped:
         return branch
-    start, iterations = left.with_taken(dropped), search.cfg.fitting.settle
+    start, iterations = left.with_taken(dropped), search.cfg.fitting.again
     now = search.fits.side_by_side(branch.problem, [start], iterations, keep_jacobian=True)[0]
     return replace(branch, now=now, errors=search.fits.validation_errors(branch.problem, [now])[0])

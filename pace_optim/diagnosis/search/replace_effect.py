@@ -27,7 +27,7 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
     of them want.
     """
     cfg, now, errors, rounds = search.cfg.judging, branch.now, branch.errors, list(branch.rounds)
-    exchanges = _exchanges(now, rounds, errors.mse.sqrt() > cfg.near * search.at_floor, cfg)
+    exchanges = _exchanges(now, rounds, errors.mse.sqrt() > cfg.next_effect * search.at_floor, cfg)
     if not exchanges:
         return branch
     search.say("trying others in place of what was found")

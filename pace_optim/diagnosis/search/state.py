@@ -29,6 +29,11 @@ class Branch:
     errors: BlockErrors
     rounds: tuple[Round, ...] = ()
 
+    def on_joints(self, joints: torch.Tensor) -> Branch:
+        """The model of some joints, (n,) bool, without what led to it."""
+        problem, now = self.problem.on_joints(joints), self.now.on_joints(joints)
+        return Branch(problem=problem, now=now, errors=self.errors.on_joints(joints))
+
     def squared_fall_with(self, effect: type[Effect]) -> float:
         """By how much an effect lowered the squared error of the joints that chose it [rad²]."""
         trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
@@ -87,7 +92,7 @@ class Search:
         open_joints = missed <= (far & cfg.has("second_try"))
         # beside a joint that is far from the floor, another's last tenths may come from how that one moves
         alone = depth == 0 and not bool(far.any())
-        open_joints &= branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.near) * self.at_floor
+        open_joints &= branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.next_effect) * self.at_floor
         untried = [e for e in self.effects if bool((branch.now.model.allowed_joints(e) & open_joints).any())]
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
             return None
@@ -98,18 +103,10 @@ class Search:
             facts = own.facts | {"effect": depth + 1}
             self.log(replace(own, joints=[places[j] for j in own.joints], facts=facts))
 
-        found = self.try_effects(
-            self.fits,
-            branch.problem.on_joints(open_joints),
-            branch.now.on_joints(open_joints),
-            branch.errors.on_joints(open_joints),
-            untried,
-            self.effort[open_joints],
-            self.floor[open_joints],
-            self.say,
-            log,
-            rough=bool(self._rough(branch.now, branch.errors.mse, cfg.judging.far).any()),
-        )
+        rough = bool(self._rough(branch.now, branch.errors.mse, cfg.judging.far).any())
+        effort, floor = self.effort[open_joints], self.floor[open_joints]
+        part = replace(self, effects=untried, effort=effort, floor=floor, log=log)
+        found = self.try_effects(part, branch.on_joints(open_joints), rough)
         return None if found is None else found.among_all(open_joints, branch.now)
 
     def along_own_motion(self, branch: Branch, now: Fitted) -> Branch:
@@ -120,7 +117,7 @@ class Search:
 
     def settled(self, problem: TwinProblem, now: Fitted) -> tuple[Fitted, BlockErrors]:
         """A model fitted to whole recordings, as well as it can be before another effect is sought; its errors."""
-        fits, near = self.fits, self.cfg.judging.near
+        fits, near = self.fits, self.cfg.judging.next_effect
         if bool(self._rough(now, now.score, near).any()) and self.cfg.has("wide_steps"):
             now = fits.over_wide_steps(problem, now)
         if now.jacobian is None:  # it was fitted in windows

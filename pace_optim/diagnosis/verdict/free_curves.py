@@ -10,7 +10,7 @@ import torch
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
@@ -115,7 +115,8 @@ def error_map(
     curves: Curves | None,
     joint_names: Sequence[str],
     base_errors: BlockErrors,
-    least: float = DEFAULT.verdict.worth_a_word,
+    *,
+    cfg: VerdictCfg = DEFAULT.verdict,
 ) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
@@ -123,7 +124,7 @@ def error_map(
         curves: What was fitted.
         joint_names: The joints.
         base_errors: Of the base model, as everything else in the diagnosis tells them.
-        least: With less than this part explained a curve is not told of.
+        cfg: What part explained is worth a word.
     """
     if curves is None:
         return {}
@@ -139,8 +140,8 @@ def error_map(
             "kind": "friction" if effect.resists else "missing torque",
             "validation_rmse_before": before,
             "validation_rmse_after": after,
-            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after) if part >= least else _NONE,
-            "curve": _curve(curves.models[k], effect, j) if part >= least else None,
+            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after) if part >= 1 - cfg.nearly_all else _NONE,
+            "curve": _curve(curves.models[k], effect, j) if part >= 1 - cfg.nearly_all else None,
         }
     return joints
 
