@@ -9,19 +9,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters, effect_parameters
+from pace_optim.problem.box import Box
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
 
 class ParameterSpace:
-    """Lays parameters out in one vector, in order, one entry per key.
-
-    The optimizer's coordinate x runs from -1 to 1 between the bounds:
-
-        physical = lower + (x + 1)/2 (upper - lower)              linear scale
-        physical = exp(log lower + (x + 1)/2 (log upper - log lower))   logarithmic scale
-    """
+    """Lays parameters out in one vector, in order, one entry per key; the optimizer's coordinates are a `Box`'s."""
 
     def __init__(self, parameters: Sequence[Parameter]):
         """Lay out the vector.
@@ -43,9 +38,8 @@ class ParameterSpace:
         self.lower = torch.tensor([v for p in parameters for v in p.lower], dtype=torch.float64)
         self.upper = torch.tensor([v for p in parameters for v in p.upper], dtype=torch.float64)
         self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
-        self._log = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
-        self._low = torch.where(self._log, self.lower.clamp(min=1e-300).log(), self.lower)
-        self._high = torch.where(self._log, self.upper.clamp(min=1e-300).log(), self.upper)
+        log = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
+        self._box = Box(self.lower, self.upper, log)
 
     @classmethod
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
@@ -98,20 +92,15 @@ class ParameterSpace:
 
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:
         """Physical values of normalised vectors (…, size)."""
-        value = self._low + (x + 1) / 2 * (self._high - self._low)
-        value = torch.where(self._log, value.exp(), value)
-        return value.clamp(self.lower, self.upper)
+        return self._box.to_physical(x)
 
     def to_normalised(self, physical: torch.Tensor) -> torch.Tensor:
         """Normalised vectors of physical values (…, size); entries whose bounds are equal become 0."""
-        value = torch.where(self._log, physical.clamp(min=1e-300).log(), physical)
-        width = self._high - self._low
-        return torch.where(width > 0, (value - self._low) / width.clamp(min=1e-300) * 2 - 1, 0.0)
+        return self._box.to_normalised(physical)
 
     def slope(self, x: torch.Tensor) -> torch.Tensor:
         """D physical / d x at normalised vectors (…, size)."""
-        half_width = (self._high - self._low) / 2
-        return torch.where(self._log, self.to_physical(x) * half_width, half_width)
+        return self._box.slope(x)
 
     def to_dict(self, physical: torch.Tensor) -> dict[str, dict[str, float]]:
         """One vector (size,) as {parameter: {key: value}}."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.effects import Effect
+from pace_optim.problem.box import Box
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import AT_BOUND
 
@@ -242,23 +243,18 @@ class JointModel:
                     result[row] |= has & (value > 1 - AT_BOUND)
         return result
 
+    @property
+    def box(self) -> Box:
+        """Bounds and scales."""
+        return Box(self.lower, self.upper, self.log)
+
     def to_physical(self, x: torch.Tensor) -> torch.Tensor:
         """Physical values of normalised ones (…, n, P)."""
-        low, high = self._ends()
-        value = low + (x + 1) / 2 * (high - low)
-        return torch.where(self.log, value.exp(), value).clamp(self.lower, self.upper)
+        return self.box.to_physical(x)
 
     def to_normalised(self, physical: torch.Tensor) -> torch.Tensor:
         """Normalised values of physical ones (…, n, P); 0 where the bounds are equal."""
-        low, high = self._ends()
-        value = torch.where(self.log, physical.clamp(min=1e-300).log(), physical)
-        width = high - low
-        return torch.where(width > 0, (value - low) / width.clamp(min=1e-300) * 2 - 1, 0.0).clamp(-1.0, 1.0)
-
-    def _ends(self) -> tuple[torch.Tensor, torch.Tensor]:
-        low = torch.where(self.log, self.lower.clamp(min=1e-300).log(), self.lower)
-        high = torch.where(self.log, self.upper.clamp(min=1e-300).log(), self.upper)
-        return low, high
+        return self.box.to_normalised(physical).clamp(-1.0, 1.0)
 
 
 def start_values(effect: type[Effect], values: dict[str, float]) -> torch.Tensor:

@@ -73,7 +73,7 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
     if error is None:
         raise ValueError("Error bars need a model that was fitted with keep_jacobian.")
     result = torch.zeros_like(now.x)
-    slope = _slope(now)
+    slope = now.model.box.slope(now.x)
     for j in range(now.model.num_joints):
         own = columns[..., j].double()
         free = own.flatten(1).norm(dim=1).nonzero()[:, 0]
@@ -81,10 +81,3 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
             covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), _RIDGE)
             result[j, free] = torch.as_tensor(covariance.diagonal().copy()).clamp(min=0.0).sqrt() * slope[j, free]
     return result
-
-
-def _slope(now: Fitted) -> torch.Tensor:
-    """Physical units by normalised ones, (n, P)."""
-    model = now.model
-    half = torch.where(model.log, (model.upper / model.lower.clamp(min=1e-300)).clamp(min=1.0).log(), 0.0) / 2
-    return torch.where(model.log, half * now.physical, (model.upper - model.lower) / 2)
