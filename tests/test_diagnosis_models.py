@@ -9,13 +9,11 @@ from diagnoses import FakeFits, errors_of, joint_alone, make_search
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.screening import Probe
 from pace_optim.diagnosis.fitting.validation import BlockErrors
-from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
+from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 from pace_optim.diagnosis.search.one_round import _ranked
 from pace_optim.diagnosis.search.pooling import pool
-from pace_optim.diagnosis.search.pruning import drop_last, drop_superfluous
+from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.state import Branch, Outcome
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -82,23 +80,6 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
             assert bool(outcome.final.model.free.all())
         else:
             assert values == pytest.approx(found)
-
-
-def test_an_older_effect_goes_where_the_newer_one_does_without_it(bench):
-    base = JointModel.base(bench.problem)
-    values, yes = bench.truth_values, torch.tensor([True])
-    for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1])):
-        base, values = base.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
-    weights = torch.ones(1).double()
-    before = BlockErrors(square=torch.tensor([[1e-8]]).double(), weight=weights)
-    newest = Round(trials=[[]], chosen=[QUADRATIC], rivals=[[]])
-    branch = Branch(problem=bench.twins, now=Fitted.start(base, values), errors=before, rounds=(newest,))
-    for cost, kept in ((1.05, [False, True]), (1.3, [True, True])):
-        after = BlockErrors(square=cost * before.square, weight=weights)
-        left = drop_superfluous(make_search(lambda _, after=after: after), branch).now
-        assert left.model.has[:, 0].tolist() == kept
-        assert labels(left.model, ["servo"]) == [e.name for e, k in zip((STRIBECK, QUADRATIC), kept, strict=True) if k]
-        assert ("stribeck_friction.effort" in whole_values(left.model, left.x, ["servo"])) is kept[0]
 
 
 def left_at_last(bench, rmse):

@@ -105,7 +105,7 @@ def some(joints):
 def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
-    fits = InWorld(world.errors, off=("replace", "drop", "merge", "drop_last", "trim", "wide_steps"))
+    fits = InWorld(world.errors, off=("replace", "merge", "drop_last", "trim", "wide_steps"))
     model = base_model(n)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * model.upper), [ELASTICITY, MOUNT, GAIN, SPRING]

@@ -120,8 +120,8 @@ class JudgingCfg:
     clear_t: float = 2.0
     """A fall may be there above this t, though it does not show it."""
     as_good: float = 1.025
-    """A simpler model is as good up to this ratio: the effect with the fewest parameters is chosen, an older one goes
-    that the newest makes superfluous, joints share one value, and a way with fewer parameters is taken."""
+    """A simpler model is as good up to this ratio: the effect with the fewest parameters is chosen, joints share one
+    value, and a way with fewer parameters is taken."""
     weighed: float = 1.15
     """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
     far: float = 3.0
@@ -162,7 +162,6 @@ RULES = (
     "look_ahead",
     "add_pair",
     "replace",
-    "drop",
     "merge",
     "drop_last",
     "pool",

@@ -72,16 +72,14 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if str(j) in olds.get(name, {}) else None for j, name in zip(joints, best, strict=True)]
 
 
-def _drop(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """What a joint does best without, where it is as good without it."""
-    mse, best = decision.before.mse, _best(decision)
-    left = [float(decision.after[name].mse[place]) for place, name in enumerate(best)]
-    return [n if within(left[p], float(mse[p]), cfg.judging.as_good) else None for p, n in enumerate(best)]
-
-
 def _drop_last(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """What a joint does best without, where it does not pay."""
-    return [None if _pays(decision, name, place, cfg) else name for place, name in enumerate(_best(decision))]
+    taken: Taken = []
+    for place in range(len(decision.joints)):
+        tried = [name for name in decision.after if place in decision.places(name)]
+        best = min(tried, key=lambda name: float(decision.after[name].mse[place]))
+        taken.append(None if _pays(decision, best, place, cfg) else best)
+    return taken
 
 
 def _merge(decision: Decision, cfg: DiagnosisCfg) -> Taken:
@@ -148,14 +146,6 @@ def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 
-def _best(decision: Decision) -> list[str]:
-    """For each joint, that of what was tried which leaves the least error."""
-    return [
-        min((n for n in decision.after if p in decision.places(n)), key=lambda n: float(decision.after[n].mse[p]))
-        for p in range(len(decision.joints))
-    ]
-
-
 def _pays(decision: Decision, without: str, place: int, cfg: DiagnosisCfg) -> bool:
     """Whether what the present model has pays beside what was tried in place of it, or without it."""
     other, tried = decision.after[without], decision.facts["candidates"]
@@ -166,7 +156,6 @@ _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "add": _add,
     "replace": _replace,
     "look_ahead": _look_ahead,
-    "drop": _drop,
     "drop_last": _drop_last,
     "merge": _merge,
     "pool": _pool,

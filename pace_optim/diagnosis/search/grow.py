@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.search.pruning import drop_superfluous
 from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.state import Branch, Search
-
-REVISIONS: Mapping[str, Callable[[Search, Branch], Branch]] = {"replace": replace_effects, "drop": drop_superfluous}
-"""What is tried on older effects when newer ones have joined them, in this order."""
 
 
 def grown(search: Search, branch: Branch, found: Round) -> Branch:
     """The branch with each joint's chosen effect, and what that changes of the older ones."""
     now = combined(search, branch, found)
     branch = search.along_own_motion(replace(branch, rounds=(*branch.rounds, found)), now)
-    for name, revise in REVISIONS.items():
-        if search.cfg.has(name):
-            branch = revise(search, branch)
-    return branch
+    return replace_effects(search, branch) if search.cfg.has("replace") else branch
 
 
 def combined(search: Search, branch: Branch, found: Round) -> Fitted:
