@@ -199,14 +199,15 @@ def simulate(
     data.qpos[:] = plant.home
     positions = np.zeros_like(target)
     total = round((SETTLE + len(target) * CONTROL_DT) / dt)
-    k, torque = 0, np.zeros(len(dofs))
+    k, torque = -round(SETTLE / CONTROL_DT), np.zeros(len(dofs))  # a loop holds the robot while it settles
     for i in range(total):
         now = i * dt - SETTLE
         while k < len(target) and k * CONTROL_DT <= now + 1e-9:
             shown = data.qpos[columns] - truth.encoder_bias
             if k * CONTROL_DT > now - dt + 1e-9:  # between two steps: the state of its instant
                 shown = shown - (now - k * CONTROL_DT) * data.qvel[dofs]
-            positions[k] = shown
+            if k >= 0:
+                positions[k] = shown
             if not own:
                 late = max(0, int(np.floor((k * CONTROL_DT - LATE) / CONTROL_DT + 1e-6)))
                 torque = kp * (target[late] - shown) - kd * data.qvel[dofs]
