@@ -112,7 +112,7 @@ def load_tracks(
         content = trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled))
     else:
         content = read_trajectory(folder)
-    _check_finite(folder, content)
+    _check_finite(folder if simulate else folder / "best_trajectory.pt", content)
     recordings = None if problem is None else problem.dataset.recordings
     if recordings is not None and not _are_those(recordings, content):
         notes.append("The run's recordings have changed since it was fitted: there is no load torque.")
@@ -147,11 +147,11 @@ def load_tracks(
     )
 
 
-def _check_finite(folder: Path, content: dict[str, Any]) -> None:
+def _check_finite(source: Path, content: dict[str, Any]) -> None:
     for entry in content["recordings"]:
         if not bool(torch.as_tensor(entry["sim_dof_pos"]).isfinite().all()):
             raise ValueError(
-                f"{folder}: the simulation of {entry['name']} diverges with the run's parameters, so there is nothing "
+                f"{source}: the simulation of {entry['name']} diverges with the run's parameters, so there is nothing "
                 "to compare. Fit again, with narrower bounds or a finer --physics_dt."
             )
 
