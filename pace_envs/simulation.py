@@ -29,6 +29,9 @@ _INTEGRATORS = {
 
 
 _STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
+_RK4_FRICTION = 0.8
+"""Time constant T of joint friction with RK4 [time steps]. A sticking joint's speed decays at the rate 2 / T; RK4 is
+stable where a step is shorter than 2.79 / rate, and 2 / 0.8 = 2.5."""
 _EXPLICIT = 0.5
 """Part of its speed that a rotor may lose to viscous friction in a step of an explicit integrator."""
 
@@ -47,7 +50,8 @@ class SimulationCfg:
     """Gravity [m/s^2]."""
 
     friction_timeconst: float | None = None
-    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps, the stiffest stable one.
+    """Time constant of the joints' Coulomb friction [s]; ``None``: the shortest that is stable, two time steps, or 0.8
+    with ``rk4``, whose stages bring a sticking joint to rest from any of them.
 
     MuJoCo's default of 20 ms is soft: a stuck joint creeps.
     """
@@ -332,15 +336,26 @@ class Simulation:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         for body in spec.bodies[1:]:
             body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
-        timeconst = 2 * self.cfg.dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
         impedance = self.cfg.friction_impedance
         for joint in spec.joints:
-            joint.solref_friction = [timeconst, 1.0]
+            joint.solref_friction = self._friction_solref()
             joint.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
         try:
             return spec.compile()
         except ValueError as error:
             raise ValueError(f"MuJoCo cannot compile the model: {error}") from None
+
+    def _friction_solref(self) -> list[float]:
+        """MuJoCo's solref of joint friction.
+
+        It is the time constant T; where that is below two steps, which MuJoCo would lengthen it to, it is the stiffness
+        and damping that T stands for, -(1 / T², 2 / T).
+        """
+        timeconst, dt = self.cfg.friction_timeconst, self.cfg.dt
+        if timeconst is None and self.is_trapezoidal:
+            shortest = _RK4_FRICTION * dt
+            return [-1.0 / shortest**2, -2.0 / shortest]
+        return [2 * dt if timeconst is None else timeconst, 1.0]
 
 
 def bytes_per_env(model: mujoco.MjModel) -> int:

@@ -154,6 +154,33 @@ def test_finer_steps_are_runge_kutta_with_fast_dynamics_of_a_drive_too():
     assert cfg.scene.robot.actuators["servo"].control_decimation == 5
 
 
+def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
+    """Positions every 10 ms of a joint that a slow torque swings against friction, by Runge-Kutta."""
+    cfg = load_env_cfg("Pace-TestBench-v0")
+    cfg.sim.dt, cfg.sim.integrator, cfg.sim.gravity, cfg.sim.friction_timeconst = dt, "rk4", (0.0, 0.0, 0.0), timeconst
+    env = ManagerBasedRLEnv(cfg)
+    start(env)
+    every, seen = round(0.01 / dt), []
+    armature, coulomb = (torch.full((1, 1), value, dtype=torch.float64) for value in (0.01, friction))
+    env.sim.write_passive(slice(None), armature, coulomb, torch.zeros(1, 1, dtype=torch.float64), None)
+    for step in range(200 * every):
+        env.sim.qfrc_applied[:] = amplitude * math.sin(2 * math.pi * (step + 0.5) * dt)
+        env.sim.step()
+        if (step + 1) % every == 0:
+            seen.append(env.sim.qpos.item())
+    return np.array(seen)
+
+
+def test_friction_of_runge_kutta_gives_way_at_once():
+    """What two time steps smooth where the joint turns is worth a finer step."""
+    exact, own, two_steps = swung(0.0001), swung(0.0025), swung(0.0025, timeconst=0.005)
+    assert np.abs(own - exact).max() < 0.3 * np.abs(two_steps - exact).max()
+
+
+def test_friction_of_runge_kutta_holds():
+    assert np.abs(swung(0.0025, amplitude=0.19)).max() < 1e-4
+
+
 @pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
 def test_implicit_damping_acts_on_the_speed_after_the_step(integrator):
     """(M + J) (v₊ - v) = h (τ - D v₊), whatever D is."""

@@ -47,7 +47,9 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         for parameter, attribute in fields.items():
             if not is_undetermined(drives, parameter, name):
                 _set(joint, attribute, drives.values(parameter, [name])[name])
-        joint.solref_friction, joint.solimp_friction = model.dof_solref[column], model.dof_solimp[column]
+        solref = model.dof_solref[column]  # that of RK4 would not be stable with another integrator
+        joint.solref_friction = solref if solref[0] > 0 else [2 * drives.at.physics_dt, 1.0]
+        joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
         joint = spec.joint(name)
         joint.solref_friction = [time_constant, 1.0]

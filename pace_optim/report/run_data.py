@@ -97,7 +97,7 @@ class RunData:
         if not path.is_file():
             return None
         if self.model_digest not in (None, file_digest(path)):  # MuJoCo's reader checks less than it would have to
-            refuse(path, "is not the model that the fit wrote", "Remove it, or fit again.")
+            refuse(path, f"is not the model that {self.folder / 'settings.json'} has", "Remove it, or fit again.")
         with collected() as said:
             try:
                 return mujoco.MjModel.from_binary_path(str(path))
