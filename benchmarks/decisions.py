@@ -3,32 +3,61 @@
 python benchmarks/hidden_effects.py --cases effects,clean --seeds 5
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --number alike=1.05 --number next_effect=1.15
+python benchmarks/decisions.py logs/hidden_effects/*/*.jsonl --save tests/decisions/reference.jsonl.gz
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
+import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.decisions import Decision, read_decisions
+from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
 from pace_optim.diagnosis.judging.rules import decided
 
 
 def main() -> None:
     """Read and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="decisions.jsonl of diagnoses")
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="decisions of diagnoses, or a saved file")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="write them all to one compressed file")
     parser.add_argument(
         "--number", action="append", default=[], metavar="NAME=VALUE", help="another value of a field of JudgingCfg"
     )
     args = parser.parse_args()
     numbers = dict(each.split("=") for each in args.number)
     cfg = replace(DEFAULT, judging=replace(DEFAULT.judging, **{name: float(value) for name, value in numbers.items()}))
-    print(table({path.stem: read_decisions(path.read_text(encoding="utf-8")) for path in args.files}, cfg))
+    cases = read_cases(args.files)
+    if args.save is not None:
+        save_cases(cases, args.save)
+    print(table(cases, cfg))
+
+
+def read_cases(files: Sequence[Path]) -> dict[str, list[Decision]]:
+    """The decisions of each case: of a file each, or of files that `save_cases` wrote."""
+    cases: dict[str, list[Decision]] = {}
+    for path in files:
+        if path.suffix != ".gz":
+            cases[path.stem] = read_decisions(path.read_text(encoding="utf-8"))
+            continue
+        for line in gzip.decompress(path.read_bytes()).decode().splitlines():
+            saved = json.loads(line)
+            cases[saved["case"]] = read_decisions("\n".join(json.dumps(each) for each in saved["decisions"]))
+    return cases
+
+
+def save_cases(cases: Mapping[str, Sequence[Decision]], path: Path) -> None:
+    """Write the decisions of all cases to one file, a line of JSON each, compressed."""
+    lines = (
+        json.dumps({"case": name, "decisions": [json.loads(line) for line in as_lines(own).splitlines()]})
+        for name, own in sorted(cases.items())
+    )
+    path.write_bytes(gzip.compress("".join(f"{line}\n" for line in lines).encode(), mtime=0))
 
 
 def table(cases: Mapping[str, Sequence[Decision]], cfg: DiagnosisCfg = DEFAULT) -> str:

@@ -12,7 +12,7 @@ from test_search_moves import BOTH_LACK, NEIGHBOUR, STANDS_IN, base_model, searc
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
-from decisions import table
+from decisions import read_cases, save_cases, table
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
@@ -24,7 +24,8 @@ from pace_optim.diagnosis.search.state import Branch
 
 ROOT = Path(__file__).parents[1]
 DIAGNOSIS = ROOT / "pace_optim" / "diagnosis"
-LOGS = sorted((Path(__file__).parent / "decisions").glob("*.jsonl"))
+CASES = read_cases(sorted((Path(__file__).parent / "decisions").glob("*.jsonl*")))
+"""The decisions of the reference: benchmarks/ablation.md."""
 PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}
 """Numbers of arithmetic and units: halves, squares, tenths, percent, milli."""
 GUARDS = {"_RIDGE", "_LEAST", "_MOST", "_POINTS"}
@@ -33,11 +34,9 @@ TELLING = {"_EFFECTS"}
 """How much is printed."""
 
 
-@pytest.mark.parametrize("path", LOGS, ids=lambda path: path.stem)
-def test_decisions_of_whole_diagnoses_come_out_as_they_did(path):
-    decisions = read_decisions(path.read_text(encoding="utf-8"))
-    assert decisions
-    for decision in decisions:
+@pytest.mark.parametrize("case", CASES)
+def test_decisions_of_whole_diagnoses_come_out_as_they_did(case):
+    for decision in CASES[case]:
         assert decided(decision) == decision.taken, decision.rule
 
 
@@ -51,6 +50,14 @@ def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
     assert {decision.rule for decision in read} == {"look_ahead", "add_pair", "add_to_group"}
     for decision in read:
         assert [bool(name) for name in decided(decision)] == [bool(name) for name in decision.taken]
+
+
+def test_saved_cases_are_read_as_they_were(tmp_path):
+    log: list[Decision] = []
+    searched(BOTH_LACK, log=log.append)
+    save_cases({"two": log, "none": []}, tmp_path / "saved.jsonl.gz")
+    read = read_cases([tmp_path / "saved.jsonl.gz"])
+    assert read["none"] == [] and as_lines(read["two"]) == as_lines(read_decisions(as_lines(log).decode()))
 
 
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
