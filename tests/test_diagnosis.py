@@ -20,13 +20,13 @@ from pace_optim.diagnosis import candidate_effects
 from pace_optim.diagnosis.candidates.screening import _explained
 from pace_optim.diagnosis.diagnose import search_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors, check_long_enough
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.telling.next_experiment import rivals_of
 from pace_optim.diagnosis.verdict.verdict import explained_joints, ranking, verdict
+from pace_optim.problem.forked import parallel_map
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

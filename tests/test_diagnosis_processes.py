@@ -15,11 +15,11 @@ from diagnoses import joint_alone
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import screen
-from pace_optim.diagnosis.fitting import processes
 from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
+from pace_optim.problem import forked as processes
+from pace_optim.problem.forked import parallel_map
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 
@@ -135,7 +135,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     script.write_text(
         "import os, sys\n"
         "from pace_actuators.effects import get_effect\n"
-        "from pace_optim.diagnosis.fitting import processes\n"
+        "from pace_optim.problem import forked as processes\n"
         "processes.available_processors = lambda: 2\n"
         "here = os.getpid()\n"
         "def work(own):\n"

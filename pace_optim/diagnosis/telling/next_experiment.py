@@ -10,12 +10,12 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
-from pace_optim.diagnosis.fitting.processes import parallel_map
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import found_effects
 from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.excitation import make_excitation
+from pace_optim.problem.forked import parallel_map
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset

@@ -1,7 +1,6 @@
-"""Effects that are tried side by side, shared out among processes.
+"""Work shared out among forked processes.
 
-The torque law of a few hundred rows costs its calls, not its numbers, so that threads inside a call gain nothing; every
-effect that is tried adds calls of its own.
+The torque law of a few hundred rows costs its calls, not its numbers, so that threads inside a call gain nothing.
 """
 
 from __future__ import annotations
