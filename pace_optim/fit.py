@@ -18,7 +18,7 @@ from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.other_starts import other_valleys, scattered
-from pace_optim.optimizers.refine import BEGINNING, refine
+from pace_optim.optimizers.refine import BEGINNING, COARSE, refine
 from pace_optim.optimizers.search import RefiningPays, agree_to_stop, search
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
@@ -307,7 +307,9 @@ class _Fit:
         if others:  # resumed
             self.processes.agree(None)
         else:
-            self.descents = [found] = refine(self.evaluator, self.colouring, [found], self._after_iteration)
+            self.descents = [found] = refine(
+                self.evaluator, self.colouring, [found], self._after_iteration, on_beginning=self._on_beginning
+            )
             others = self._elsewhere(found)
         if others:
             self._try_others(found, others)
@@ -338,7 +340,14 @@ class _Fit:
         """Refine other starts, as far as an interrupted run had not done it yet."""
         self.descents = [found, *others]
         self._write_checkpoint()
-        self.descents = refine(self.evaluator, self.colouring, others, self._after_iteration, found=[found])
+        self.descents = refine(
+            self.evaluator,
+            self.colouring,
+            others,
+            self._after_iteration,
+            found=[found],
+            on_beginning=self._on_beginning,
+        )
         self._searched = self.descents[0] is found
 
     def _write_checkpoint(self) -> None:
@@ -388,6 +397,11 @@ class _Fit:
         if optimizer.cfg.save_optimization_process:
             self._saved["params"].append(optimizer.candidates)
             self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
+
+    def _on_beginning(self, descents: Sequence[Descent]) -> None:
+        """A descent on the beginnings of the recordings, which a resumed fit makes anew, says that it goes on."""
+        best, iteration = min(d.score for d in descents), max(d.iteration for d in descents)
+        self.progress.show("begin", iteration, COARSE.max_iteration, best, None, self.steps)
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         best = min(d.score for d in descents)

@@ -14,7 +14,7 @@ from pace_optim.problem.evaluator import Evaluator
 BEGINNING = 0.25
 """The part of each recording on which most of the way is gone."""
 
-_COARSE = LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
+COARSE = LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
 _DAMPING_AFTER_COARSE = 1e-5
 _ANOTHER_VALLEY = 0.02
 _MUCH_WORSE = 10.0
@@ -26,6 +26,7 @@ def refine(
     starts: Sequence[Descent],
     on_iteration: Callable[[list[Descent]], None] | None = None,
     found: Sequence[Descent] = (),
+    on_beginning: Callable[[list[Descent]], None] | None = None,
 ) -> list[Descent]:
     """Least squares from several starts; most of the way is gone on a part of each recording, which is cheaper.
 
@@ -35,25 +36,31 @@ def refine(
         starts: Fresh descents, or those of an interrupted run to go on with.
         on_iteration: Called with all descents after each iteration on the whole recordings.
         found: Descents that have ended: a start that comes into their valley, or stays far above them, is dropped.
+        on_beginning: The same on the part of each recording, whose descents are not yet those of the whole.
 
     Returns:
         The descents, those that had ended too, the best first.
     """
     descents = list(starts)
     if all(descent.iteration == 0 for descent in descents):
-        descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents])
+        descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents], on_beginning)
         if on_iteration is not None:
             on_iteration([*found, *descents])
     return least_squares(evaluator, colouring, [*found, *descents], on_iteration=on_iteration)
 
 
-def _near_their_valleys(evaluator: Evaluator, colouring: Colouring, starts: Sequence[torch.Tensor]) -> list[Descent]:
+def _near_their_valleys(
+    evaluator: Evaluator,
+    colouring: Colouring,
+    starts: Sequence[torch.Tensor],
+    on_iteration: Callable[[list[Descent]], None] | None,
+) -> list[Descent]:
     """Refine on the beginnings of the recordings; keep, of each start, what is better on the whole.
 
     Ends that are far worse than the best, or next to it, are left out.
     """
     where = evaluator.dataset.beginning(BEGINNING)
-    ends = [d.x for d in least_squares(evaluator, colouring, starts, _COARSE, where=where)]
+    ends = [d.x for d in least_squares(evaluator, colouring, starts, COARSE, on_iteration, where)]
     candidates = torch.stack([*ends, *starts])
     neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
     residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))
