@@ -37,6 +37,8 @@ MEMORY = 6 << 30
 """Most memory that a trial may ask for beyond what it starts with [bytes]."""
 LONG = ("diagnose", "refit")
 """Options without a value that ask for minutes of work and nothing wrong."""
+WORK = ("max_iterations",)
+"""Options whose number is how long a training goes on: a large one is no fault, and no hang."""
 FAULTS = ("hang", "crash", "traceback", "execution", "half-written", "message", "unnamed")
 
 
@@ -88,6 +90,8 @@ def bad_words(command: str, rng: random.Random) -> tuple[list[str], str]:
     words = list(world_of.COMMANDS[command][1])
     action = rng.choice([action for action in options_of(command) if action.dest not in LONG] or [None])
     word = rng.choice(mutations.WRONG_WORDS)
+    if action is not None and action.dest in WORK and word.isdecimal() and int(word):
+        word = "0"
     if action is None:
         return [*words, word], f"a word {word!r:.40}"
     if not action.option_strings:

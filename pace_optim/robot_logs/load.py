@@ -84,6 +84,15 @@ def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> li
         robot: The robot's joints and limits, as far as they are known.
         columns: Which column is what; without it, it is guessed.
     """
+    try:
+        return _understood(path, robot, columns)
+    except ValueError as error:
+        if columns is None or columns.source in str(error):
+            raise
+        raise ValueError(f"{error} ({path.name} was read by {columns.source}.)") from None
+
+
+def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Understood]:
     result = []
     for log in _logs(path, columns):
         used, notes = columns, list(log.notes)
@@ -96,9 +105,7 @@ def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> li
         _check_map(path, used, names)
         fields, more = fields_of(log, used, names)
         facts = add_json_facts(fields, Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path)
-        recording = check_recording(
-            facts, source=f"{path} (read by {columns.source})" if columns else str(path), default_name=log.name
-        )
+        recording = check_recording(facts, source=str(path), default_name=log.name)
         if len(log.name) > len(path.stem):  # an episode
             recording = replace(recording, name=log.name)
         lines = [printable(line) for line in (f"{path}: read as", *rates_of(log, used), *notes, *more)]
@@ -218,8 +225,8 @@ def _check_map(path: Path, columns: ColumnMap, names: Sequence[str]) -> None:
     missing = [name for name in names if "dof_pos" not in columns.joints.get(name, {})]
     if missing:
         raise ValueError(
-            f"{path}: the column map {columns.source} has no dof_pos of {listed(missing)}; it has the joints "
-            f"{listed(columns.joints)}. Add them."
+            f"{path}: the column map has no dof_pos of {listed(missing)}; it has the joints {listed(columns.joints)}. "
+            "Add them."
         )
 
 
