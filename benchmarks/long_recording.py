@@ -36,7 +36,8 @@ def write_robot(path: Path) -> None:
             drives.append(f'<position joint="{name}" kp="40" kv="2" forcerange="-20 20"/>')
         bodies.append(text)
     path.write_text(
-        f'<mujoco model="limbs"><compiler angle="radian"/><worldbody>{"".join(bodies)}</worldbody><actuator>{"".join(drives)}</actuator></mujoco>'
+        '<mujoco model="limbs"><compiler angle="radian"/>'
+        f"<worldbody>{''.join(bodies)}</worldbody><actuator>{''.join(drives)}</actuator></mujoco>"
     )
 
 
