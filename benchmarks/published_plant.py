@@ -96,7 +96,7 @@ class Plant:
                     gains = -model.actuator_biasprm[i, 1:3] * ratio**2
                     result.append((i, ratio, float(gains[0]), float(gains[1])))
                     break
-        return result
+        return result if all(kp > 0 for *_, kp, _ in result) else []  # motors: the loop is somebody else's
 
 
 def home_of(full: mujoco.MjModel, model: mujoco.MjModel) -> np.ndarray:
