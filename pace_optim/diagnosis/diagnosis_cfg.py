@@ -26,10 +26,6 @@ class FittingCfg:
     """Iterations where refits begin, and of a model that was changed or moves along a new reference."""
     behind: float = 2.0
     """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
-    damping: float = 1e-3
-    """Of the first step, relative to the diagonal of JᵀJ."""
-    trials: tuple[float, ...] = (1.0, 30.0, 1e3)
-    """Multiples of the damping that are tried side by side; the next damping is a tenth of the one that was best."""
     narrow: float = 1e-4
     """Normalised step of the derivatives."""
     wide: tuple[float, ...] = (3e-2, 1e-2)

@@ -13,7 +13,10 @@ import torch
 from pace_optim.optimizers.jacobian import Colouring, Jacobian, jacobian, perturbed
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
-_DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
+FIRST_DAMPING = 1e-3
+"""Relative to the diagonal of JᵀJ."""
+DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
+"""Multiples of the damping that are tried side by side; the next damping is a tenth of the one that was best."""
 _STALLED = 3
 _CREEPING = 4
 _GIVEN = 5
@@ -58,7 +61,7 @@ class Descent:
     """Present normalised vector, (size,)."""
     score: float = np.inf
     """Its score [rad²]."""
-    damping: float = 1e-3
+    damping: float = FIRST_DAMPING
     """Levenberg–Marquardt damping, relative to the diagonal of JᵀJ."""
     jacobian: Jacobian | None = None
     """Residuals at x, and derivatives at ``jacobian_x``; ``None`` until they are known."""
@@ -117,7 +120,7 @@ class Descent:
             return self.x[None]
         hessian, gradient = self.jacobian.normal_equations()
         return torch.stack(
-            [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in _DAMPING_TRIALS]
+            [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in DAMPING_TRIALS]
         )
 
     def expected_gain(self, x: torch.Tensor) -> float:
@@ -250,16 +253,16 @@ def _advance(
         descent.look(batch[0], residuals, step, colouring)
         descent.scores = descent.scores or [descent.score]
     else:
-        rows = [0, *range(len(batch) - len(_DAMPING_TRIALS) + 1, len(batch))]
+        rows = [0, *range(len(batch) - len(DAMPING_TRIALS) + 1, len(batch))]
         best = int(scores[rows].argmin())
         gain = descent.score - float(scores[rows[best]])
         expected = descent.expected_gain(batch[0])
         descent.stalled = 0 if gain > cfg.score_tolerance * descent.score else descent.stalled + 1
-        fresh, looked = descent.is_fresh, len(batch) > len(_DAMPING_TRIALS)
+        fresh, looked = descent.is_fresh, len(batch) > len(DAMPING_TRIALS)
         if gain > 0:
             moved = float((batch[rows[best]] - descent.x).abs().max())
             descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
-            descent.damping = max(_SMALLEST_DAMPING, descent.damping * _DAMPING_TRIALS[best] / 10.0)
+            descent.damping = max(_SMALLEST_DAMPING, descent.damping * DAMPING_TRIALS[best] / 10.0)
             if descent.jacobian is not None and not looked:
                 descent.jacobian = replace(descent.jacobian, residuals=residuals.rows(rows[best], rows[best] + 1))
             elif best == 0:  # its neighbours were simulated beside it

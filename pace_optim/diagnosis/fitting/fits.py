@@ -12,7 +12,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_envs.devices import find_device
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
+from pace_optim.diagnosis.fitting.levenberg_marquardt import TRIALS, LevenbergMarquardt
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors
 from pace_optim.diagnosis.model.fitted import Fitted
@@ -202,7 +202,7 @@ class Fits:
 
     def _batch_of(self, problem: TwinProblem, fits: Sequence[Fitted] | Sequence[LevenbergMarquardt]) -> SideBySide:
         """What simulates one iteration of each."""
-        slots = [Slot(model=each.model, rows=each.model.size + len(self.cfg.fitting.trials)) for each in fits]
+        slots = [Slot(model=each.model, rows=each.model.size + len(TRIALS)) for each in fits]
         return self.batch(problem, slots, training=True)
 
     def _near(self, models: Sequence[Fitted]) -> list[bool]:

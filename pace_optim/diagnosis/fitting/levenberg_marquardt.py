@@ -6,7 +6,10 @@ import torch
 
 from pace_optim.diagnosis.diagnosis_cfg import FittingCfg
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.optimizers.least_squares import bounded_step
+from pace_optim.optimizers.least_squares import DAMPING_TRIALS, FIRST_DAMPING, bounded_step
+
+TRIALS = DAMPING_TRIALS[:-1]
+"""Those of a whole robot's fit without the largest: a joint has few parameters."""
 
 
 class LevenbergMarquardt:
@@ -20,14 +23,14 @@ class LevenbergMarquardt:
             samples: How many count for each joint, (n,).
             keep: Whether the last Jacobian is kept.
             rough: Whether derivatives are taken over wide steps first.
-            cfg: Dampings, steps and tolerances.
+            cfg: Steps and tolerances.
         """
         self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
         n, size = start.x.shape
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
-        self._damping = torch.full((n,), cfg.damping, dtype=torch.float64)
+        self._damping = torch.full((n,), FIRST_DAMPING, dtype=torch.float64)
         self._hessian = torch.zeros(n, size, size, dtype=torch.float64)
         self._gradient = torch.zeros(n, size, dtype=torch.float64)
         self._known = torch.zeros(n, dtype=torch.bool)
@@ -48,14 +51,14 @@ class LevenbergMarquardt:
     def ask(self) -> torch.Tensor:
         """Normalised rows, (P + trials, n, P)."""
         n, size = self.x.shape
-        trials = self.x.repeat(len(self._cfg.trials), 1, 1)
+        trials = self.x.repeat(len(TRIALS), 1, 1)
         for j in range(n):
             free = self._free[j]
             if not bool(self._known[j]) or not bool(free.any()):
                 continue
             at = free.nonzero()[:, 0]
             hessian, gradient = self._hessian[j][at[:, None], at], self._gradient[j][at]
-            for t, factor in enumerate(self._cfg.trials):
+            for t, factor in enumerate(TRIALS):
                 trials[t, j, at] = bounded_step(self.x[j, at], hessian, gradient, float(self._damping[j]) * factor)
         favoured = trials[0]
         width = self._widths[self._width][:, None]
@@ -85,15 +88,13 @@ class LevenbergMarquardt:
         self.x = torch.where(moved[:, None], chosen, self.x)
         self.score = torch.where(better, lowest, self.score)
         self._scores.append(float(self.score.sum()))
-        factor = torch.tensor(self._cfg.trials, dtype=torch.float64)[best]
+        factor = torch.tensor(TRIALS, dtype=torch.float64)[best]
         lowered = (self._damping * factor / 10).clamp(min=1e-9)
-        self._damping = torch.where(
-            moved, lowered, torch.where(fresh, self._damping, self._damping * self._cfg.trials[-1])
-        )
+        self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * TRIALS[-1]))
         at_favoured = fresh | (moved & (best == 0))
         self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known)) & ~narrower
         self._width += narrower
-        self._damping = torch.where(narrower, self._cfg.damping, self._damping)
+        self._damping = torch.where(narrower, FIRST_DAMPING, self._damping)
         if bool(at_favoured.any()):
             difference = error[1 : 1 + size] - error[:1]
             columns = difference / self._step.T[:, None, None, :].to(error.device, torch.float32)
@@ -115,7 +116,7 @@ class LevenbergMarquardt:
         for j in result.nonzero()[:, 0].tolist():
             at = self._free[j].nonzero()[:, 0]
             x, hessian, gradient = self.x[j, at], self._hessian[j][at[:, None], at], self._gradient[j][at]
-            move = bounded_step(x, hessian, gradient, self._cfg.damping) - x if len(at) else x
+            move = bounded_step(x, hessian, gradient, FIRST_DAMPING) - x if len(at) else x
             promised = -float(2 * gradient @ move + move @ hessian @ move)
             result[j] = promised < self._cfg.enough / 10 * float(self.score[j])
         return result
