@@ -225,7 +225,7 @@ def test_a_target_beyond_a_joint_limit_is_an_error_that_says_where():
     assert finding.is_error and (finding.joint, finding.quantity, finding.limit) == ("hip", "target", 1.0)
     assert finding.value == pytest.approx(1.5 * TIME[-1]) and finding.time == pytest.approx(TIME[-1])
     with pytest.raises(ValueError, match=r"'m' must not be sent.* hip: its target is 1\.496 rad at 1\.00 s"):
-        refuse_errors([finding], "m")
+        refuse_errors([finding], "m", "this robot")
 
 
 def test_the_lower_limit_counts_too():
@@ -238,7 +238,7 @@ def test_fast_targets_are_a_warning_but_steps_are_excepted():
     (finding,) = check_command(motion(step), LIMITS)
     assert not finding.is_error and finding.quantity == "speed"
     assert finding.value == pytest.approx(0.5 / DT) and finding.share == pytest.approx(1 / 399)
-    refuse_errors([finding], "m")
+    refuse_errors([finding], "m", "this robot")
     assert check_command(motion(step, has_jumps=True), LIMITS) == []
 
 

@@ -191,6 +191,12 @@ def test_a_urdfs_limit_that_is_no_number_is_told_with_its_joint(tmp_path, key, t
         cfg_of(tmp_path, urdf, "robot.urdf")
 
 
+def test_ranges_that_seem_to_be_radians_read_as_degrees_are_noted(tmp_path):
+    said = [note for note in cfg_of(tmp_path, ARM.replace(' angle="radian"', "")).sim2real.notes if "degrees" in note]
+    assert said and said[0].startswith("ranges: 3 degrees wide") and '<compiler angle="radian"/>' in said[0]
+    assert not any("degrees" in note for note in cfg_of(tmp_path, ARM).sim2real.notes)
+
+
 XACRO = "http://www.ros.org/wiki/xacro"
 
 

@@ -24,6 +24,8 @@ from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, Pac
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 
 _UNNAMED = {"", "mujoco model", "robot", "model", "scene"}
+_NARROW = 0.2
+"""Median width of ranges [rad] below which the file may mean radians where MuJoCo reads degrees."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +71,13 @@ def read_robot(path: str | Path) -> Robot:
         name=_folder_name(file),
         joints=tuple(joints),
         home=home,
-        notes=(*file.notes, *notes, *_assumptions(joints, key, model), _loop_note(joints, model)),
+        notes=(
+            *_degrees_note(joints, file),
+            *file.notes,
+            *notes,
+            *_assumptions(joints, key, model),
+            _loop_note(joints, model),
+        ),
     )
 
 
@@ -196,6 +204,17 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) 
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
         notes.append("the base is held in the air, and nothing touches")
     return notes
+
+
+def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
+    """Whether the ranges of an MJCF seem to be radians that are read as degrees, which is MuJoCo's default."""
+    widths = [high - low for low, high in (j.range for j in joints if not j.is_slide) if np.isfinite(high - low)]
+    if file.urdf is not None or not file.spec.compiler.degree or not widths or np.median(widths) > _NARROW:
+        return []
+    return [
+        f"ranges: {np.degrees(np.median(widths)):.2g} degrees wide in the median; MuJoCo reads an MJCF's angles in "
+        'degrees. If they are radians, say so in the file: <compiler angle="radian"/>'
+    ]
 
 
 def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel) -> str:

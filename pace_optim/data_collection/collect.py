@@ -96,7 +96,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         trajectories = trajectories if design is None else [design.trajectory]
         findings = [check_command(trajectory, limits) for trajectory in trajectories]
         for trajectory, found in zip(trajectories, findings, strict=True):
-            refuse_errors(found, trajectory.name)
+            refuse_errors(found, trajectory.name, cfg.task)
         simulated: list[Simulated] = []
         hidden: Hidden | None = None
         if truth is not None and cfg.effects:
@@ -115,7 +115,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         if simulated:
             for trajectory, result, found in zip(trajectories, simulated, findings, strict=True):
                 found += check_simulated(trajectory.time, result.position, result.torque, limits)
-                refuse_errors(found, trajectory.name)
+                refuse_errors(found, trajectory.name, cfg.task)
     finally:
         env.close()
     written = _write(cfg, sim2real, trajectories, simulated, files, findings, limits)

@@ -137,17 +137,18 @@ def summarise(findings: Sequence[MotionFinding]) -> list[str]:
     return lines
 
 
-def refuse_errors(findings: Sequence[MotionFinding], name: str) -> None:
+def refuse_errors(findings: Sequence[MotionFinding], name: str, robot: str) -> None:
     """Raise a ValueError that lists the errors among the findings.
 
     Args:
         findings: The findings.
         name: Name of the trajectory.
+        robot: What to call the robot.
     """
     errors = [finding.message for finding in findings if finding.is_error]
     if errors:
         more = f" And {len(errors) - 3} more." if len(errors) > 3 else ""
-        raise ValueError(f"The motion {name!r} must not be sent to this robot. {' '.join(errors[:3])}{more}")
+        raise ValueError(f"The motion {name!r} must not be sent to {robot}. {' '.join(errors[:3])}{more}")
 
 
 def _severity(finding: MotionFinding) -> float:
