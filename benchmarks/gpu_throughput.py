@@ -4,7 +4,10 @@
 
 The environment steps on random targets and its torques are kept; then both start from the same state again and
 again, in turns: ``env.simulate`` (action, drives, physics), and the physics alone with those torques copied in.
-For walking tasks ``env.step`` is timed, too: rewards, ends, resets, commands, observations.
+For walking tasks ``env.step`` is timed, too (rewards, ends, resets, commands, observations), against the physics along
+its motion: torques are copied in, and before each control step the state that the environment had, resets included;
+what these copies of the state take is measured alone and taken off. ``--plain`` leaves every operation of torch a
+kernel of its own.
 """
 
 from __future__ import annotations
@@ -34,10 +37,10 @@ def seconds(call: Callable[[int], object], count: int) -> float:
     return (time.perf_counter() - start) / count
 
 
-def measure(task: str, num_envs: int, steps: int, device: str) -> dict[str, object]:
+def measure(task: str, num_envs: int, steps: int, device: str, plain: bool) -> dict[str, object]:
     """Physics steps per second, bare and with the environment around them."""
     cfg = load_env_cfg(task)
-    cfg.scene.num_envs, cfg.seed, cfg.sim.device = num_envs, 0, device
+    cfg.scene.num_envs, cfg.seed, cfg.sim.device, cfg.sim.fused = num_envs, 0, device, not plain
     env = ManagerBasedRLEnv(cfg)
     env.reset(seed=0)
     sim, decimation = env.sim, cfg.decimation
@@ -79,12 +82,52 @@ def measure(task: str, num_envs: int, steps: int, device: str) -> dict[str, obje
         "part_of_bare": statistics.median(a / b for a, b in zip(alone, with_env, strict=True)),
     }
     if cfg.sim.contacts:
-        env.reset(seed=0)
-        for action in actions[:5]:
-            env.step(action)
-        row["env_steps_per_s"] = num_envs * decimation / seconds(lambda k: env.step(actions[k % steps]), 60)
+        torques.clear()
+        row |= measure_step(env, actions[:60])
     env.close()
     return row
+
+
+def measure_step(env: ManagerBasedRLEnv, actions: torch.Tensor) -> dict[str, object]:
+    """Physics steps per second of ``env.step``, and of the physics alone along its motion."""
+    sim, decimation, count = env.sim, env.cfg.decimation, len(actions)
+    assert isinstance(sim, WarpSimulation)
+    state, step = [sim.bind(name) for name in STATE], sim.step
+    env.reset(seed=0)
+    for action in actions:  # graphs are captured, robots have found their feet or fallen
+        env.step(action)
+    states, torques = list[list[torch.Tensor]](), list[torch.Tensor]()
+
+    def keep() -> None:
+        torques.append(sim.qfrc_applied.clone())
+        step()
+
+    sim.step = keep  # type: ignore[method-assign]
+    for action in actions:
+        states.append([field.clone() for field in state])
+        env.step(action)
+    sim.step = step  # type: ignore[method-assign]
+
+    def put(k: int) -> None:
+        for field, value in zip(state, states[k], strict=True):
+            field.copy_(value)
+
+    def bare(k: int) -> None:
+        put(k)
+        for i in range(decimation):
+            sim.qfrc_applied.copy_(torques[k * decimation + i])
+            step()
+
+    whole, alone = [], []
+    for _ in range(REPEATS):
+        put(0)
+        whole.append(seconds(lambda k: env.step(actions[k]), count))
+        alone.append(seconds(bare, count) - seconds(put, count))
+    return {
+        "env_steps_per_s": env.num_envs * decimation / statistics.median(whole),
+        "bare_along_env_steps_per_s": env.num_envs * decimation / statistics.median(alone),
+        "env_part_of_bare": statistics.median(a / b for a, b in zip(alone, whole, strict=True)),
+    }
 
 
 def main() -> None:
@@ -94,10 +137,11 @@ def main() -> None:
     parser.add_argument("--num_envs", type=int, nargs="+", default=[512, 4096, 16384, 65536])
     parser.add_argument("--steps", type=int, default=200, help="control steps (fewer for walking at large widths)")
     parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--plain", action="store_true", help="every operation of torch is a kernel of its own")
     args = parser.parse_args()
     print(torch.cuda.get_device_name(args.device))
     for num_envs in args.num_envs:
-        print(json.dumps(measure(args.task, num_envs, args.steps, args.device)), flush=True)
+        print(json.dumps(measure(args.task, num_envs, args.steps, args.device, args.plain)), flush=True)
 
 
 if __name__ == "__main__":

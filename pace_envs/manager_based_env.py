@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from pace_envs.fused import Fusion, fusion_for
 from pace_envs.managers import (
     ActionManager,
     ActionTermCfg,
@@ -211,11 +212,15 @@ class ManagerBasedEnv(gym.Env):
         version = self.sim.version
         if self._drive_graphs is None:
             owners = [part for robot in self.scene.articulations.values() for part in (robot.data, robot.actuators)]
-            self._drive_graphs = StepGraphs(self.scene.write_data_to_sim, owners, self.device)
+            self._drive_graphs = StepGraphs(self.scene.write_data_to_sim, owners, self.device, self._fusion())
         elif version != self._graphs_version:
             self._drive_graphs.clear()
         self._graphs_version = version
         self._drive_graphs()
+
+    def _fusion(self) -> Fusion | None:
+        """What makes few kernels of many operations, where that is wanted and can be had."""
+        return fusion_for(self.num_envs, self.device) if self.cfg.sim.fused else None
 
     def render(self) -> np.ndarray | None:
         """A picture of environment 0, (height, width, 3) uint8; ``None`` without a render mode."""

@@ -64,7 +64,9 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.masks_resets = self.device.type != "cpu" and self.takes_masks
         self._manager_graph: ManagerGraph | None = None
         if self.masks_resets and cfg.sim.graphs and self.can_be_captured:
-            self._manager_graph = ManagerGraph(lambda: self._after_physics(with_drives=False), self._generator)
+            self._manager_graph = ManagerGraph(
+                lambda: self._after_physics(with_drives=False), self._generator, self._fusion()
+            )
 
     @property
     def max_episode_length_s(self) -> float:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager
+from typing import Any
 
 import torch
 
+from pace_envs.fused import Fusion
+
 _RUNS_BEFORE = 2
-"""Runs as they are before a capture: constants are copied to the GPU, and every tensor has found its place."""
+"""Runs before a capture: constants are copied to the GPU, every tensor has found its place, kernels are compiled."""
 
 
 class ManagerGraph:
@@ -17,14 +22,18 @@ class ManagerGraph:
     key, another capture.
     """
 
-    def __init__(self, function: Callable[[], dict[str, torch.Tensor]], generator: torch.Generator):
+    def __init__(
+        self, function: Callable[[], dict[str, torch.Tensor]], generator: torch.Generator, fusion: Fusion | None
+    ):
         """Keep the function.
 
         Args:
             function: Queues kernels on torch's current stream, and never waits for them.
             generator: Where it draws random numbers from.
+            fusion: Makes few kernels of it; ``None`` leaves it as it is.
         """
         self._function = function
+        self._fused: AbstractContextManager[Any] = contextlib.nullcontext() if fusion is None else fusion
         self._generator = generator
         self._results: dict[str, torch.Tensor] = {}
         self.clear()
@@ -52,11 +61,12 @@ class ManagerGraph:
             self._key, self._runs, self._graph = key, 0, None
         if self._graph is None and self._runs < _RUNS_BEFORE:
             self._runs += 1
-            return self._function()
+            with self._fused:
+                return self._function()
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
             self._graph.register_generator_state(self._generator)
-            with torch.cuda.graph(self._graph):
+            with torch.cuda.graph(self._graph, capture_error_mode="relaxed"), self._fused:
                 self._results = self._function()
         self._graph.replay()
         return {name: value.clone() for name, value in self._results.items()}

@@ -71,6 +71,10 @@ class SimulationCfg:
     graphs: bool = True
     """Whether drives and physics are replayed from CUDA graphs on a GPU; else every kernel is launched by itself."""
 
+    fused: bool = True
+    """Whether what is captured of drives and managers becomes a few kernels (:mod:`pace_envs.fused`); else each of
+    torch's operations is one."""
+
     class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None
     """What builds the simulation; ``None`` means :class:`Simulation`, or on a GPU ``WarpSimulation``."""
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import types
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
 
 from pace_actuators import PaceDCMotor
 from pace_actuators.effects import Effect
+from pace_envs.fused import Fusion
 
 _ROOTS = ("pace_actuators", "pace_envs")
 Key = tuple[tuple[str, Hashable], ...]
@@ -27,14 +30,18 @@ class StepGraphs:
     What the function reads and is not on these objects must stay where it is; whoever replaces it calls :meth:`clear`.
     """
 
-    def __init__(self, function: Callable[[], None], owners: Sequence[object], device: torch.device):
+    def __init__(
+        self, function: Callable[[], None], owners: Sequence[object], device: torch.device, fusion: Fusion | None = None
+    ):
         """Keep the function.
 
         Args:
             function: Queues kernels on torch's current stream, and never waits for them.
             owners: Objects whose attributes it reads and changes, with all that they hold.
             device: The GPU.
+            fusion: Makes few kernels of it; ``None`` leaves it as it is.
         """
+        self._fused: AbstractContextManager[Any] = contextlib.nullcontext() if fusion is None else fusion
         self._function = function
         self._owners = list(owners)
         self._device = device
@@ -67,8 +74,9 @@ class StepGraphs:
             graph = self._capture() if self._key in self._seen and self._key not in self._graphs else None
         if graph is None:
             self._seen.add(self._key)
-            self._function()
-            self._key = self._settle(after=True)
+            with self._fused:
+                self._function()
+                self._key = self._settle(after=True)
             self._expected = self._fingerprint()
             return
         graph.replay()
@@ -84,7 +92,7 @@ class StepGraphs:
         graph = torch.cuda.CUDAGraph()
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
-        with torch.cuda.graph(graph, pool=self._pool):
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="relaxed"), self._fused:
             self._function()
             self._settle(after=True)
         changes = self._changes(before)

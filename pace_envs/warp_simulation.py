@@ -14,6 +14,7 @@ import torch
 
 from pace_envs.constraint_counts import most_constraints, most_contacts
 from pace_envs.devices import find_device
+from pace_envs.fused import launch_pending
 from pace_envs.simulation import EnvIds, Simulation
 
 _INSTALL = 'pip install "pace-mujoco[gpu]"'
@@ -153,6 +154,7 @@ class WarpSimulation(Simulation):
 
     def _run(self, name: str) -> None:
         """Queue a step, a forward pass or the constants on torch's current stream."""
+        launch_pending()
         if self.device.type == "cpu" or not self.cfg.graphs:
             with self._on_stream():
                 self._call(name)

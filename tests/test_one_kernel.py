@@ -9,14 +9,12 @@ import torch
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
+from pace_envs.kernels import CannotCompileError, HostKernels, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.fitting.fits import fits_on
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.one_kernel import NotTraceableError
-from pace_optim.one_kernel.host import HostKernels, host_kernels
-from pace_optim.one_kernel.nvrtc import kernels_of
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STEPS = 80
@@ -197,12 +195,12 @@ def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_
             assert float(value) == 42.0
         folder = tmp_path / "pace" / "kernels"
         assert len(list(folder.iterdir())) == 1 and folder.stat().st_mode & 0o777 == 0o700
-        with pytest.raises(NotTraceableError):
+        with pytest.raises(CannotCompileError):
             kernels.compile(["this is no C"])
         assert len(list(folder.iterdir())) == 1
         other = source.replace("2.0", "3.0")
         kernels._compiled(other).write_bytes(b"damaged")
-        with pytest.raises(NotTraceableError):  # the drives themselves go on, and the next one compiles it again
+        with pytest.raises(CannotCompileError):  # the drives themselves go on, and the next one compiles it again
             kernels.compile([other])
         kernels.compile([other])
         assert len(list(folder.iterdir())) == 2

@@ -2,7 +2,7 @@
 
 Nothing is written twice. One control step of the same ``PaceDCMotor``, effects and ``TwinSimulation`` runs on symbols
 (``symbols``, ``operations``) in place of tensors; what they record (``tape``) is the program of one joint, which is
-written as C (``source``) and compiled for a GPU (``nvrtc``) or the processor (``host``). Numbers are float64, and
+written as C (``source``) and compiled for a GPU or the processor (``pace_envs.kernels``). Numbers are float64, and
 multiplications are not fused with additions.
 """
 

@@ -20,7 +20,7 @@ _WIDTH = 32
 
 
 class Compiler(Protocol):
-    """Compiles and launches kernels: see :class:`~pace_optim.one_kernel.nvrtc.Kernels`."""
+    """Compiles and launches kernels: see :class:`~pace_envs.kernels.Kernels`."""
 
     def compile(self, sources: Sequence[str]) -> None:
         """Compile those that are new."""

@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from pace_envs.kernels import CannotCompileError
+
 Kind = Literal["double", "bool", "int"]
 
 
-class NotTraceableError(Exception):
+class NotTraceableError(CannotCompileError):
     """Something was done to a symbol that a kernel cannot do."""
 
 

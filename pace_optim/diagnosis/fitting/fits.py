@@ -11,13 +11,12 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_envs.devices import find_device
+from pace_envs.kernels import host_kernels, kernels_of
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.fitting.levenberg_marquardt import TRIALS, LevenbergMarquardt
 from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
 from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.one_kernel.host import host_kernels
-from pace_optim.one_kernel.nvrtc import kernels_of
 from pace_optim.problem.forked import parallel_map
 from pace_optim.single_joint_model.problem import TwinProblem
 

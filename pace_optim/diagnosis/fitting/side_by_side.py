@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
+from pace_envs.kernels import CannotCompileError
 from pace_optim.diagnosis.model.model import BASE, JointModel
-from pace_optim.one_kernel import KernelRollout, NotTraceableError
+from pace_optim.one_kernel import KernelRollout
 from pace_optim.one_kernel.batch import Compiler
 from pace_optim.problem.rollout import Rollout
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -85,7 +86,7 @@ class SideBySide:
         steps = where.any(dim=1).nonzero()[:, 0][::stride]
         try:
             errors = self._errors(self._begin(physical, where), steps)
-        except NotTraceableError:  # what an effect of the user's does is nothing for a kernel
+        except CannotCompileError:  # what an effect of the user's does is nothing for a kernel
             self._kernels = None
             errors = self._errors(self._begin(physical, where), steps)
         errors *= where[steps][:, None, :, None].to(errors.device)

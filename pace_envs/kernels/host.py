@@ -15,15 +15,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from pace_optim.one_kernel.tape import NotTraceableError
+from pace_envs.kernels.arguments import Argument, as_argument
 
 _COMPILERS = ("c++", "g++", "clang++")
 _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
 """A multiplication and an addition are rounded one by one, as everywhere else."""
 _TEMPORARY: list[tempfile.TemporaryDirectory] = []
 """Folders of this process, removed at its end."""
+
+
+class CannotCompileError(RuntimeError):
+    """There is no kernel of something: it is done without one."""
 
 
 class HostKernels:
@@ -41,7 +43,7 @@ class HostKernels:
         """Compile those that are new, side by side.
 
         Raises:
-            NotTraceableError: If the compiler refuses one, or what it makes cannot be loaded.
+            CannotCompileError: If the compiler refuses one, or what it makes cannot be loaded.
         """
         new = [source for source in dict.fromkeys(sources) if source not in self._functions]
         if not new:
@@ -52,9 +54,9 @@ class HostKernels:
                     self._functions[source] = ctypes.CDLL(str(path)).simulate
                 except (OSError, AttributeError) as error:  # a folder from which nothing may run, a damaged file
                     path.unlink(missing_ok=True)
-                    raise NotTraceableError(f"{path}: {error}") from error
+                    raise CannotCompileError(f"{path}: {error}") from error
 
-    def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
+    def launch(self, source: str, threads: int, width: int, arguments: Sequence[Argument]) -> None:
         """Run a compiled kernel over all its joints.
 
         Args:
@@ -63,12 +65,7 @@ class HostKernels:
             width: Not used.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
-        self._functions[source](
-            *(
-                ctypes.c_void_p(each.data_ptr()) if isinstance(each, torch.Tensor) else ctypes.c_int(each)
-                for each in arguments
-            )
-        )
+        self._functions[source](*map(as_argument, arguments))
 
     def _compiled(self, source: str) -> Path:
         path = self._folder / f"{hashlib.sha256((self._key + source).encode()).hexdigest()}.so"
@@ -79,7 +76,7 @@ class HostKernels:
                 subprocess.run([*self._command, "-", "-o", str(begun)], input=source.encode(), check=True, stderr=-1)
                 os.replace(begun, path)  # whole or not at all: other processes may want the same
             except (OSError, subprocess.CalledProcessError) as error:
-                raise NotTraceableError(f"{self._command[0]}: {error}") from error
+                raise CannotCompileError(f"{self._command[0]}: {error}") from error
             finally:
                 begun.unlink(missing_ok=True)
         return path

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import torch
 
+from pace_envs.kernels.arguments import Argument, as_argument
+
 _OPTIONS = ("--fmad=false", "-default-device")
 """A multiplication and an addition are rounded one by one, as on a processor."""
 
@@ -37,7 +39,7 @@ class Kernels:
         for source, binary in zip(new, binaries, strict=True):
             self._functions[source] = self._loaded(binary)
 
-    def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
+    def launch(self, source: str, threads: int, width: int, arguments: Sequence[Argument]) -> None:
         """Queue a kernel on torch's current stream.
 
         Args:
@@ -46,10 +48,7 @@ class Kernels:
             width: Threads of a block.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
-        values = [
-            ctypes.c_void_p(each.data_ptr()) if isinstance(each, torch.Tensor) else ctypes.c_int(each)
-            for each in arguments
-        ]
+        values = [as_argument(each) for each in arguments]
         places = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
         blocks = -(-threads // width)
         stream = ctypes.c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
@@ -62,7 +61,8 @@ class Kernels:
     def _loaded(self, binary: bytes) -> ctypes.c_void_p:
         module, function = ctypes.c_void_p(), ctypes.c_void_p()
         with torch.cuda.device(self._device):
-            torch.cuda.current_stream().synchronize()  # torch makes its context current
+            if not torch.cuda.is_current_stream_capturing():
+                torch.cuda.current_stream().synchronize()  # torch makes its context current
             _check(_driver().cuModuleLoadData(ctypes.byref(module), binary), "loading a kernel")
         _check(_driver().cuModuleGetFunction(ctypes.byref(function), module, b"simulate"), "finding a kernel")
         self._kept.append(module)
