@@ -69,4 +69,12 @@ class ManagerGraph:
             with torch.cuda.graph(self._graph, capture_error_mode="relaxed"), self._fused:
                 self._results = self._function()
         self._graph.replay()
-        return {name: value.clone() for name, value in self._results.items()}
+        return self._copies()
+
+    def _copies(self) -> dict[str, torch.Tensor]:
+        """The results in memory of their own, by one kernel for each type."""
+        copies = {name: torch.empty_like(value) for name, value in self._results.items()}
+        for dtype in {value.dtype for value in copies.values()}:
+            names = [name for name, value in copies.items() if value.dtype == dtype]
+            torch._foreach_copy_([copies[name] for name in names], [self._results[name] for name in names])
+        return copies

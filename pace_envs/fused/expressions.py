@@ -63,10 +63,12 @@ SAME: dict[str, Callable[..., str]] = {
     "bitwise_and": _infix("&"),
     "bitwise_or": _infix("|"),
     "bitwise_xor": _infix("^"),
-    "addcmul": lambda a, b, c: f"({a} + {b} * {c})",
-    "lerp": lambda a, b, w: f"({w} < 0.5f ? {a} + {w} * ({b} - {a}) : {b} - ({b} - {a}) * (1 - {w}))",
+    "addcmul": lambda a, b, c: f"fused({b}, {c}, {a})",
+    "lerp": lambda a, b, w: (
+        f"({w} < 0.5f && {w} > -0.5f ? fused({w}, {b} - {a}, {a}) : fused({a} - {b}, 1 - {w}, {b}))"
+    ),
 }
-"""Of values of the result's type."""
+"""Of values of the result's type; ``fused(a, b, c)`` is a b + c, rounded once on a GPU, as torch's kernels there do."""
 
 COMPARED: dict[str, Callable[..., str]] = {
     "gt": _infix(">"),
@@ -114,11 +116,14 @@ def element(name: str, arguments: list[Any], options: dict[str, Any], kind: torc
         return arguments[: 1 if name == "logical_not" else 2], COMPARED[name], True
     if name in ("add", "sub", "rsub"):
         alpha = arguments[2] if len(arguments) > 2 else options.get("alpha", 1)
-        factor = "" if alpha == 1 else f"{literal(alpha, c)} * "
+        signed = literal(alpha if name == "add" else -alpha, c)
+        exact = alpha != 1 and kind.is_floating_point
         sign = "+" if name == "add" else "-"
         if name == "rsub":
-            return arguments[:2], lambda a, b: f"({b} - {factor}{a})", False
-        return arguments[:2], lambda a, b: f"({a} {sign} {factor}{b})", False
+            return (arguments[:2], lambda a, b: f"({b} - {a})", False) if alpha == 1 else None
+        if exact:
+            return arguments[:2], lambda a, b: f"fused({signed}, {b}, {a})", False
+        return (arguments[:2], lambda a, b: f"({a} {sign} {b})", False) if alpha == 1 else None
     if name == "abs":
         return arguments[:1], (lambda a: f"fabs({a})" if kind.is_floating_point else f"({a} < 0 ? -{a} : {a})"), False
     if name == "_to_copy":
