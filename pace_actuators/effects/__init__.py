@@ -16,7 +16,7 @@ from pace_actuators.effects import (
     two_mass,
 )
 from pace_actuators.effects.drive_state import DriveState
-from pace_actuators.effects.effect import Effect, EffectParameter, probe_points
+from pace_actuators.effects.effect import PROBED_EFFORT, Effect, EffectParameter, probe_points
 from pace_actuators.effects.effect_cfg import SHARED, WIDE, EffectCfg, effect_cfgs
 from pace_actuators.effects.registry import (
     available_effects,
@@ -29,6 +29,7 @@ from pace_actuators.effects.registry import (
 from pace_actuators.effects.stack import EffectStack
 
 __all__ = [
+    "PROBED_EFFORT",
     "SHARED",
     "WIDE",
     "DriveState",

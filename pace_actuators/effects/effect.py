@@ -318,6 +318,10 @@ class Effect:
                 raise ValueError(f"A probe of the effect {cls.name!r} names {unknown[0]!r}, which is no parameter.")
 
 
+PROBED_EFFORT = 5.0
+"""Torque of the drives that probes in N m are meant for [N m]; on smaller drives they are taken smaller."""
+
+
 def probe_points(effect: type[Effect]) -> list[dict[str, float]]:
     """The complete parameter values at which a screening looks at an effect."""
     start = {parameter.name: parameter.start for parameter in effect.parameters}

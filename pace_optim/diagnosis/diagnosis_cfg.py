@@ -24,8 +24,6 @@ class FittingCfg:
     was found, and a trimmed fit are made again as often at most."""
     again: int = 6
     """Iterations where refits begin, and of a model that was changed or moves along a new reference."""
-    behind: float = 2.0
-    """RMSE, as a multiple of the best model's, from which a model is not worth the finer step."""
     narrow: float = 1e-4
     """Normalised step of the derivatives."""
     wide: tuple[float, ...] = (3e-2, 1e-2)
@@ -80,14 +78,10 @@ class CandidatesCfg:
     """With less than this part of an effect's amplitude left beside a base parameter, that one absorbs it."""
     seen_step: float = 0.1
     """Normalised step of that parameter: joints that stick make the error rough, and a narrow step sees that."""
-    usual_effort: float = 5.0
-    """Torque for which the probes' torques are meant [N m]; they are smaller on smaller drives."""
     multiple: tuple[float, float] = (0.2, 20.0)
     """A refit starts at the best multiple of a probe, between these."""
     frictions: tuple[float, ...] = (-0.9, -0.5)
     """Normalised armature and friction that far starts begin with too, with a quarter of the delay."""
-    points: int = 12
-    """Of an effect with more probes than this far starts look at some."""
     independent_s: float = 0.4
     """Errors of a wrong model that are further apart than this count as independent [s]."""
 
@@ -122,8 +116,8 @@ class JudgingCfg:
     """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
-    to this ratio apart, a window is an outlier above this many times the median, and predictions part clearly above
-    this many times the noise."""
+    to this ratio apart, a model is not worth the finer step above this many times the best one's RMSE, a window is an
+    outlier above this many times the median, and predictions part clearly above this many times the noise."""
     in_place: int = 3
     """So many of those that came near are tried in place of a joint's effects."""
 

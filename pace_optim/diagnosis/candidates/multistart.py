@@ -37,9 +37,7 @@ def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequenc
     bases = _bases(now, cfg.candidates.frictions)
     slots, values = [], []
     for effect in effects:
-        points = probe_points(effect)
-        points = points[:: -(-len(points) // cfg.candidates.points)]
-        own = [start_values(effect, point).repeat(now.model.num_joints, 1) for point in points]
+        own = [start_values(effect, point).repeat(now.model.num_joints, 1) for point in probe_points(effect)]
         may = now.model.allowed_joints(effect)
         tried = [now.model.extended(base, effect, may, each) for base in bases for each in own]
         slots.append(Slot(model=tried[0][0], rows=len(tried)))

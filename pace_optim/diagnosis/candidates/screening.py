@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from pace_actuators.effects import Effect, probe_points
+from pace_actuators.effects import PROBED_EFFORT, Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.fitting.side_by_side import Slot
@@ -122,18 +122,17 @@ def simulated_probes(
     ``beside``, (b, n, P) normalised, are more values of the model itself; what those change comes first.
     """
     model, physical = now.model, now.physical
-    stride, usual = fits.cfg.fitting.stride, fits.cfg.candidates.usual_effort
     own = now.x[None] if beside is None else torch.cat([now.x[None], beside])
     slots, values = [Slot(model=model, rows=len(own))], [model.to_physical(own)]
     probes: list[tuple[type[Effect], torch.Tensor]] = []
     for effect in effects:
-        points = [_probe_values(effect, point, effort / usual) for point in probe_points(effect)]
+        points = [_probe_values(effect, point, effort / PROBED_EFFORT) for point in probe_points(effect)]
         extended = [model.extended(physical, effect, model.allowed_joints(effect), each) for each in points]
         slots.append(Slot(model=extended[0][0], rows=len(points)))
         values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
     batch = fits.batch(problem, slots, training=True)
-    errors = batch.simulate(values, batch.dataset.train, stride).cpu()
+    errors = batch.simulate(values, batch.dataset.train, fits.cfg.fitting.stride).cpu()
     return probes, errors[1:] - errors[:1], batch.dataset.train
 
 

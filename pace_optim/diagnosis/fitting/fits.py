@@ -207,7 +207,7 @@ class Fits:
     def _near(self, models: Sequence[Fitted]) -> list[bool]:
         """Which models are near the best one on some joint."""
         scores = torch.stack([each.score for each in models])
-        return (scores <= self.cfg.fitting.behind**2 * scores.amin(dim=0)).any(dim=1).tolist()
+        return (scores <= self.cfg.judging.far**2 * scores.amin(dim=0)).any(dim=1).tolist()
 
 
 def _again(
