@@ -121,9 +121,7 @@ def run_case(job: Job) -> dict[str, Any]:
     middle = problem.space.to_physical(problem.space.start)
     decisions: list[Decision] = []
     fits = job.fits
-    found = search_effects(
-        problem, middle, candidate_effects(), job.max_effects, cfg=fits.cfg, log=decisions.append, fits=fits
-    )
+    found = search_effects(problem, middle, candidate_effects(), job.max_effects, log=decisions.append, fits=fits)
     diagnosed = time.perf_counter()
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     job.folder.with_name(f"{job.case.name}.jsonl").write_bytes(as_lines(decisions))

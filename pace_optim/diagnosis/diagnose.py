@@ -85,11 +85,27 @@ def diagnose(
         settings.max_effects,
         progress.say,
         result,
-        cfg=settings.cfg,
         log=decisions.append,
         fits=fits,
     )
-    diagnosis = Diagnosis(
+    diagnosis = _told(found, fits, problem, result, folder, candidates)
+    diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
+    _save(diagnosis, decisions)
+    progress.close()
+    on_verdict(diagnosis)
+    explains = found.verdict == "effect" or bool(found.free_form)
+    refit = explains if settings.refit is None else settings.refit
+    if refit and found.paying and (path := _refit(found, problem, run, diagnosis, progress)) is not None:
+        diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
+        _save(diagnosis, decisions)
+    return diagnosis
+
+
+def _told(
+    found: Findings, fits: Fits, problem: Problem, run: FitResult, folder: Path, candidates: Sequence[type[Effect]]
+) -> Diagnosis:
+    """What was found, in the words and tables of ``diagnosis.json``."""
+    return Diagnosis(
         run=str(folder),
         verdict=found.verdict,
         summary=summary_of(found, problem),
@@ -102,26 +118,16 @@ def diagnose(
         sizes=sizes(fits, found.outcome, problem.joint_names),
         likes=likes(found.outcome),
         joints=by_joint(found, problem),
-        data=[*found.data.sentences, *_about_run(found, problem, result)],
+        data=[*found.data.sentences, *_about_run(found, problem, run)],
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
         advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         runs=[str(folder)],
         tried=[effect.name for effect in candidates],
-        physics_dt=physics_dt,
+        physics_dt=problem.physics_dt,
         ladder=ladder(found),
-        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=settings.cfg.verdict),
-        cfg=json.loads(json_text(asdict(settings.cfg))),
-        wall_time_s=time.monotonic() - begin,
+        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=fits.cfg.verdict),
+        cfg=json.loads(json_text(asdict(fits.cfg))),
     )
-    _save(diagnosis, decisions)
-    progress.close()
-    on_verdict(diagnosis)
-    explains = found.verdict == "effect" or bool(found.free_form)
-    refit = explains if settings.refit is None else settings.refit
-    if refit and found.paying and (path := _refit(found, problem, run, diagnosis, progress)) is not None:
-        diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
-        _save(diagnosis, decisions)
-    return diagnosis
 
 
 def _save(diagnosis: Diagnosis, decisions: Sequence[Decision]) -> None:
@@ -224,7 +230,6 @@ def search_effects(
     say: Callable[[str], None] = lambda _: None,
     run: FitResult | None = None,
     *,
-    cfg: DiagnosisCfg | None = None,
     log: Log = unlogged,
     fits: Fits | None = None,
 ) -> Findings:
@@ -237,15 +242,14 @@ def search_effects(
         max_effects: Most effects of a joint.
         say: Shows how far it is.
         run: The whole robot's own fit, if there is one.
-        cfg: Its numbers.
         log: Gets every decision.
-        fits: Fits models; ``None``: as on the processor.
+        fits: Fits models, by its numbers; ``None``: on the processor, as shipped.
 
     Raises:
         ValueError: If the validation recordings are too short to judge by.
     """
-    cfg = cfg or DiagnosisCfg()
-    fits = fits or fits_on("cpu", cfg)
+    fits = fits or fits_on("cpu", DiagnosisCfg())
+    cfg = fits.cfg
     check_long_enough(problem.dataset.validation, problem.control_dt, cfg=cfg.judging)
     twins, base, effort = fit_base(fits, problem, physical, candidates, say)
     data = check_data(fits, problem, twins, base, run)
