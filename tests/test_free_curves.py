@@ -102,7 +102,7 @@ def curves(fitted):
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
-    joint = error_map(curves, ["servo"], curves.base_errors)["servo"]
+    joint = error_map(curves, ["servo"], curves.errors[0])["servo"]
     assert joint["best"] == "friction_over_position" and joint["best_label"] == "position [rad]"
     others = [part for name, part in joint["explained"].items() if name != joint["best"]]
     assert joint["explained"]["friction_over_position"] > 0.9 and max(others) < 0.5
@@ -178,7 +178,6 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         effects=[curve],
         models=[Fitted.start(*with_curve)],
         errors=[errors_of(6e-3, 2e-4, 2.9e-3, 1e-4)],
-        base_errors=outcome.base_errors,
         explained=torch.tensor([[0.0, 0.996, 0.2, 0.0]]),
         instead=four == 1,
     )
@@ -207,12 +206,12 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
     advice = advise(robot, found.outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
-    told = error_map(curves, robot.joint_names, curves.base_errors)
+    told = error_map(curves, robot.joint_names, curves.errors[0])
     assert list(told) == ["b", "c"]
     first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
     assert first == pytest.approx(CALM["friction"])
     curves.explained[0, 2] = 0.05
-    weak = error_map(curves, robot.joint_names, curves.base_errors)["c"]
+    weak = error_map(curves, robot.joint_names, curves.errors[0])["c"]
     assert weak["curve"] is None and weak["sentence"].startswith("no curve")
     assert last == pytest.approx(CALM["friction"] + 0.1 + 0.1 * CALM["viscous_friction"])
 

@@ -77,15 +77,12 @@ def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) ->
         for pair, choices, own in zip(pairs, menus, apart, strict=True)
         for choice, each in zip(choices, own.tolist(), strict=True)
     ]
-    result = []
     clear = [each for each in predictions if each.times >= outcome.cfg.judging.far]
-    while clear:
-        best = _most_telling(clear)
+    result, left = [], pairs
+    while best := _most_telling([each for each in clear if each.pair in left]):
         result.append(_sentence(best, problem))
-        told = [each.pair for each in best]
-        clear = [each for each in clear if each.pair not in told]
-    seen = [each.pair for each in predictions if each.times >= outcome.cfg.judging.far]
-    for pair in [pair for pair in pairs if pair not in seen]:
+        left = [pair for pair in left if pair not in [each.pair for each in best]]
+    for pair in left:
         count = sum(each.pair is pair for each in predictions)
         text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
         result.append(f"{text} {_hint(pair)}".rstrip())
@@ -97,7 +94,7 @@ def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
     by_recording: dict[str, list[Prediction]] = {}
     for each in clear:
         by_recording.setdefault(each.choice.arguments + each.choice.words, []).append(each)
-    return max(by_recording.values(), key=lambda own: (len(own), min(each.times for each in own)))
+    return max(by_recording.values(), key=lambda own: (len(own), min(each.times for each in own)), default=[])
 
 
 def _sentence(told: Sequence[Prediction], problem: Problem) -> str:

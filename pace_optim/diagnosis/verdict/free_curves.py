@@ -34,8 +34,6 @@ class Curves:
     """The base model with each, of all joints."""
     errors: list[BlockErrors]
     """Of all joints."""
-    base_errors: BlockErrors
-    """Of the base model, fitted along the same motion."""
     explained: torch.Tensor
     """Part of a joint's squared error above the floor that each explains, (curves, n)."""
     instead: torch.Tensor
@@ -95,7 +93,6 @@ def fit_curves(
         effects=effects,
         models=models[1:],
         errors=errors[1:],
-        base_errors=errors[0],
         explained=explained,
         instead=instead,
     )
