@@ -16,13 +16,15 @@ GENERATIONS = 3
 
 
 def main() -> None:
-    """Search, and print all scores; the rank named by LOSE ends without a word after the first generation."""
+    """Search, and print all scores and where it is; the rank named by LOSE ends without a word after a generation."""
     torch.set_num_threads(1)
     processes, _ = join("cpu")
-    problem = load_problem("Pace-TestBench-v0")
+    problem = load_problem(sys.argv[1] if len(sys.argv) > 1 else "Pace-TestBench-v0")
     evaluator = problem.training_evaluator()
     where = evaluator.dataset.beginning(0.1)
-    optimizer = CMAESOptimizer(problem.space, 9, problem.env_cfg.sim2real.cmaes, processes=processes)
+    optimizer = CMAESOptimizer(
+        problem.space, 9, problem.env_cfg.sim2real.cmaes, trees=problem.trees, processes=processes
+    )
 
     def after_generation(_: CMAESOptimizer) -> None:
         if os.environ.get("LOSE") == str(processes.rank):
@@ -32,7 +34,8 @@ def main() -> None:
 
     evaluator.dataset = replace(evaluator.dataset, train=where)
     search(optimizer, evaluator.rollout(optimizer.num_shown), after_generation)
-    print([scores.tolist() for scores in optimizer.history])
+    where_it_is = [each.tolist() for each in (optimizer.best, optimizer.mean, optimizer.spread)]
+    print([[scores.tolist() for scores in optimizer.history], where_it_is, optimizer.best_scores])
 
 
 if __name__ == "__main__":

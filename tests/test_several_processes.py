@@ -37,6 +37,11 @@ def test_one_process_alone_keeps_its_scores():
     assert Processes().agree("x") == "x"
 
 
+def test_pieces_of_work_go_round_the_processes():
+    owners = [[Processes(rank, 3).owns(number) for rank in range(3)].index(True) for number in range(7)]
+    assert owners == [0, 1, 2, 0, 1, 2, 0] and Processes().exchange(["a", "b"]) == ["a", "b"]
+
+
 def _start(count: int, *command: str, **environ: str) -> list[subprocess.Popen[str]]:
     """One process per rank, as torchrun would start them."""
     with socket.socket() as free:
@@ -70,6 +75,14 @@ def test_two_processes_score_what_one_scores():
     texts = _texts(processes)
     alone, first, second = (ast.literal_eval(text.strip().splitlines()[-1]) for text in texts)
     assert alone == first == second
+
+
+@pytest.mark.slow
+def test_processes_that_share_four_strategies_search_as_one_does_with_all():
+    """Each does the arithmetic of its own legs' strategies; of four, three processes have two, one and one."""
+    texts = _texts([*_start(1, SEARCH, "Pace-AnymalD-v0"), *_start(3, SEARCH, "Pace-AnymalD-v0")])
+    alone, *shared = (ast.literal_eval(text.strip().splitlines()[-1]) for text in texts)
+    assert len(alone[0][0][0]) == 4 and shared == [alone] * 3
 
 
 @pytest.mark.slow

@@ -66,7 +66,8 @@ class CMAESOptimizer:
             seed: Seed of the search.
             start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
             criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
-            processes: Who shares the candidates: each process has the same strategies, and simulates its part.
+            processes: Who shares the search: each process simulates its part of the candidates, and does the
+                arithmetic of its own strategies; the others' candidates and states come from them.
 
         Raises:
             ValueError: If the population is too small.
@@ -78,7 +79,7 @@ class CMAESOptimizer:
             )
         self.space = space
         self.cfg = cfg
-        self.processes = processes or Processes()
+        self.processes = self._doers = processes or Processes()
         self.population_size = population_size
         self._shown_here = self.num_shown
         self.generation = 0
@@ -128,7 +129,10 @@ class CMAESOptimizer:
         if self._line is None and self._consensus is None and self._ready_for_consensus():
             self._line = self._consensus_line()
             self.line_generation = self.generation
-        self._asked = [s.ask() for s in self.strategies] if self._line is None else []
+        self._asked: list[np.ndarray] = []
+        if self._line is None:
+            own = [s.ask() if self._doers.owns(g) else None for g, s in enumerate(self.strategies)]
+            self._asked = self._doers.exchange(own)
         shown = []
         for g, strategy in enumerate(self.strategies):
             if self._line is not None or strategy.stop_reason:
@@ -284,7 +288,7 @@ class CMAESOptimizer:
         Raises:
             ValueError: If the history does not fit.
         """
-        self._planned_line = line_generation
+        self._planned_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
         for scores in history:
             if scores.shape != (self.population_size, len(self.strategies)):
                 raise ValueError(
@@ -296,6 +300,7 @@ class CMAESOptimizer:
             self._learn(np.asarray(scores))
             if after_generation is not None:
                 after_generation(self)
+        self._doers = self.processes
 
     # ------------------------------------------------------------------ inside
 
@@ -319,9 +324,13 @@ class CMAESOptimizer:
                 strategy.best_x[self._positions(strategy)] = self._consensus
                 strategy.best_score = float(scores[winner, g])
             return
-        for g, strategy in enumerate(self.strategies):
-            if not strategy.stop_reason:
-                strategy.tell(scores[:, g], self._shown[g])
+        going = [g for g, strategy in enumerate(self.strategies) if not strategy.stop_reason]
+        for g in going:
+            if self._doers.owns(g):
+                self.strategies[g].tell(scores[:, g], self._shown[g])
+        states = self._doers.exchange([strategy.state for strategy in self.strategies])
+        for g in going:
+            self.strategies[g].state = states[g]
 
     def _ready_for_consensus(self) -> bool:
         """Whether all trees know their shared parameters well, or time is running out."""

@@ -21,11 +21,22 @@ DIVERGED_SCORE = 1e6
 """The score of a simulation that is not finite [rad²]."""
 
 
+State = tuple[np.ndarray, float, str | None, np.ndarray, np.ndarray]
+
+
 class TreeStrategy:
     """pycma's strategy with its own random numbers, its best candidate and its reasons to stop.
 
     pycma brings candidates into their bounds one by one, which takes longer than their simulation on a GPU. So its
     strategy is told of no bounds here, and a generation is brought into them at once: the candidates are the same.
+
+    Attributes:
+        best_x: The best candidate, normalised, (len(entries),).
+        best_score: Its score [rad²].
+        best_scores: The best score after each generation [rad²].
+        stop_reason: Why it has stopped; ``None`` while it goes on.
+        mean: Of the search distribution, normalised, inside the bounds.
+        spread: Standard deviation of the search distribution, normalised.
     """
 
     def __init__(
@@ -50,10 +61,6 @@ class TreeStrategy:
         """
         self.entries = np.asarray(entries)
         self.criteria = tuple(criteria)
-        self.best_x = np.array(start, dtype=float)
-        self.best_score = np.inf
-        self.best_scores: list[float] = []
-        self.stop_reason: str | None = None
         generator = np.random.default_rng(seed)
         options = {
             "maxstd": _MAXSTD,
@@ -70,16 +77,25 @@ class TreeStrategy:
             warnings.simplefilter("ignore")
             unbounded = BoundTransform([-1.0, 1.0]).inverse(list(start))
             self._strategy = cma.CMAEvolutionStrategy(unbounded, sigma, options)
+        self.best_x = np.array(start, dtype=float)
+        self.best_score = np.inf
+        self.best_scores: list[float] = []
+        self.stop_reason: str | None = None
+        self._look()
+
+    def _look(self) -> None:
+        """Keep what pycma knows of its distribution."""
+        self.mean = into_unit_box(self._strategy.mean)
+        self.spread = np.array(self._strategy.stds)
 
     @property
-    def mean(self) -> np.ndarray:
-        """Mean of the search distribution, normalised, inside the bounds."""
-        return into_unit_box(self._strategy.mean)
+    def state(self) -> State:
+        """What others read of it: another process may have done its arithmetic."""
+        return self.best_x, self.best_score, self.stop_reason, self.mean, self.spread
 
-    @property
-    def spread(self) -> np.ndarray:
-        """Standard deviation of the search distribution, normalised."""
-        return np.asarray(self._strategy.stds)
+    @state.setter
+    def state(self, state: State) -> None:
+        self.best_x, self.best_score, self.stop_reason, self.mean, self.spread = state
 
     def ask(self) -> np.ndarray:
         """Candidates of the next generation, normalised, (population_size, len(entries))."""
@@ -96,6 +112,7 @@ class TreeStrategy:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of its clock, which its own ask would have started
             self._strategy.tell(list(self._asked), scores, check_points=False)  # they are its own: none is clipped
+        self._look()
         i = int(scores.argmin())
         if scores[i] < self.best_score:
             self.best_score, self.best_x = float(scores[i]), shown[i].copy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
@@ -33,6 +33,23 @@ class Processes:
     def share(self, size: int) -> slice:
         """This process's part of so many candidates; parts differ by one at most."""
         return slice(size * self.rank // self.count, size * (self.rank + 1) // self.count)
+
+    def owns(self, number: int) -> bool:
+        """Whether this process does the piece of work of that number: they go round the processes."""
+        return number % self.count == self.rank
+
+    def exchange(self, pieces: Sequence[Any]) -> list[Any]:
+        """All pieces, each from the process that owns its number.
+
+        Raises:
+            ValueError: If another process is lost.
+        """
+        if self.count == 1:
+            return list(pieces)
+        own = [piece if self.owns(number) else None for number, piece in enumerate(pieces)]
+        every: list[Any] = [None] * self.count
+        _together(lambda: dist.all_gather_object(every, own))
+        return [every[number % self.count][number] for number in range(len(own))]
 
     def gather(self, mine: torch.Tensor, size: int) -> torch.Tensor:
         """All rows (size, ...) of which each process has its share.
