@@ -99,6 +99,18 @@ class Plant:
         return result if all(kp > 0 for *_, kp, _ in result) else []  # motors: the loop is somebody else's
 
 
+def effort_limits(plant: Plant) -> np.ndarray:
+    """Largest torque of each driven joint by its own range or its motor's, (n,) [N m]."""
+    model = plant.model
+    joints = model.dof_jntid[plant.dofs]
+    limits = np.where(model.jnt_actfrclimited[joints], model.jnt_actfrcrange[joints, 1], np.inf)
+    for i in range(model.nu):
+        if model.actuator_ctrllimited[i] and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
+            most = model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i, 1] * abs(model.actuator_gear[i, 0])
+            limits[joints == model.actuator_trnid[i, 0]] = most
+    return limits
+
+
 def home_of(full: mujoco.MjModel, model: mujoco.MjModel) -> np.ndarray:
     """The home keyframe's posture (or the first one's, or the middle of ranges without 0) in the model without base."""
     names = [full.key(k).name for k in range(full.nkey)]
@@ -195,7 +207,7 @@ def simulate(
     model.dof_frictionloss[dofs] = truth.friction
     hit = np.array([name in truth.hidden_on for name in truth.joints])
     span = np.ptp(target, axis=0) / 2
-    dt = model.opt.timestep
+    dt, limit = model.opt.timestep, effort_limits(plant)
     data.qpos[:] = plant.home
     positions = np.zeros_like(target)
     total = round((SETTLE + len(target) * CONTROL_DT) / dt)
@@ -210,7 +222,7 @@ def simulate(
                 positions[k] = shown
             if not own:
                 late = max(0, int(np.floor((k * CONTROL_DT - LATE) / CONTROL_DT + 1e-6)))
-                torque = kp * (target[late] - shown) - kd * data.qvel[dofs]
+                torque = np.clip(kp * (target[late] - shown) - kd * data.qvel[dofs], -limit, limit)
             k += 1
         arrived = min(len(target) - 1, max(0, int(np.floor((now - LATE) / CONTROL_DT + 1e-6))))
         extra = hidden_torque(truth, hit, data.qvel[dofs], kp * span)
