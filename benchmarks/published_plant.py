@@ -136,7 +136,7 @@ def draw_truth(plant: Plant, joints: tuple[str, ...], kp: np.ndarray, amplitude:
         joints=joints,
         armature=rng.uniform(0.7, 1.5, n) * np.where(armature > 0, armature, rotor(plant)),
         viscous_friction=rng.uniform(0.7, 1.5, n) * np.where(damping > 0, damping, 0.1 * critical),
-        friction=rng.uniform(0.05, 0.15, n) * kp * amplitude,
+        friction=rng.uniform(0.05, 0.15, n) * np.minimum(kp * amplitude, effort_limits(plant)),
         encoder_bias=rng.uniform(-1, 1, n) * np.where(slide, 0.001, 0.02),
     )
 

@@ -21,7 +21,7 @@ BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
 CURE = "Fit again."
 
 _LONGEST = 100.0
-"""Between two control steps [s]: of no drive, and so that numbers of steps are numbers."""
+"""Delay, and time between two control steps [s]: of no drive, and so that numbers of steps are numbers."""
 
 
 @dataclass(kw_only=True)
@@ -83,8 +83,8 @@ class DriveResult:
             for key, value in self.parameters[name].items():
                 if value < 0:
                     refuse(source, f"{name} of {key} is {value:g}, expected at least 0", CURE)
-        if self.delay_s < 0:
-            refuse(source, f"delay_s is {self.delay_s:g}, expected at least 0 [s]", CURE)
+        if not 0 <= self.delay_s <= _LONGEST:
+            refuse(source, f"delay_s is {self.delay_s:g}, expected 0 to {_LONGEST:g} [s]", CURE)
         if not 1e-9 < self.physics_dt <= self.control_dt * (1 + 1e-6) <= _LONGEST:
             refuse(
                 source,

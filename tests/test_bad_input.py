@@ -234,6 +234,7 @@ def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, 
         ("control_dt", 1e308, "control_dt 1e+308"),
         ("physics_dt", 0.1, "the first no longer than the second"),
         ("delay_s", -1.0, "delay_s is -1"),
+        ("delay_s", 1e308, "delay_s is 1e+308"),
         ("parameters/friction", {"all": -1.0}, "friction of all is -1"),
     ],
 )

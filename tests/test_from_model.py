@@ -191,6 +191,13 @@ def test_a_urdfs_limit_that_is_no_number_is_told_with_its_joint(tmp_path, key, t
         cfg_of(tmp_path, urdf, "robot.urdf")
 
 
+def test_the_loop_around_motors_is_somebody_elses(tmp_path):
+    actuators = "".join(f'<motor joint="{name}"/>' for name in ("arm/shoulder", "elbow (left)", "rail"))
+    motors = re.sub("<actuator>.*</actuator>", f"<actuator>{actuators}</actuator>", ARM, flags=re.DOTALL)
+    cfg = cfg_of(tmp_path, motors)
+    assert drive_of(cfg).stiffness == [0.0, 0.0, 0.0] and not drive_of(cfg).implicit and cfg.sim.integrator == "rk4"
+
+
 def test_ranges_that_seem_to_be_radians_read_as_degrees_are_noted(tmp_path):
     said = [note for note in cfg_of(tmp_path, ARM.replace(' angle="radian"', "")).sim2real.notes if "degrees" in note]
     assert said and said[0].startswith("ranges: 3 degrees wide") and '<compiler angle="radian"/>' in said[0]

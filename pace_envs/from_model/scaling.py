@@ -46,10 +46,10 @@ def gains(joint: JointFacts) -> tuple[float, float]:
 def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel) -> bool:
     """Whether the drives' loops are those of the file's actuators, which MuJoCo evaluates at every step.
 
-    Loops are held at the control rate, as in PACE, where the file has no gains, or gains with a damping that is stable
-    there and that the file's own integrator treats explicitly too.
+    Loops are held at the control rate, as in PACE, where the file has no gains (no actuators, or motors), or gains with
+    a damping that is stable there and that the file's own integrator treats explicitly too.
     """
-    if any(joint.drive is None for joint in joints):
+    if any(joint.drive is None or joint.drive.kind == "effort" for joint in joints):
         return False
     implicit = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     if int(model.opt.integrator) in implicit or not any(gains(joint)[1] for joint in joints):
