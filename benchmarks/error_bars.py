@@ -32,7 +32,7 @@ def one_seed(problem: Problem, seed: int, noise: float, bits: int) -> tuple[np.n
     truth = seeded.space.from_dict(seeded.env_cfg.sim2real.sample_params)
     # every start ends in the same minimum; this one saves iterations
     best = least_squares(evaluator, colouring, [seeded.space.to_normalised(truth)])[0]
-    uncertainty, _ = assess(seeded, evaluator, colouring, best.x)
+    uncertainty = assess(seeded, evaluator, colouring, best.x).uncertainty
     return (seeded.space.to_physical(best.x) - truth).numpy(), uncertainty.std
 
 

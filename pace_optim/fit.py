@@ -15,7 +15,7 @@ from pace_envs import load_env_cfg
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.jacobian import Jacobian, colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.other_starts import other_valleys, scattered
 from pace_optim.optimizers.refine import BEGINNING, COARSE, refine
@@ -430,12 +430,12 @@ class _Fit:
             return self.optimizer.best
         return self.problem.space.start
 
-    def _check_consistency(self, outcome: Outcome, score: float) -> Consistency:
+    def _check_consistency(self, outcome: Outcome, score: float, there: Jacobian) -> Consistency:
         """Fit each recording alone, where there are several and the optimizer can afford it."""
         wanted = self.settings.check_consistency and self.settings.optimizer != "cmaes"
         if not wanted or outcome.stop_reasons == ["interrupted"]:
             return Consistency()
-        result = check_consistency(self.problem, outcome.x, score, self.progress.say)
+        result = check_consistency(self.problem, outcome.x, score, self.progress.say, there)
         if result.recordings:
             self.folder.write_json("consistency.json", asdict(result))
         return result
@@ -443,7 +443,8 @@ class _Fit:
     def _assess(self, outcome: Outcome) -> FitResult:
         """Simulate the result once more on everything, with its derivatives, and write it down."""
         problem, space, data = self.problem, self.problem.space, self.problem.dataset
-        uncertainty, every = assess(problem, self.assessor, self.colouring, outcome.x)
+        known = assess(problem, self.assessor, self.colouring, outcome.x)
+        uncertainty, every = known.uncertainty, known.residuals
         self._refuse_divergence(float(every.score[0]))
         train = rmse_by_joint(every, data.train[every.step], problem.joint_names)["all"]
         times = times_noise(problem, train)
@@ -453,14 +454,14 @@ class _Fit:
             refit = outcome.stop_reasons != ["interrupted"]
             x, left_open = held_at_prior(problem, outcome.x, uncertainty, left_open, _NEAR if refit else None)
             outcome = replace(outcome, x=x)
-            uncertainty, every = assess(problem, self.assessor, self.colouring, x)
-            uncertainty = without(uncertainty, left_open, space)
+            known = assess(problem, self.assessor, self.colouring, x)
+            uncertainty, every = without(known.uncertainty, left_open, space), known.residuals
         if not far and outcome.stop_reasons != ["interrupted"]:
             none = without_delay(problem, outcome.x, uncertainty, left_open, _NEAR)
             if none is not None:
                 outcome = replace(outcome, x=none)
-                uncertainty, every = assess(problem, self.assessor, self.colouring, none)
-                uncertainty = without(uncertainty, [*left_open, DELAY], space)
+                known = assess(problem, self.assessor, self.colouring, none)
+                uncertainty, every = without(known.uncertainty, [*left_open, DELAY], space), known.residuals
         uncertainty = with_other_solutions(uncertainty, self.descents, space)
         physical = space.to_physical(outcome.x)
         where = {"train": data.train[every.step], "validation": data.validation[every.step]}
@@ -469,7 +470,7 @@ class _Fit:
         bias = physical[space["encoder_bias"]].numpy()
         self.folder.write_json("drives.json", drive_loads(problem, self.assessor, bias))
         score = float(every.error[0].square()[where["train"]].sum(dim=1).mean())
-        consistency = self._check_consistency(outcome, score)
+        consistency = self._check_consistency(outcome, score, known.jacobian)
         result = make_result(
             problem,
             outcome.x,

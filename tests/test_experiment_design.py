@@ -71,7 +71,7 @@ def fitted(recording, start=None):
     problem = make_problem(recording)
     evaluator, colouring = problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names)
     x = least_squares(evaluator, colouring, [normalised(problem, NEAR) if start is None else start])[0].x
-    uncertainty, _ = assess(problem, evaluator, colouring, x)
+    uncertainty = assess(problem, evaluator, colouring, x).uncertainty
     width = (problem.space.upper - problem.space.lower).numpy()
     return problem.space.to_physical(x).numpy(), uncertainty, width
 

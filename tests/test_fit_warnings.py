@@ -152,7 +152,7 @@ def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
     problem = make_problem(record(truth={**TRUTH, "friction": 0.0}, noise=1e-4))
     x = normalised(problem, {**TRUTH, "friction": 0.0})
     evaluator, colouring = problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names)
-    uncertainty, _ = assess(problem, evaluator, colouring, x)
+    uncertainty = assess(problem, evaluator, colouring, x).uncertainty
     told = fit_warnings(problem, problem.space.to_physical(x), uncertainty, FINE)
     assert len(told) == 1 and told[0].startswith("friction is at its lower bound (0 N m) on servo")
 

@@ -21,9 +21,9 @@ DOWNSTREAM = {
 FLOORS = {
     "pace_optim": (
         ["terminal", "recording", "excitation"],
-        ["robot_logs", "plant", "export", "measured_effort"],
+        ["robot_logs", "plant", "export", "measured_effort", "one_kernel"],
         ["problem"],
-        ["optimizers", "single_joint_model", "one_kernel"],
+        ["optimizers", "single_joint_model"],
         ["uncertainty"],
         ["run", "experiment_design"],
         ["report", "data_collection"],

@@ -1,6 +1,7 @@
 """The refinement: recovery of known truths, bounds, trials that diverge, several starts."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from problems import (
     record,
 )
 from problems import normalised as normalised_truth
-from scipy.optimize import lsq_linear
+from scipy.optimize import lsq_linear, minimize_scalar
 
 from pace_optim.optimizers.jacobian import Colouring, colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, bounded_step, least_squares
@@ -74,6 +75,27 @@ def test_near_the_end_derivatives_are_kept_and_a_step_costs_its_trials_only():
     assert sizes.count(4) >= 2 and sizes[-1] == 4 and sizes[0] == 1 + neighbours
     again = refine(problem, best.x)[0]  # its derivatives are those at the end
     assert again.score > (1 - LeastSquaresCfg().creep_tolerance) * best.score  # what a descent leaves
+
+
+class Curved:
+    """Residuals x - 0.3 and 1 + bend x²/2 in place of a simulation: what no x explains is large, and turns."""
+
+    def __init__(self, bend):
+        self.bend, self.space = bend, SimpleNamespace(to_physical=lambda x: x)
+
+    def residuals(self, physical, where=None):
+        x = physical[:, 0]
+        error = torch.stack([x - 0.3, 1 + 0.5 * self.bend * x.square()], dim=1)[..., None, None]
+        return Residuals(error=error, where=torch.ones(2, 1, dtype=torch.bool), step=torch.arange(2))
+
+
+@pytest.mark.parametrize(("bend", "start"), [(0.3, 0.25), (0.3, 0.2), (0.1, 0.25)])
+def test_no_descent_ends_on_derivatives_of_elsewhere(bend, start):
+    """There the gradient of elsewhere is zero, not its own: it would end up to 3e-5 above the bottom."""
+    one = Colouring(colours=((0,),), joints=((0,),))
+    best = least_squares(Curved(bend), one, [torch.tensor([start], dtype=torch.float64)])[0]
+    bottom = minimize_scalar(lambda x: ((x - 0.3) ** 2 + (1 + 0.5 * bend * x**2) ** 2) / 2, tol=1e-12).fun
+    assert best.stop_reason == "converged" and best.score < (1 + 1e-6) * bottom
 
 
 # ---------------------------------------------------------------- bounds

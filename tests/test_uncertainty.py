@@ -200,18 +200,18 @@ def assessed(problem, x):
 def test_a_drive_that_is_off_hides_the_delay():
     off = np.zeros(401, dtype=bool)
     problem = make_problem(record(torque_enable=off, noise=1e-4))
-    uncertainty, _ = assessed(problem, normalised(problem))
+    uncertainty = assessed(problem, normalised(problem)).uncertainty
     assert "delay/all" in uncertainty.no_influence
 
 
 def test_a_slow_move_in_one_direction_cannot_tell_bias_from_friction():
     ramp = (0.002 * np.minimum(np.arange(401), 400) / 400 + 0.3)[:, None]
     problem = make_problem(record(ramp, noise=1e-4))
-    uncertainty, _ = assessed(problem, normalised(problem))
+    uncertainty = assessed(problem, normalised(problem)).uncertainty
     together = {label for group in uncertainty.indistinguishable for label in group}
     assert {"friction/servo", "encoder_bias/servo"} <= together
     moving = make_problem(record(noise=1e-4))
-    uncertainty, _ = assessed(moving, normalised(moving))
+    uncertainty = assessed(moving, normalised(moving)).uncertainty
     assert uncertainty.indistinguishable == ()
 
 
@@ -220,7 +220,7 @@ def test_a_parameter_held_fixed_by_its_bounds_is_neither_at_a_bound_nor_without_
     bounds[2] = 0.3
     cfg = env_cfg(bounds_params=bounds)
     problem = make_problem(record(noise=1e-4, cfg=cfg), cfg=cfg)
-    uncertainty, _ = assessed(problem, normalised(problem))
+    uncertainty = assessed(problem, normalised(problem)).uncertainty
     assert np.isnan(uncertainty.std).tolist() == [False, False, True, False, False]
     assert uncertainty.at_bound == uncertainty.no_influence == ()
 
@@ -237,7 +237,7 @@ def test_the_truth_is_inside_the_95_percent_interval_in_90_to_99_percent_of_case
         evaluator = problem.evaluator()
         colouring = colour(problem.space, problem.trees, problem.joint_names)
         best = least_squares(evaluator, colouring, [normalised(problem)])[0]
-        uncertainty, _ = assess(problem, evaluator, colouring, best.x)
+        uncertainty = assess(problem, evaluator, colouring, best.x).uncertainty
         error = (problem.space.to_physical(best.x) - physical(problem, TRUTH)).numpy()
         inside += (np.abs(error) < 1.96 * uncertainty.std).tolist()
     assert 0.90 <= np.mean(inside) <= 0.99

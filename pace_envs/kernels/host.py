@@ -20,6 +20,8 @@ from pace_envs.kernels.arguments import Argument, as_argument
 _COMPILERS = ("c++", "g++", "clang++")
 _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
 """A multiplication and an addition are rounded one by one, as everywhere else."""
+_PATIENCE = 3000
+"""Control steps in Python that take as long as a compiler."""
 _TEMPORARY: list[tempfile.TemporaryDirectory] = []
 """Folders of this process, removed at its end."""
 
@@ -31,12 +33,13 @@ class CannotCompileError(RuntimeError):
 class HostKernels:
     """Kernels by their source, each compiled once for a user and a compiler."""
 
-    def __init__(self, compiler: str, folder: Path):
-        """With a compiler of C++, and a folder of the user's alone that keeps what it has made."""
-        self._command = [compiler, *_OPTIONS]
+    def __init__(self, compiler: str, folder: Path, include: str | None = None):
+        """With a compiler of C++, a folder of the user's alone that keeps what it has made, and one of headers."""
+        self._command = [compiler, *_OPTIONS, *([] if include is None else [f"-I{include}"])]
         info = os.stat(compiler)
         self._key = f"{self._command} {info.st_size} {info.st_mtime_ns}"
         self._folder = folder
+        self._waited: dict[str, int] = {}
         self._functions: dict[str, Any] = {}
 
     def compile(self, sources: Sequence[str]) -> None:
@@ -67,8 +70,27 @@ class HostKernels:
         """
         self._functions[source](*map(as_argument, arguments))
 
+    def pays(self, source: str, steps: int) -> bool:
+        """Whether a source is compiled before so many control steps: it was before, or as many have gone without it.
+
+        Args:
+            source: The source.
+            steps: Control steps that are simulated now.
+        """
+        if source in self._functions or self._path_of(source).exists():
+            return True
+        self._waited[source] = self._waited.get(source, 0) + steps
+        return self._waited[source] - steps >= _PATIENCE
+
+    def address_of(self, source: str) -> int:
+        """Where the function of a compiled one is."""
+        return ctypes.cast(self._functions[source], ctypes.c_void_p).value or 0
+
+    def _path_of(self, source: str) -> Path:
+        return self._folder / f"{hashlib.sha256((self._key + source).encode()).hexdigest()}.so"
+
     def _compiled(self, source: str) -> Path:
-        path = self._folder / f"{hashlib.sha256((self._key + source).encode()).hexdigest()}.so"
+        path = self._path_of(source)
         if not path.exists():
             with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".tmp", delete=False) as file:
                 begun = Path(file.name)
@@ -87,6 +109,18 @@ def host_kernels() -> HostKernels | None:
     """The kernels of the processor; ``None`` where no compiler of C++ is installed."""
     compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
     return None if compiler is None else HostKernels(compiler, _own_folder())
+
+
+@cache
+def mujoco_kernels() -> HostKernels | None:
+    """The same for kernels that step MuJoCo themselves; ``None`` where there is no compiler, or MuJoCo no headers."""
+    import mujoco
+
+    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
+    include = Path(mujoco.HEADERS_DIR).parent
+    if compiler is None or not (include / "mujoco" / "mujoco.h").exists():
+        return None
+    return HostKernels(compiler, _own_folder(), str(include))
 
 
 def _own_folder() -> Path:

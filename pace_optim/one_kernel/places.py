@@ -116,7 +116,8 @@ class Places:
             self.known[place] = index, Cell(self.tape.leaf(index, kind))
         index, cell = self.known[place]
         self.put(holder, key, Symbol(self.operations, cell, shape))
-        self.slots.append(Slot(holder=holder, key=key, leaf=index))
+        if index >= 0:
+            self.slots.append(Slot(holder=holder, key=key, leaf=index))
 
     def delay(self, holder: Any, key: Any, begin: int) -> None:
         """A symbolic delay in place of a buffer."""

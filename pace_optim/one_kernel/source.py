@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from pace_optim.one_kernel.tape import Node, Tape
 
-_BEGIN = """
+BEGIN = """
 #ifdef __CUDACC_RTC__
 #define FUNCTION __device__ __forceinline__
 #else
@@ -64,12 +64,12 @@ def source_of(tape: Tape, updates: Mapping[int, Node], shown: Node, entries: Seq
         shown: What is written to ``out`` at the beginning of each step.
         entries: How many numbers each leaf has.
     """
-    updates, needed = _needed(tape, updates, shown)
-    changing = _changing(tape, updates)
+    updates, needed = needed_nodes(tape, updates, [shown, *(node for node in tape.nodes if node.operation == "push")])
+    changing = changing_nodes(tape, updates)
     nodes = [node for node in tape.nodes if node.number in needed]
     used = list(dict.fromkeys(node.index for node in nodes if node.operation in ("leaf", "table")))
     begin = dict(zip(used, itertools.accumulate((entries[i] for i in used), initial=0), strict=False))
-    names = _Names(tape, nodes, begin)
+    names = Names(tape, nodes, begin)
     before, inside = [], []
     offset = 0
     for i, ring in enumerate(tape.rings):
@@ -110,12 +110,12 @@ def source_of(tape: Tape, updates: Mapping[int, Node], shown: Node, entries: Seq
     ]
     top, loop = "\n  ".join(before), "\n    ".join(inside)
     return (
-        f"{_BEGIN}FUNCTION void joint(int e, {_ARGUMENTS}) {{\n  {top}\n"
+        f"{BEGIN}FUNCTION void joint(int e, {_ARGUMENTS}) {{\n  {top}\n"
         f"  for (int k = first; k < last; ++k) {{\n    {loop}\n  }}\n}}\n{_END}"
     ), used
 
 
-class _Names:
+class Names:
     """What nodes are called in C."""
 
     def __init__(self, tape: Tape, nodes: Sequence[Node], begin: Mapping[int, int]):
@@ -145,11 +145,11 @@ class _Names:
         return node.operation.format(*names)
 
 
-def _needed(tape: Tape, updates: Mapping[int, Node], shown: Node) -> tuple[dict[int, Node], set[int]]:
-    """The leaves that what is shown depends on at any later step, with their updates, and all nodes that this takes."""
+def needed_nodes(tape: Tape, updates: Mapping[int, Node], roots: Sequence[Node]) -> tuple[dict[int, Node], set[int]]:
+    """The leaves that some nodes depend on at any later step, with their updates, and all nodes that this takes."""
     needed: set[int] = set()
     leaves: dict[int, Node] = {}
-    left = [shown, *(node for node in tape.nodes if node.operation == "push")]
+    left = list(roots)
     while left:
         node = left.pop()
         if node.number in needed:
@@ -162,11 +162,11 @@ def _needed(tape: Tape, updates: Mapping[int, Node], shown: Node) -> tuple[dict[
     return {i: node for i, node in updates.items() if i in leaves}, needed
 
 
-def _changing(tape: Tape, updates: Mapping[int, Node]) -> set[int]:
+def changing_nodes(tape: Tape, updates: Mapping[int, Node]) -> set[int]:
     """Numbers of the nodes that change from step to step."""
     changing: set[int] = set()
     for node in tape.nodes:
-        own = node.operation in ("series", "ring") or (node.operation == "leaf" and node.index in updates)
+        own = node.operation in ("series", "ring", "field") or (node.operation == "leaf" and node.index in updates)
         if own or any(each.number in changing for each in node.arguments):
             changing.add(node.number)
     return changing

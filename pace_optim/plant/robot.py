@@ -62,6 +62,8 @@ class PlantRobot:
         for joint in spec.joints:
             if joint.type != mujoco.mjtJoint.mjJNT_HINGE:
                 raise ValueError(f"{self.name}: the joint {joint.name!r} is no hinge; the plant simulates hinges only.")
+        for key in list(spec.keys):  # it has the size of the model with its actuators
+            spec.delete(key)
         for actuator in list(spec.actuators):
             spec.delete(actuator)
         off = mujoco.mjtDisableBit

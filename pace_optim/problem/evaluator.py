@@ -120,11 +120,9 @@ class Evaluator:
         rollout = self.rollout(len(physical))
         rollout.start(physical, mask, initial_offset=initial_offset)
         bias = rollout.physical[:, self.space["encoder_bias"]]
-        env = rollout.env
         m, count, n = len(physical), data.num_recordings, bias.shape[1]
-        error = torch.zeros(len(step), m * count, n, dtype=env.dtype, device=env.device)
-        for k, (sim_dof_pos, real_dof_pos) in enumerate(rollout):
-            torch.sub(sim_dof_pos, bias, out=error[k]).sub_(real_dof_pos)
+        error = rollout.positions(step).sub_(bias)
+        error.view(len(step), m, count, n).sub_(rollout.dataset.measured[step][:, None])
         kept = mask[step]
         error = error.to("cpu", torch.float64).view(len(step), m, count, n)
         if not bool(kept.all()):

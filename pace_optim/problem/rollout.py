@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import torch
 
+from pace_optim.one_kernel.robot_kernel import CompiledRobot
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.dataset import Dataset
 
@@ -58,6 +59,7 @@ class Rollout:
         self.space = space
         self.num_candidates = env.num_envs // count
         self.simulated_steps = 0
+        self._compiled = CompiledRobot(env, self.dataset)
         self._where = self.dataset.train
         self._enable_changes = _changes(dataset.torque_enable)
         self.weight: torch.Tensor | float = 0.0
@@ -118,16 +120,58 @@ class Rollout:
                 self.weight = self._rows(weights[k, :, None])
                 yield sim_dof_pos, self._rows(data.measured[k])
 
-    def samples(self, at_steps: bool = False) -> Iterator[tuple[int, torch.Tensor]]:
+    def positions(self, at: torch.Tensor) -> torch.Tensor:
+        """Simulated positions at samples, as when iterating, (len(at), num_envs, n) [rad]; the numbers are the same.
+
+        Where drives can be compiled the robot's own state stays where it is: whoever needs more of it iterates.
+
+        Args:
+            at: Control steps of the samples, ascending, the last one that counts among them.
+        """
+        if self.dataset.sample_offset is None and self.observation_lag(self.duration_steps) is None:
+            return self._in_one_go(at)
+        wanted = set(at.tolist())
+        shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
+        return torch.stack([position.clone() for k, position in shown if k in wanted])
+
+    def _in_one_go(self, at: torch.Tensor) -> torch.Tensor:
+        """Simulated positions at control steps, (len(at), num_envs, n) [rad]."""
+        last, robot = int(at[-1]), self.robot
+        shape = len(at), self.env.num_envs, robot.num_joints
+        result = torch.empty(shape, dtype=self.env.dtype, device=self.env.device)
+        begin = int(at[0] == 0)
+        if begin:
+            result[0] = robot.sensed_joint_pos()
+        if last > 0:
+            self.advance(0)
+            compiled = self._compiled.positions(at[begin:])
+            if compiled is None:
+                row = {k: i for i, k in enumerate(at.tolist())}
+                for k in range(1, last + 1):
+                    shown = robot.sensed_joint_pos()
+                    if k in row:
+                        result[row[k]] = shown
+                    if k < last:
+                        self.advance(k)
+            else:
+                result[begin:] = compiled
+        self.simulated_steps += last * self.env.num_envs
+        return result
+
+    def samples(
+        self, at_steps: bool = False, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
+    ) -> Iterator[tuple[int, torch.Tensor]]:
         """Step and sensed positions at every control step, as late as the effects on the recording have them.
 
         Args:
             at_steps: Whether at the steps themselves, not at the instants of samples that were taken beside them.
+            simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
         """
+        simulated = simulated or self.simulated
         steps, offset = self.duration_steps, None if at_steps else self.dataset.sample_offset
         lag = self.observation_lag(steps)
         if lag is None and offset is None:
-            yield from enumerate(self.simulated(steps))
+            yield from enumerate(simulated(steps))
             return
         if lag is None:
             lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
@@ -142,7 +186,7 @@ class Rollout:
         late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
         first = lag[0, late]
         rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
-        for j, position in enumerate(self.simulated(steps + ahead)):
+        for j, position in enumerate(simulated(steps + ahead)):
             seen[j % length] = position
             if j == 0:
                 seen[:] = position

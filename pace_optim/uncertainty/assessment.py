@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from pace_optim.optimizers.jacobian import Colouring, jacobian, perturbed
+from pace_optim.optimizers.jacobian import Colouring, Jacobian, jacobian, perturbed
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
@@ -17,9 +17,19 @@ _INITIAL_STEP = 1e-5
 """Change of the first position for its derivative [rad]."""
 
 
-def assess(
-    problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
-) -> tuple[Uncertainty, Residuals]:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Assessment:
+    """What is known of a vector."""
+
+    uncertainty: Uncertainty
+    """Its error bars."""
+    residuals: Residuals
+    """On all samples, m = 1."""
+    jacobian: Jacobian
+    """On the training samples."""
+
+
+def assess(problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor) -> Assessment:
     """Error bars at x from the training samples, and x's residuals on all samples."""
     data, probes = problem.dataset, make_probes(x, colouring, problem.trees, problem.joint_names)
     every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
@@ -31,7 +41,23 @@ def assess(
     initial = probes.initial(trained.error)
     there = jacobian(trained, probes.step, colouring)
     uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints)
-    return uncertainty, Residuals(error=every.error[:1], where=every.where, step=every.step)
+    residuals = Residuals(error=every.error[:1], where=every.where, step=every.step)
+    return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there)
+
+
+def error_bars(problem: Problem, evaluator: Evaluator, there: Jacobian, x: torch.Tensor) -> Uncertainty:
+    """Error bars at x from derivatives that are known: only first positions are moved once more.
+
+    Args:
+        problem: What was fitted.
+        evaluator: Simulates the recordings that are trained on.
+        there: Residuals at x and derivatives there or near it, on the training samples.
+        x: Normalised, (size,).
+    """
+    offset, joints = _shaken(problem.trees, problem.joint_names)
+    shaken = evaluator.residuals(problem.space.to_physical(x.repeat(len(joints), 1)), initial_offset=offset)
+    initial = (shaken.error - there.residuals.error) / _INITIAL_STEP
+    return estimate_uncertainty(there, problem.space, x, initial, joints)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,14 +90,23 @@ def make_probes(
         joint_names: All joints, in order.
     """
     neighbours, step = perturbed(x, colouring)
+    moved, joints = _shaken(trees, joint_names)
+    vectors = torch.cat([x[None], neighbours, x.repeat(len(joints), 1)])
+    offset = torch.cat([torch.zeros(len(vectors) - len(joints), len(joint_names), dtype=torch.float64), moved])
+    return Probes(vectors=vectors, offset=offset, step=step, initial_joints=joints)
+
+
+def _shaken(
+    trees: Sequence[Sequence[str]], joint_names: Sequence[str]
+) -> tuple[torch.Tensor, tuple[tuple[int, ...], ...]]:
+    """Changes of the first positions, (sets, n) [rad], and which joints each of them moves: the i-th of each tree."""
     index = {name: i for i, name in enumerate(joint_names)}
     depth = max(len(tree) for tree in trees)
-    shaken = tuple(tuple(index[tree[i]] for tree in trees if i < len(tree)) for i in range(depth))
-    vectors = torch.cat([x[None], neighbours, x.repeat(len(shaken), 1)])
-    offset = torch.zeros(len(vectors), len(joint_names), dtype=torch.float64)
-    for row, joints in zip(offset[-len(shaken) :], shaken, strict=True):
-        row[list(joints)] = _INITIAL_STEP
-    return Probes(vectors=vectors, offset=offset, step=step, initial_joints=shaken)
+    joints = tuple(tuple(index[tree[i]] for tree in trees if i < len(tree)) for i in range(depth))
+    offset = torch.zeros(depth, len(joint_names), dtype=torch.float64)
+    for row, own in zip(offset, joints, strict=True):
+        row[list(own)] = _INITIAL_STEP
+    return offset, joints
 
 
 def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:

@@ -10,11 +10,12 @@ import torch
 
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
-from pace_optim.optimizers.jacobian import colour, jacobian, perturbed
-from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.optimizers.jacobian import Jacobian, colour, jacobian, perturbed
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
-from pace_optim.uncertainty.assessment import assess
+from pace_optim.uncertainty.assessment import assess, error_bars
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 DISAGREEMENT = 4.0
@@ -30,7 +31,8 @@ _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
 _GAIN_REFITS = 2
 """Recordings refitted with gains of their own."""
-_REFINE = LeastSquaresCfg(max_iteration=12)
+_REFINE = LeastSquaresCfg(max_iteration=12, score_tolerance=1e-4)
+"""From the joint result: what is left after that is some tenths of a standard deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +52,11 @@ class Consistency:
 
 
 def check_consistency(
-    problem: Problem, x: torch.Tensor, score: float, report: Callable[[str], None] = lambda text: None
+    problem: Problem,
+    x: torch.Tensor,
+    score: float,
+    report: Callable[[str], None] = lambda text: None,
+    there: Jacobian | None = None,
 ) -> Consistency:
     """Fit each training recording alone, from the joint result, and compare beyond the error bars.
 
@@ -58,6 +64,7 @@ def check_consistency(
         problem: The joint problem.
         x: Its result, normalised (size,).
         score: Its score [rad²].
+        there: Residuals and derivatives at x on the training samples; ``None``: they are simulated.
         report: Gets a line of progress.
     """
     trained = problem.dataset.trained()
@@ -67,7 +74,8 @@ def check_consistency(
     fits = []
     for r in range(len(trained)):
         report(f"fitting {problem.dataset.recordings[r].name} alone")
-        fits.append(_fit_from(replace(problem, dataset=problem.dataset.select([r])), x))
+        alone = replace(problem, dataset=problem.dataset.select([r]))
+        fits.append(_fit_from(alone, x, None if there is None else _of_recording(there, trained[r])))
     names = tuple(recording.name for recording in problem.dataset.recordings)
     values = torch.stack([problem.space.to_physical(fit.x) for fit in fits]).numpy()
     std = np.stack([fit.uncertainty.std for fit in fits])
@@ -97,13 +105,29 @@ class _Fit:
     simulated_steps: int
 
 
-def _fit_from(problem: Problem, x: torch.Tensor) -> _Fit:
-    """Least squares from x."""
+def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) -> _Fit:
+    """Least squares from x, where the derivatives may be known."""
     evaluator = problem.training_evaluator()
     colouring = colour(problem.space, problem.trees, problem.joint_names)
-    best = least_squares(evaluator, colouring, [x], _REFINE)[0]
-    uncertainty, _ = assess(problem, evaluator, colouring, best.x)
+    start = Descent(x=x.clamp(-1.0, 1.0).clone())
+    if there is not None:
+        start.jacobian, start.jacobian_x, start.score = there, start.x.clone(), float(there.residuals.score[0])
+        start.scores, start.iteration = [start.score], 1
+    best = least_squares(evaluator, colouring, [start], _REFINE)[0]
+    uncertainty = (
+        assess(problem, evaluator, colouring, best.x).uncertainty
+        if best.jacobian is None
+        else error_bars(problem, evaluator, best.jacobian, best.x)
+    )
     return _Fit(score=best.score, x=best.x, uncertainty=uncertainty, simulated_steps=evaluator.simulated_steps)
+
+
+def _of_recording(there: Jacobian, r: int) -> Jacobian:
+    """Residuals and derivatives of one of the recordings."""
+    whole = there.residuals
+    at = whole.where[:, r]
+    own = Residuals(error=whole.error[:, at, r : r + 1], where=whole.where[at, r : r + 1], step=whole.step[at])
+    return replace(there, residuals=own, columns=there.columns[:, at, r : r + 1])
 
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:

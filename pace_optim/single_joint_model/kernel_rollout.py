@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
-from pace_optim.one_kernel.recorder import Recorded, record
+from pace_optim.one_kernel.drive import commands
+from pace_optim.single_joint_model.kernel_recorder import Recorded, record
 
 if TYPE_CHECKING:
     from pace_optim.problem.rollout import Rollout
 
+_OF_RECORDINGS = ("command", "command_vel", "command_effort", "torque_enable")
 _WIDTH = 32
 """Threads of a block: each goes its way alone, and few blocks spread over the GPU."""
 
@@ -162,16 +164,8 @@ class KernelRollout:
     def _one(self, name: str) -> torch.Tensor:
         """A series by name, (T, R n)."""
         rollout = self._rollout
-        if name == "command":
-            term = next(iter(rollout.env.action_manager._terms.values()))
-            term.process_actions(rollout.dataset.command)
-            value = term.processed_actions  # type: ignore[attr-defined]
-        elif name == "torque_enable":
-            enable = rollout.dataset.torque_enable
-            assert enable is not None
-            value = enable[..., None].expand(-1, -1, rollout.robot.num_joints)
-        elif name in ("command_vel", "command_effort"):
-            value = getattr(rollout.dataset, name)
+        if name in _OF_RECORDINGS:
+            value = commands(rollout.env, rollout.dataset, name)
         else:
             value = rollout.env.sim.series(name)  # type: ignore[attr-defined]
         return value.double().reshape(len(value), -1)
