@@ -13,7 +13,7 @@ import numpy as np
 from drive_problem import FITTED, DriveProblem
 from solver_trace import Trace
 
-from pace_envs.articulation import load_robot_spec
+from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import Simulation
 
 _SETTERS: dict[str, Callable[[Any, float], None]] = {

@@ -14,10 +14,10 @@ from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
 from pace_envs import mdp
-from pace_envs.articulation import load_robot_spec
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.managers import EventTermCfg
+from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
 
 _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

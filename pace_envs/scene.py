@@ -8,9 +8,10 @@ import mujoco
 import torch
 
 from pace_actuators import match_names
-from pace_envs.articulation import Articulation, load_robot_spec
+from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
+from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import EnvIds, SimulationCfg, make_simulation
 
 

@@ -1,0 +1,264 @@
+"""What a drive holds: its numbers, its delays and its effects, batched over environments."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from pace_actuators.drive_delays import DriveDelays
+from pace_actuators.drive_parameters import DriveParameters
+from pace_actuators.drive_rates import calls_per_run
+from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
+from pace_actuators.identified import delay_in_steps, step_notes
+from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+
+EnvIds = Sequence[int] | torch.Tensor | slice | None
+
+
+@dataclasses.dataclass
+class ControllerRun:
+    """What the controller keeps of a run for commands that arrive before the next, (num_envs, num_joints) each."""
+
+    encoder_pos: torch.Tensor
+    encoder_vel: torch.Tensor
+    stiffness: torch.Tensor
+    damping: torch.Tensor
+    velocity: torch.Tensor | None
+    feed_forward: torch.Tensor | None
+    added: torch.Tensor | None = None
+
+
+class Drive:
+    """The numbers, delays and effects of a group of joints' drives; the law is :class:`PaceDCMotor`'s."""
+
+    is_implicit_model = False
+
+    def __init__(
+        self,
+        cfg: PaceDCMotorCfg,
+        joint_names: Sequence[str],
+        joint_ids: slice | torch.Tensor | Sequence[int],
+        num_envs: int,
+        device: str | torch.device = "cpu",
+        stiffness: torch.Tensor | float = 0.0,
+        damping: torch.Tensor | float = 0.0,
+        armature: torch.Tensor | float = 0.0,
+        friction: torch.Tensor | float = 0.0,
+        dynamic_friction: torch.Tensor | float | None = None,
+        viscous_friction: torch.Tensor | float = 0.0,
+        effort_limit: torch.Tensor | float = torch.inf,
+        velocity_limit: torch.Tensor | float = torch.inf,
+        *,
+        physics_dt: float | None = None,
+        dtype: torch.dtype = torch.float32,
+    ):
+        """Create the drive of a group of joints.
+
+        Args:
+            cfg: The configuration.
+            joint_names: Names of the joints of the group, in order.
+            joint_ids: Their indices in the articulation (kept for the caller).
+            num_envs: Number of environments.
+            device: Device of all tensors.
+            stiffness: Used where the configuration says ``None``; so are the following arguments.
+            damping: [N m s/rad].
+            armature: [kg m^2].
+            friction: Coulomb friction [N m].
+            dynamic_friction: Isaac Lab's friction while sliding [N m]; equal to ``friction`` if ``None``, and
+                where the configuration gives the friction.
+            viscous_friction: [N m s/rad].
+            effort_limit: [N m].
+            velocity_limit: [rad/s].
+            physics_dt: Time between two calls of :meth:`compute` [s], where the configuration says ``None``.
+            dtype: Type of all tensors.
+
+        Raises:
+            ValueError: If a value is missing, negative or not finite where it must be.
+        """
+        self.cfg = cfg
+        self._joint_names = list(joint_names)
+        self._joint_indices = joint_ids
+        self._num_envs = num_envs
+        self._device = torch.device(device)
+        self._dtype = dtype
+        parameters = DriveParameters(cfg, joint_names, num_envs, self._device, dtype)
+
+        self.stiffness = parameters.read("stiffness", stiffness)
+        self.damping = parameters.read("damping", damping)
+        self.armature = parameters.read("armature", armature)
+        self.friction = parameters.read("friction", friction)
+        self.dynamic_friction = (
+            self.friction.clone()
+            if dynamic_friction is None or cfg.friction is not None
+            else parameters.tensor(dynamic_friction, "dynamic_friction")
+        )
+        self.viscous_friction = parameters.read("viscous_friction", viscous_friction)
+        self.effort_limit = parameters.read("effort_limit", effort_limit)
+        self.effort_limit_sim = self.effort_limit.clone()
+        self.velocity_limit = parameters.read("velocity_limit", velocity_limit)
+        self.velocity_limit_sim = self.velocity_limit.clone()
+        if cfg.saturation_effort is None:
+            # no torque-speed line was asked for: a stall torque (finite) beyond all others and no fall with speed
+            self.saturation_effort = torch.full_like(self.effort_limit, torch.finfo(dtype).max)
+            self.velocity_limit = torch.full_like(self.velocity_limit, torch.inf)
+        else:
+            self.saturation_effort = parameters.read("saturation_effort", torch.inf)
+        self.encoder_bias = parameters.read("encoder_bias", 0.0)
+        self.torque_enable: torch.Tensor | None = None
+        self.holds_line = False
+        self.centred = False
+        self.is_trapezoidal = False
+        self._first_call = True
+        self._speed_slope: torch.Tensor | None = None
+        self._loop_slope: torch.Tensor | None = None
+        self._run: ControllerRun | None = None
+
+        self.computed_effort = torch.zeros_like(self.stiffness)
+        self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
+        delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
+        dt = self._physics_dt = cfg.physics_dt or physics_dt
+        delay, max_delay = delay_in_steps(cfg, dt)
+        for note in step_notes(cfg, dt):
+            warnings.warn(note, stacklevel=2)
+        self._calls_per_run = calls = calls_per_run(cfg, dt)
+        self._delays = DriveDelays(
+            delayed,
+            max_delay,
+            num_envs,
+            self._device,
+            cfg.delay_interpolation,
+            runs=cfg.control_decimation // calls,
+            parts=calls,
+        )
+        self._asked = self.computed_effort
+        self._calls_until_control = 0
+        self.update_time_lags(delay)
+        self._delays.set_lead(self._lead)
+        self.effects = self._make_effects(dt)
+        self.update_effects()
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints in the group."""
+        return len(self._joint_names)
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints in the group."""
+        return self._joint_names
+
+    @property
+    def joint_indices(self) -> slice | torch.Tensor | Sequence[int]:
+        """Indices of the group's joints in the articulation."""
+        return self._joint_indices
+
+    @property
+    def run_dt(self) -> float:
+        """Time between two runs of the controller [s]; infinite where the physics step is not known."""
+        return math.inf if self._physics_dt is None else self._calls_per_run * self._physics_dt
+
+    @property
+    def time_lags(self) -> torch.Tensor:
+        """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
+        return self._delays.time_lags
+
+    def update_effects(self) -> None:
+        """Take over changed parameters of the base model and of the effects."""
+        if self.effects is not None:
+            self.effects.take_over(self.armature, self.friction, self.viscous_friction)
+
+    def reset(self, env_ids: EnvIds = None) -> None:
+        """Forget the history of all or some environments; parameters stay."""
+        self._delays.reset(env_ids)
+        if env_ids is None:
+            self._calls_until_control = 0
+            self._first_call = True
+        if self.effects is not None:
+            self.effects.reset(env_ids)
+
+    def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
+        """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it."""
+        rows = slice(None) if env_ids is None else env_ids
+        self.encoder_bias[rows] = torch.as_tensor(encoder_bias, dtype=self._dtype, device=self._device)
+
+    def update_time_lags(self, delay: torch.Tensor | float, env_ids: EnvIds = None) -> None:
+        """Set the delay [control steps]: a number, (len(env_ids),) or, per joint, (len(env_ids), num_joints).
+
+        Raises:
+            ValueError: If a delay lies outside 0 to ``max_delay``, or their number is wrong.
+        """
+        if isinstance(delay, torch.Tensor) and delay.ndim == 2 and delay.shape[1] not in (1, self.num_joints):
+            raise ValueError(
+                f"delay has shape {tuple(delay.shape)}, expected 1 or {self.num_joints} columns: "
+                "one delay per environment or per joint."
+            )
+        self._delays.set_time_lag(delay, env_ids)
+
+    def take_over_simulator(self, *, is_trapezoidal: bool, holds_line: bool) -> None:
+        """Say how the simulator moves positions, and what it holds between two calls: see the attributes."""
+        self.holds_line, self.is_trapezoidal = holds_line, is_trapezoidal
+        self.centred = holds_line and not is_trapezoidal
+        if self.effects is not None:
+            self.effects.is_trapezoidal = is_trapezoidal
+        self._delays.set_lead(self._lead)
+
+    @property
+    def _lead(self) -> float:
+        """By how much the simulator lets a delayed command act too early, in runs of the controller."""
+        early = self.cfg.centred_commands and self.cfg.delay_mode == "command"
+        return 0.5 / self._calls_per_run if early and not (self.is_trapezoidal or self.centred) else 0.0
+
+    def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
+        """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
+        self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
+        if self.effects is not None:
+            given = self.effects.state.enabled
+            given.copy_(torch.ones_like(given) if self.torque_enable is None else self.torque_enable.expand_as(given))
+
+    def flags(self) -> list[tuple]:
+        """Everything of the drive and its effects that is no tensor and can be compared: what Python branches over."""
+        stack = self.effects
+        things: list[Any] = [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
+        return [
+            tuple(
+                (key, frozenset(value) if isinstance(value, set) else value)
+                for key, value in vars(each).items()
+                if value is None or isinstance(value, (bool, int, float, str, set))
+            )
+            for each in things
+        ]
+
+    def _make_effects(self, physics_dt: float | None) -> EffectStack | None:
+        cfgs = [cfg for cfg in effect_cfgs(self.cfg.effects) if _applies(cfg, self._joint_names)]
+        if not cfgs:
+            return None
+        if physics_dt is None:
+            raise ValueError(
+                f"The effects {', '.join(cfg.label for cfg in cfgs)} need to know the time between two calls: set "
+                "physics_dt [s] in the actuator's configuration."
+            )
+        return EffectStack(
+            cfgs,
+            self._joint_names,
+            self._num_envs,
+            dt=physics_dt,
+            control_dt=physics_dt * self._calls_per_run,
+            delay_mode=self.cfg.delay_mode,
+            device=self._device,
+            dtype=self._dtype,
+        )
+
+
+def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:
+    """Whether an effect has joints in this group of joints; in another group it may have some."""
+    return any(
+        re.fullmatch(pattern, name)
+        for pattern in ([cfg.joint_names_expr] if isinstance(cfg.joint_names_expr, str) else cfg.joint_names_expr)
+        for name in joint_names
+    )

@@ -1,0 +1,246 @@
+"""A robot's joints in the simulation: finding them, reading and writing their state and targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import torch
+
+from pace_actuators import resolve_joint_values
+from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.articulation_data import ArticulationData
+from pace_envs.closed_loops import ClosedLoops
+from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
+from pace_envs.joint_layout import JointLayout
+from pace_envs.simulation import Simulation
+
+
+class RobotState:
+    """A robot without its drives, batched over environments; every joint index is an index into ``joint_names``."""
+
+    def __init__(self, cfg: ArticulationCfg, sim: Simulation):
+        """Find the robot's joints in the simulation.
+
+        Args:
+            cfg: The configuration.
+            sim: The simulation that holds the robot.
+
+        Raises:
+            ValueError: If names in the configuration do not fit the model.
+        """
+        self.cfg = cfg
+        self._sim = sim
+        layout = JointLayout.of_model(sim.model, cfg.joint_order, cfg.mjcf_path, sim.device)
+        self._layout, self.joint_names, self.dof_columns = layout, list(layout.joint_names), layout.dof_columns
+        self._body_ids = list(range(1, sim.model.nbody))
+        self.body_names = [sim.model.body(i).name for i in self._body_ids]
+        n, device, dtype = self.num_joints, sim.device, sim.dtype
+        init = cfg.init_state
+        limits = torch.full((n, 2), torch.inf, dtype=dtype, device=device)
+        limits[:, 0] = -torch.inf
+        for i, name in enumerate(self.joint_names):
+            if sim.model.joint(name).limited[0]:
+                limits[i] = sim.tensor(sim.model.joint(name).range)
+        middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
+        zeros = torch.zeros(sim.num_envs, n, dtype=dtype, device=device)
+        default_pos, self._passive_pos = self._initial_positions()
+        default_vel = sim.tensor(
+            resolve_joint_values(init.joint_vel, self.joint_names, field="init_state.joint_vel", default=0.0)
+        )
+        self.data = ArticulationData(
+            joint_pos=sim.qpos[:, self._layout.qpos_view] if self._layout.side_by_side else zeros.clone(),
+            joint_vel=sim.qvel[:, self._layout.dof_view] if self._layout.side_by_side else zeros.clone(),
+            default_joint_pos=default_pos.repeat(sim.num_envs, 1),
+            default_joint_vel=default_vel.repeat(sim.num_envs, 1),
+            joint_pos_limits=limits,
+            soft_joint_pos_limits=middle + cfg.soft_joint_pos_limit_factor * (limits - middle),
+            joint_pos_target=default_pos.repeat(sim.num_envs, 1),
+            computed_torque=zeros.clone(),
+            applied_torque=zeros.clone(),
+        )
+        if self._layout.root is not None:
+            q, v = self._layout.root
+            self.data.root_pos_w, self.data.root_quat_w = sim.qpos[:, q : q + 3], sim.qpos[:, q + 3 : q + 7]
+            self.data.root_lin_vel_w, self.data.root_ang_vel_b = (
+                sim.qvel[:, v : v + 3],
+                sim.qvel[:, v + 3 : v + 6],
+            )
+        self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
+        self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self._sim.num_envs
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Of a value for each joint of each environment."""
+        return self.num_envs, self.num_joints
+
+    @property
+    def is_fixed_base(self) -> bool:
+        """Whether the base is held in place."""
+        return self._layout.root is None
+
+    @property
+    def slide_joints(self) -> tuple[str, ...]:
+        """Those of the joints that slide."""
+        model = self._sim.model
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        return tuple(name for name in self.joint_names if int(model.joint(name).type[0]) == slide)
+
+    def find_joints(
+        self, name_keys: str | Sequence[str], *, preserve_order: bool = False
+    ) -> tuple[list[int], list[str]]:
+        """Joints whose names match regular expressions.
+
+        Args:
+            name_keys: One expression or several.
+            preserve_order: Order by the expressions instead of by ``joint_names``.
+
+        Returns:
+            Indices and names.
+
+        Raises:
+            ValueError: If an expression matches no joint.
+        """
+        return find_names(name_keys, self.joint_names, preserve_order, "joint")
+
+    def find_bodies(
+        self, name_keys: str | Sequence[str], *, preserve_order: bool = False
+    ) -> tuple[list[int], list[str]]:
+        """Bodies whose names match regular expressions: model body indices and names."""
+        found, names = find_names(name_keys, self.body_names, preserve_order, "body")
+        return [self._body_ids[i] for i in found], names
+
+    def reset_state(self, env_ids: EnvIds = None) -> None:
+        """Put all or some environments' robots back to their initial state, and their targets."""
+        rows = self._sim.rows(env_ids)
+        if self._layout.root is not None:
+            self.write_root_state_to_sim(self._initial_root, env_ids)
+        if len(self._layout.passive_names):
+            assign(self._sim.qpos, rows, self._layout.passive_columns, self._passive_pos)
+        self.write_joint_state_to_sim(
+            self.data.default_joint_pos[rows], self.data.default_joint_vel[rows], env_ids=env_ids
+        )
+        self.data.joint_pos_target[rows] = self.data.default_joint_pos[rows]
+        for target in (self.data.joint_vel_target, self.data.joint_effort_target):
+            if target is not None:
+                target[rows] = 0.0
+
+    @property
+    def targets(self) -> list[torch.Tensor]:
+        """The targets that are set, (num_envs, num_joints) each."""
+        data = self.data
+        every = (data.joint_pos_target, data.joint_vel_target, data.joint_effort_target)
+        return [target for target in every if target is not None]
+
+    def write_joint_state_to_sim(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        joint_ids: JointIds = None,
+        env_ids: EnvIds = None,
+    ) -> None:
+        """Write positions [rad] and velocities [rad/s], (len(env_ids), len(joint_ids)) or broadcastable.
+
+        The passive joints of closed chains go where they close them, from where they are.
+        """
+        self._write(self._sim.qpos, self._layout.qpos_columns, position, joint_ids, env_ids, "the position")
+        self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids, "the velocity")
+        if self._loops is not None:
+            rows = slice(None) if env_ids is None else self._sim.resolve_env_ids(env_ids)
+            self._sim.qpos[rows], self._sim.qvel[rows] = self._loops.closed(self._sim.qpos[rows], self._sim.qvel[rows])
+        self._refresh()
+
+    def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
+        """Write a floating base's state, (len(env_ids), 13) or broadcastable.
+
+        Args:
+            root_state: Position [m], quaternion (w x y z), linear velocity in the world [m/s] and angular
+                velocity in the base's frame [rad/s].
+            env_ids: The environments, or ``None`` for all.
+
+        Raises:
+            ValueError: If the base is fixed.
+        """
+        if self._layout.root is None:
+            raise ValueError("This robot's base is fixed: it has no root state to write.")
+        rows, (q, v) = indices(env_ids), self._layout.root
+        self._sim.qpos[rows, q : q + 7] = root_state[..., :7]
+        self._sim.qvel[rows, v : v + 6] = root_state[..., 7:]
+
+    def set_joint_position_target(
+        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set position targets [rad]; they reach the drives with :meth:`write_data_to_sim`."""
+        if joint_ids is None and env_ids is None:
+            values = checked_values(target, self._shape, "the position target")
+            self.data.joint_pos_target.copy_(torch.as_tensor(values))
+        else:
+            assign(self.data.joint_pos_target, indices(env_ids), indices(joint_ids), target, "the position target")
+
+    def set_joint_velocity_target(
+        self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None
+    ) -> None:
+        """Set velocity targets [rad/s]."""
+        if self.data.joint_vel_target is None:
+            self.data.joint_vel_target = zeros_like(self.data.joint_pos_target)
+        assign(self.data.joint_vel_target, indices(env_ids), indices(joint_ids), target, "the velocity target")
+
+    def set_joint_effort_target(self, target: torch.Tensor, joint_ids: JointIds = None, env_ids: EnvIds = None) -> None:
+        """Set feed-forward efforts [N m]."""
+        if self.data.joint_effort_target is None:
+            self.data.joint_effort_target = zeros_like(self.data.joint_pos_target)
+        assign(self.data.joint_effort_target, indices(env_ids), indices(joint_ids), target, "the effort target")
+
+    def _slow_down(self, place: torch.Tensor | slice, fastest: float) -> None:
+        """Limit speeds, in the simulator itself."""
+        speeds = self._sim.qvel
+        if isinstance(place, slice):
+            speeds[:, place].clamp_(-fastest, fastest)
+        else:
+            speeds[:, place] = speeds[:, place].clamp(-fastest, fastest)
+
+    @property
+    def closed_loops(self) -> ClosedLoops | None:
+        """What closes the robot's kinematic loops; ``None`` where it has none."""
+        return self._loops
+
+    @property
+    def load_effort(self) -> torch.Tensor:
+        """Torque of gravity and of the other joints' motion on each joint [N m], (num_envs, num_joints)."""
+        return -self._sim.qfrc_bias[:, self._layout.dof_view if self._layout.side_by_side else self._layout.dof_columns]
+
+    def _initial_positions(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Initial positions [rad] of the joints, (num_joints,), and of the passive ones."""
+        value, layout = self.cfg.init_state.joint_pos, self._layout
+        if not isinstance(value, Mapping):
+            own = resolve_joint_values(value, self.joint_names, field="init_state.joint_pos", default=0.0)
+            return self._sim.tensor(own), self._sim.tensor(self._sim.model.qpos0)[layout.passive_columns]
+        names = [*self.joint_names, *layout.passive_names]
+        every = self._sim.tensor(resolve_joint_values(value, names, field="init_state.joint_pos", default=0.0))
+        return every[: self.num_joints], every[self.num_joints :]
+
+    def _write(
+        self,
+        field: torch.Tensor,
+        columns: torch.Tensor,
+        value: torch.Tensor | float,
+        joint_ids: JointIds,
+        env_ids: EnvIds,
+        what: str = "the value",
+    ) -> None:
+        assign(field, indices(env_ids), columns[indices(joint_ids)], value, what)
+
+    def _refresh(self) -> None:
+        if not self._layout.side_by_side:
+            torch.index_select(self._sim.qpos, 1, self._layout.qpos_columns, out=self.data.joint_pos)
+            torch.index_select(self._sim.qvel, 1, self._layout.dof_columns, out=self.data.joint_vel)
