@@ -16,7 +16,7 @@ from pace_actuators import memory
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.files import remove_leftovers, write_together
 from pace_actuators.memory import available_memory, check_memory
-from pace_optim.fit import search_population
+from pace_optim.identification.beginning import search_population
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.cli import run_cli

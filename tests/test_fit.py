@@ -13,6 +13,8 @@ from problems import BENCH, TRUTH, chirp, record
 
 import pace_optim.fit as fit_module
 from pace_optim.fit import fit, resume
+from pace_optim.identification import optimization
+from pace_optim.identification.optimization import Optimization
 from pace_optim.recording import Drive, Load, load_recording, save_recording
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
@@ -235,7 +237,7 @@ def test_what_is_no_result_is_refused(content, message, tmp_path):
 
 def interrupt_after(monkeypatch, method, count):
     """Make the n-th call of a checkpoint-writing method end in Ctrl-C."""
-    original, calls = getattr(fit_module._Fit, method), []
+    original, calls = getattr(Optimization, method), []
 
     def wrapped(self, *args):
         original(self, *args)
@@ -243,7 +245,7 @@ def interrupt_after(monkeypatch, method, count):
         if len(calls) == count:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_module._Fit, method, wrapped)
+    monkeypatch.setattr(Optimization, method, wrapped)
 
 
 def same_result(resumed, whole):
@@ -304,7 +306,7 @@ def test_interrupted_while_it_tries_other_starts_resumes_to_the_same_result(
 ):
     options = {"optimizer": "least_squares"}
     whole, whole_folder = run(tmp_path, recordings["wrong"], **options)
-    original, calls = fit_module._Fit._after_iteration, []
+    original, calls = Optimization._after_iteration, []
 
     def interrupted(self, descents):
         original(self, descents)
@@ -313,7 +315,7 @@ def test_interrupted_while_it_tries_other_starts_resumes_to_the_same_result(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit_module._Fit, "_after_iteration", interrupted)
+        patch.setattr(Optimization, "_after_iteration", interrupted)
         _, folder = run(tmp_path, recordings["wrong"], **options)
     assert len(calls) == 2
     resumed, _ = resume(folder, progress=Silent())
@@ -327,7 +329,7 @@ def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp
     def at_once(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_module, "refine", at_once)
+    monkeypatch.setattr(optimization, "refine", at_once)
     result, folder = run(tmp_path, recordings["clean"])
     assert result.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
 

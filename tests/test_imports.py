@@ -28,6 +28,7 @@ FLOORS = {
         ["run", "experiment_design"],
         ["report", "data_collection"],
         ["comparison"],
+        ["identification"],
         ["fit"],
         ["diagnosis"],
         ["commands"],

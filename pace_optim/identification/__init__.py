@@ -1,0 +1,1 @@
+"""The parts of a fit: what it begins with, its optimizers, and what it concludes."""

@@ -1,0 +1,82 @@
+"""What a fit begins with: its problem, and what searches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.refine import BEGINNING
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.processes import Processes
+from pace_optim.problem.try_out import check_size, try_out
+from pace_optim.run.open import problem_of
+from pace_optim.run.settings import FitSettings
+
+_HYBRID_POPULATION = 48
+"""Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+
+
+def load_for_fit(settings: FitSettings, env_cfg: Any) -> Problem:
+    """Read everything, refuse what cannot be fitted, and try the simulation out.
+
+    Raises:
+        ValueError: If anything does not fit.
+    """
+    both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
+    if both:
+        raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
+    problem = problem_of(settings, env_cfg)
+    cmaes = problem.env_cfg.sim2real.cmaes
+    chosen = {
+        name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None
+    }
+    problem.env_cfg.sim2real.cmaes = replace(
+        cmaes,
+        per_tree=cmaes.per_tree and not settings.joint_strategy,
+        save_optimization_process=cmaes.save_optimization_process or settings.save_optimization_process,
+        **chosen,
+    )
+    if problem.dataset.num_recordings * 4 > settings.num_envs and settings.optimizer == "cmaes":
+        raise ValueError(
+            f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
+            f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
+        )
+    if not bool((problem.space.upper > problem.space.lower).any()):
+        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
+    try_out(problem)
+    if settings.device != "cpu":
+        problem.for_search(settings.device).make_env(1).close()
+    if settings.optimizer != "least_squares":  # which chooses how much it simulates at once
+        simulated = search_population(problem, settings) * len(problem.dataset.trained())
+        check_size(problem, simulated, settings.num_envs)
+    return problem
+
+
+def search_population(problem: Problem, settings: FitSettings) -> int:
+    """Candidates in a generation; a hybrid takes all of ``num_envs`` on a GPU alone."""
+    population = max(4, settings.num_envs // len(problem.dataset.trained()))
+    is_small = settings.optimizer == "hybrid" and settings.device == "cpu"
+    return min(population, _HYBRID_POPULATION) if is_small else population
+
+
+def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
+    """The search of a fit."""
+    return CMAESOptimizer(
+        problem.space,
+        search_population(problem, settings),
+        problem.env_cfg.sim2real.cmaes,
+        trees=problem.trees,
+        seed=settings.seed,
+        start=problem.space.start,
+        processes=processes,
+    )
+
+
+def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
+    """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
+    if settings.optimizer == "hybrid":
+        problem = problem.on_beginnings(BEGINNING)
+    return problem.training_evaluator()

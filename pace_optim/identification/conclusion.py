@@ -1,0 +1,141 @@
+"""What a fit concludes from where its optimizers ended: values, error bars, warnings; all of it is written."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import torch
+
+from pace_envs.task_source import EnvironmentRecord
+from pace_optim.comparison.drive_loads import drive_loads
+from pace_optim.identification.optimization import NEAR, Optimization, Outcome
+from pace_optim.optimizers.jacobian import Jacobian
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.run.result import FitResult, make_result, rmse_by_joint
+from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
+from pace_optim.uncertainty.consistency import Consistency, check_consistency
+from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
+from pace_optim.uncertainty.other_solutions import with_other_solutions
+from pace_optim.uncertainty.uncertainty import Uncertainty
+from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without, without_delay
+from pace_optim.uncertainty.warnings import fit_warnings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _End:
+    """The vector that is kept, and what is known of it."""
+
+    x: torch.Tensor
+    """Normalised, (size,)."""
+    uncertainty: Uncertainty
+    residuals: Residuals
+    """On all samples."""
+    jacobian: Jacobian
+    """On the training samples."""
+    left_open: list[str]
+    """Labels of what the recordings leave open: it is at its prior."""
+    train_rmse: float
+    """Where the optimizers ended [rad]."""
+    times: float | None
+    """The same as a multiple of the noise."""
+
+    @property
+    def is_far(self) -> bool:
+        """Whether that is so far above the noise that error bars mean nothing."""
+        return self.times is not None and self.times >= FAR_ABOVE_NOISE
+
+    def moved(self, x: torch.Tensor, known: Assessment, held: list[str], run: Optimization) -> _End:
+        """Another vector, with some parameters held."""
+        uncertainty = without(known.uncertainty, held, run.problem.space)
+        return replace(self, x=x, uncertainty=uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+
+
+def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> FitResult:
+    """Simulate the result once more on everything, with its derivatives, and write it down.
+
+    Args:
+        run: What has ended.
+        record: Where its environment comes from.
+        outcome: Where it ended.
+
+    Raises:
+        ValueError: If there the simulation diverges.
+    """
+    problem, space, data, settings = run.problem, run.problem.space, run.problem.dataset, run.settings
+    end = _settled(run, outcome)
+    every, physical = end.residuals, space.to_physical(end.x)
+    uncertainty = with_other_solutions(end.uncertainty, run.descents, space)
+    where = {"train": data.train[every.step], "validation": data.validation[every.step]}
+    rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
+    run.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
+    run.folder.write_json("drives.json", drive_loads(problem, run.assessor, physical[space["encoder_bias"]].numpy()))
+    score = float(every.error[0].square()[where["train"]].sum(dim=1).mean())
+    consistency = _check_consistency(run, outcome, end, score)
+    result = make_result(
+        problem,
+        end.x,
+        every,
+        uncertainty,
+        effects=problem.effects,
+        environment=record.to_dict(),
+        optimizer=settings.optimizer,
+        seed=settings.seed,
+        generations=run.optimizer.generation if run.optimizer else 0,
+        simulated_steps=run.steps + consistency.simulated_steps,
+        wall_time_s=run.progress.elapsed,
+        stop_reasons=[
+            f"stands still at {end.times:.3g} times the noise" if end.is_far and reason == "converged" else reason
+            for reason in outcome.stop_reasons
+        ],
+        undetermined=end.left_open,
+        times_noise=end.times,
+        std_means_nothing=end.is_far,
+        warnings=[
+            *far_end(end.times, end.train_rmse, settings.optimizer, run.searched),
+            *fit_warnings(problem, physical, uncertainty, rmse, end.left_open),
+            *consistency.sentences,
+        ],
+    )
+    result.save(run.folder.path / "result.json")
+    return result
+
+
+def _settled(run: Optimization, outcome: Outcome) -> _End:
+    """Error bars at the end; what the recordings leave open is put to its prior, and a delay that is none to none."""
+    problem, interrupted = run.problem, outcome.is_interrupted
+
+    def known_at(x: torch.Tensor) -> Assessment:
+        return assess(problem, run.assessor, run.colouring, x)
+
+    known = known_at(outcome.x)
+    run.refuse_divergence(float(known.residuals.score[0]))
+    train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)["all"]
+    end = _End(
+        x=outcome.x,
+        uncertainty=known.uncertainty,
+        residuals=known.residuals,
+        jacobian=known.jacobian,
+        left_open=[],
+        train_rmse=train,
+        times=times_noise(problem, train),
+    )
+    left_open = undetermined(problem, end.uncertainty, end.is_far)
+    if left_open:
+        x, left_open = held_at_prior(problem, end.x, end.uncertainty, left_open, None if interrupted else NEAR)
+        end = replace(end.moved(x, known_at(x), left_open, run), left_open=left_open)
+    if not end.is_far and not interrupted:
+        none = without_delay(problem, end.x, end.uncertainty, left_open, NEAR)
+        if none is not None:
+            end = end.moved(none, known_at(none), [*left_open, DELAY], run)
+    return end
+
+
+def _check_consistency(run: Optimization, outcome: Outcome, end: _End, score: float) -> Consistency:
+    """Fit each recording alone, where there are several and the optimizer can afford it."""
+    wanted = run.settings.check_consistency and run.settings.optimizer != "cmaes"
+    if not wanted or outcome.is_interrupted:
+        return Consistency()
+    result = check_consistency(run.problem, end.x, score, run.progress.say, end.jacobian)
+    if result.recordings:
+        run.folder.write_json("consistency.json", asdict(result))
+    return result
