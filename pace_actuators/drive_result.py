@@ -18,6 +18,9 @@ ALL = "all"
 BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
 """Parameters of the base model per joint, named as in ``PaceDCMotorCfg``."""
 
+NOT_NEGATIVE = ("armature", "viscous_friction", "friction", "delay")
+"""Parameters of which no value is below 0."""
+
 CURE = "Fit again."
 
 _LONGEST = 100.0
@@ -79,7 +82,7 @@ class DriveResult:
         for name in BASE_FIELDS:
             self._expect(name, self.joint_names, source)
         self._expect("delay", [ALL], source)
-        for name in ("armature", "viscous_friction", "friction", "delay"):
+        for name in NOT_NEGATIVE:
             for key, value in self.parameters[name].items():
                 if value < 0:
                     refuse(source, f"{name} of {key} is {value:g}, expected at least 0", CURE)

@@ -6,10 +6,10 @@ import math
 
 import torch
 
+from pace_actuators.drive_result import NOT_NEGATIVE
 from pace_actuators.effects import get_effect
 from pace_actuators.identified import BASE_FIELDS, IdentifiedDrives
 
-_NOT_NEGATIVE = ("armature", "viscous_friction", "friction", "delay")
 _FARTHEST = 3.0
 """Standard deviations at which draws end."""
 
@@ -67,7 +67,7 @@ def _range(name: str) -> tuple[float, float]:
     if dot:
         declared = next(p for p in get_effect(effect).parameters if p.name == parameter)
         return declared.lower, declared.upper
-    return (0.0 if name in _NOT_NEGATIVE else -math.inf), math.inf
+    return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf
 
 
 def _correlation(drives: IdentifiedDrives, labels: list[tuple[str, str]]) -> torch.Tensor:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.drive_result import ALL
 from pace_optim.report.number_text import angle_unit, three_figures
 from pace_optim.report.trajectory_errors import rms
 
@@ -59,7 +60,7 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
     """The steps of the ladder, in the order of the runs, and the noise floor beneath it."""
     joints, tracks = runs[-1].result.joint_names, runs[-1].tracks
     floors = {joint: _floor(j, tracks) for j, joint in enumerate(joints)}
-    floors["all"] = float(np.sqrt(np.mean(np.square(list(floors.values())))))
+    floors[ALL] = float(np.sqrt(np.mean(np.square(list(floors.values())))))
     steps: list[dict[str, Any]] = []
     for run, name in zip(runs, _names(runs), strict=True):
         rmse = {part: _rmse_by_joint(run, part) for part in _PARTS}
@@ -72,9 +73,7 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
                 "physics_dt": run.physics_dt,
                 "rmse": rmse,
                 "ratio_to_previous": {
-                    part: before[part]["all"] / rmse[part]["all"]
-                    for part in _PARTS
-                    if before[part] and rmse[part].get("all")
+                    part: before[part][ALL] / rmse[part][ALL] for part in _PARTS if before[part] and rmse[part].get(ALL)
                 },
             }
         )
@@ -83,11 +82,11 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
 
 def ladder_table(ladder: dict[str, Any]) -> str:
     """The ladder for a terminal."""
-    steps, floor = ladder["steps"], ladder["noise_floor"]["all"]
-    factor, unit = angle_unit([s["rmse"][part].get("all") for s in steps for part in _PARTS])
+    steps, floor = ladder["steps"], ladder["noise_floor"][ALL]
+    factor, unit = angle_unit([s["rmse"][part].get(ALL) for s in steps for part in _PARTS])
     rows = [["", *(f"{part} [{unit}]" for part in _PARTS), "× better (train, validation)"]]
     for step in steps:
-        values = [_cell(step["rmse"][part].get("all"), factor) for part in _PARTS]
+        values = [_cell(step["rmse"][part].get(ALL), factor) for part in _PARTS]
         ratio = [f"{step['ratio_to_previous'][part]:.2f}" for part in _PARTS if part in step["ratio_to_previous"]]
         rows.append([step["name"], *values, ", ".join(ratio)])
     rows.append(["noise floor", *[_cell(floor, factor)] * 2, ""])
@@ -119,7 +118,7 @@ def _rmse_by_joint(run: RunTracks, part: str) -> dict[str, float]:
     every = rmse_by_part(run.tracks)
     if part not in every:
         return {}
-    return {j: rmse_by_part(run.tracks, i)[part] for i, j in enumerate(run.result.joint_names)} | {"all": every[part]}
+    return {j: rmse_by_part(run.tracks, i)[part] for i, j in enumerate(run.result.joint_names)} | {ALL: every[part]}
 
 
 def _cell(value: float | None, factor: float) -> str:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 import torch
 
+from pace_actuators.drive_result import ALL
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
@@ -109,7 +110,7 @@ def _settled(run: Optimization, outcome: Outcome) -> _End:
 
     known = known_at(outcome.x)
     run.refuse_divergence(float(known.residuals.score[0]))
-    train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)["all"]
+    train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)[ALL]
     end = _End(
         x=outcome.x,
         uncertainty=known.uncertainty,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.one_kernel.robot_kernel import CompiledRobot
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.dataset import Dataset
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 _LOAD_STEPS = 6
 """Fixed-point steps of a start whose positions depend on the load there."""
-_DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 
 
 class Rollout:
@@ -277,7 +277,7 @@ class Rollout:
         rows = slice(r, None, self.dataset.num_recordings)
         position, velocity = recording.has_position_command, recording.has_velocity_command
         for actuator in self.robot.actuators.values():
-            for name in _DRIVE_FIELDS:
+            for name in DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
                 if value is not None:
                     own = self.env.sim.tensor(value)[actuator.joint_indices]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from pace_actuators.identified import DRIVE_FIELDS
+
 COMMAND_SERIES = ("des_dof_pos", "des_dof_vel", "des_dof_effort")
 """What a drive may be told; at least one of them is in every recording."""
 MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
@@ -13,7 +15,7 @@ SERIES = ("time", *JOINT_SERIES, "torque_enable", "des_time")
 UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
 UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
 """Unit of each series of joints."""
-DRIVE_FACTS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
 FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "comment")
 

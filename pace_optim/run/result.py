@@ -99,7 +99,7 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     square = residuals.error[0].square()[where].mean(dim=0)
     return {
         **{name: math.sqrt(value) for name, value in zip(joint_names, square.tolist(), strict=True)},
-        "all": math.sqrt(float(square.mean())),
+        ALL: math.sqrt(float(square.mean())),
     }
 
 

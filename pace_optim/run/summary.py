@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, in_slide_units, unit_for
 from pace_optim.run.result import FitResult
 
 
 def summary(result: FitResult) -> str:
     """The table of parameters with error bars, the errors and the warnings."""
-    names = [name for name, values in result.parameters.items() if set(values) != {"all"}]
+    names = [name for name, values in result.parameters.items() if set(values) != {ALL}]
     width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
@@ -16,7 +17,7 @@ def summary(result: FitResult) -> str:
         lines += _table(result, names, joints, joint_type, width)
     whole = in_slide_units if all(result.joint_type(joint) == "slide" for joint in result.joint_names) else str
     for name, values in result.parameters.items():
-        if set(values) == {"all"}:
+        if set(values) == {ALL}:
             text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
             if name == "delay":
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from pace_actuators.drive_result import ALL
 from pace_optim.run.result import FitResult
 
 if TYPE_CHECKING:
@@ -80,10 +81,10 @@ class TensorBoardLog:
         """Log what the fit ended with."""
         write = self._writer
         metrics = {"result/score": result.score, "result/delay_s": result.delay_s}
-        metrics |= {f"result/rmse/{part}": errors["all"] for part, errors in result.rmse.items() if "all" in errors}
+        metrics |= {f"result/rmse/{part}": errors[ALL] for part, errors in result.rmse.items() if ALL in errors}
         for part, errors in result.rmse.items():
             for joint, value in errors.items():
-                if joint != "all":
+                if joint != ALL:
                     write.add_scalar(f"result/rmse/{part}/{joint}", value)
         for name, values in result.parameters.items():
             for key, value in values.items():

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.drive_result import ALL
+from pace_actuators.identified import DRIVE_FIELDS
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -50,7 +52,7 @@ class TrainingReplay:
     def largest_change(self) -> float:
         """Relative change of the error of all joints, the larger of training and validation data."""
         parts = [part for part in self.replayed if self.replayed[part] and self.fitted.get(part)]
-        return max((abs(self.replayed[p]["all"] / self.fitted[p]["all"] - 1) for p in parts), default=float("nan"))
+        return max((abs(self.replayed[p][ALL] / self.fitted[p][ALL] - 1) for p in parts), default=float("nan"))
 
     def __str__(self) -> str:
         """A table: one line per joint."""
@@ -58,7 +60,7 @@ class TrainingReplay:
         parts = [part for part in ("train", "validation") if self.replayed.get(part)]
         head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>9}" for part in parts)
         lines = [f"{'RMSE [mrad]':<{width}}{head}"]
-        for name in (*self.joint_names, "all"):
+        for name in (*self.joint_names, ALL):
             cells = ""
             for part in parts:
                 fitted, here = self.fitted[part][name], self.replayed[part][name]
@@ -155,8 +157,7 @@ def _held_robot(fitted: PaceSim2realEnvCfg, training: ManagerBasedEnvCfg, folder
 def _with_recorded_gains(drive: Any, fitted: PaceSim2realEnvCfg) -> Any:
     """A training drive with the gains and limits of the identification task, for results that do not say them."""
     groups = [each for each in fitted.scene.robot.actuators.values() if each.joint_names_expr == drive.joint_names_expr]
-    names = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
-    return replace(drive, **{name: getattr(groups[0], name) for name in names}) if groups else drive
+    return replace(drive, **{name: getattr(groups[0], name) for name in DRIVE_FIELDS}) if groups else drive
 
 
 def _control_dt(cfg: PaceSim2realEnvCfg) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
+from pace_actuators.drive_result import ALL
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -96,7 +97,7 @@ def _of(keys: Sequence[str]) -> str:
 
 def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
     """Whether the error on other data is larger than the fit and the physics step (its change [rad]) make it."""
-    train, validation = rmse["train"].get("all"), rmse["validation"].get("all")
+    train, validation = rmse["train"].get(ALL), rmse["validation"].get(ALL)
     if not train or not validation or validation < _NOTHING:
         return []
     of_the_step = change if change <= _OF_THE_STEP[1] * validation else 0.0
@@ -117,7 +118,7 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
     slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
     low = problem.space.lower[problem.space["delay"]]
     at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
-    if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get("all")) or 0.0) < FAR_ABOVE_NOISE:
+    if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [
         f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between; "
@@ -129,13 +130,13 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
 def _change_at_half_the_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> float:
     """RMS change of the motion when the physics step is halved [rad], where errors are judged."""
     data = problem.dataset
-    where = data.validation if rmse["validation"].get("all") else data.train
+    where = data.validation if rmse["validation"].get(ALL) else data.train
     return float(step_error(problem, physical, where).square().mean().sqrt())
 
 
 def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: float) -> list[str]:
     """Whether a part of the error may come from the physics step (its change [rad])."""
-    left = rmse["validation"].get("all") or rmse["train"].get("all")
+    left = rmse["validation"].get(ALL) or rmse["train"].get(ALL)
     least, most = _OF_THE_STEP
     if not left or not least * left <= change <= most * left:
         return []
@@ -167,7 +168,7 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
 def in_words(labels: tuple[str, ...]) -> str:
     """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
     names = [label.split("/")[0].replace("_", " ") for label in labels]
-    keys = {label.split("/", 1)[1] for label in labels} - {"all"}
+    keys = {label.split("/", 1)[1] for label in labels} - {ALL}
     if len(keys) == 1:
         return f"{_listed(names)} of {keys.pop()}"
     return _listed([f"{name} of {label.split('/', 1)[1]}" for name, label in zip(names, labels, strict=True)])

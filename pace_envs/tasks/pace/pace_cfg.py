@@ -9,9 +9,10 @@ from typing import Any
 
 import torch
 
+from pace_actuators.drive_result import BASE_FIELDS
 from pace_actuators.effects import EffectCfg
 
-PARAMETER_GROUPS = ("armature", "viscous_friction", "friction", "encoder_bias")
+PARAMETER_GROUPS = BASE_FIELDS
 """The parameters of each joint, in the order of the parameter vector; the delay follows them."""
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from pace_actuators.drive_result import ALL
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, unit_for
@@ -18,7 +19,7 @@ from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
 
-GLOBAL = "all"
+GLOBAL = ALL
 """The key of a parameter that all joints share."""
 
 UNITS = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pace_actuators.drive_result import ALL
+
 from ..markup import Section, bullets, esc, figure
 from ..run_data import RunData
 from ..wording import in_words, pretty_unit
@@ -58,7 +60,7 @@ def _plot(run: RunData, content: dict, number: int, name: str) -> str:
                 "hovertemplate": "%{text} %{y:.4g}",
             }
         )
-    ticks = {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if key == "all" else key for key in keys]}
+    ticks = {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if key == ALL else key for key in keys]}
     layout = {"xaxis": {"range": [-0.5, len(keys) - 0.5], "zeroline": False} | ticks, "showlegend": True}
     unit = " or ".join(dict.fromkeys(pretty_unit(run.result.unit_of(name, key)) for key in keys))
     heading = f"<h3>{esc(in_words(name))} <small>{esc(unit)}</small></h3>"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pace_actuators.drive_result import ALL
+
 from ..markup import Section, bullets, figure
 from ..run_data import RunData
 from ..wording import in_words
@@ -51,7 +53,7 @@ def _in_sentences(pairs: list[tuple[float, str, str]], labels: list[str]) -> lis
     groups: dict[tuple[str, ...], list[tuple[float, str]]] = {}
     for value, a, b in pairs:
         (name_a, key_a), (name_b, key_b) = a.split("/", 1), b.split("/", 1)
-        same = key_a == key_b != "all"
+        same = key_a == key_b != ALL
         groups.setdefault((name_a, name_b) if same else (a, b, "each its own"), []).append((value, key_a))
     sentences = []
     for names, found in groups.items():
@@ -67,14 +69,14 @@ def _in_sentences(pairs: list[tuple[float, str, str]], labels: list[str]) -> lis
 
 def _listed(found: list[tuple[float, str]], labels: list[str]) -> str:
     """Joints in their order, or that it is all of them."""
-    joints = [key for key in dict.fromkeys(label.split("/", 1)[1] for label in labels) if key != "all"]
+    joints = [key for key in dict.fromkeys(label.split("/", 1)[1] for label in labels) if key != ALL]
     named = {key for _, key in found}
     return "every joint" if len(joints) == len(named) > 1 else ", ".join(key for key in joints if key in named)
 
 
 def _say(label: str) -> str:
     name, key = label.split("/", 1)
-    return in_words(name).lower() + ("" if key == "all" else f" of {key}")
+    return in_words(name).lower() + ("" if key == ALL else f" of {key}")
 
 
 def _heat_map(labels: list[str], matrix: list[list[float | None]]) -> dict:

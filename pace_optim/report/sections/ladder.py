@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pace_actuators.drive_result import ALL
 from pace_optim.report.number_text import angle_unit, three_figures
 
 from ..markup import Section, esc, figure, table
@@ -23,18 +24,18 @@ def ladder(run: RunData) -> Section | None:
     parts = [part for part in _PARTS if all(step["rmse"].get(part) for step in steps)]
     if not parts:
         return None
-    factor, unit = angle_unit([step["rmse"][part]["all"] for step in steps for part in parts])
+    factor, unit = angle_unit([step["rmse"][part][ALL] for step in steps for part in parts])
     return Section(
         id="ladder",
         title="Error ladder",
-        lead=_sentence(steps, parts[0], floor["all"]),
+        lead=_sentence(steps, parts[0], floor[ALL]),
         html=figure("error-ladder", _traces(steps, parts, floor, factor, unit), _layout(unit), height=360)
         + _table(steps, parts, floor, factor, unit),
     )
 
 
 def _sentence(steps: list[dict[str, Any]], part: str, floor: float) -> str:
-    first, last = (step["rmse"][part]["all"] for step in (steps[0], steps[-1]))
+    first, last = (step["rmse"][part][ALL] for step in (steps[0], steps[-1]))
     factor, unit = angle_unit([first])
     change = first / last if last > 0 else 1.0
     size = (
@@ -51,7 +52,7 @@ def _traces(
     steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float], factor: float, unit: str
 ) -> list[dict[str, Any]]:
     names = [f"{i + 1}. {step['name']}" for i, step in enumerate(steps)]
-    joints = [joint for joint in steps[-1]["rmse"][parts[0]] if joint != "all"]
+    joints = [joint for joint in steps[-1]["rmse"][parts[0]] if joint != ALL]
     traces: list[dict[str, Any]] = [
         {
             "type": "scatter",
@@ -74,7 +75,7 @@ def _traces(
                 "mode": "lines+markers",
                 "name": f"{word}, all joints" if len(joints) > 1 else word,
                 "x": names,
-                "y": [factor * step["rmse"][part]["all"] for step in steps],
+                "y": [factor * step["rmse"][part][ALL] for step in steps],
                 "line": {"width": 2.5, "color": color},
                 "marker": {"size": 8},
                 "hovertemplate": f"{word}: %{{y:.3g}} {unit}<extra></extra>",
@@ -86,7 +87,7 @@ def _traces(
             "mode": "lines",
             "name": "noise floor",
             "x": names,
-            "y": [factor * floor["all"]] * len(names),
+            "y": [factor * floor[ALL]] * len(names),
             "line": {"width": 1.5, "dash": "dot", "color": "var(--muted)"},
             "hovertemplate": f"noise floor: %{{y:.3g}} {unit}<extra></extra>",
         }
@@ -110,9 +111,9 @@ def _table(steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float
         cells = [f"<b>{esc(step['name'])}</b>"]
         for part in parts:
             ratio = step["ratio_to_previous"].get(part)
-            cells += [three_figures(factor * step["rmse"][part]["all"]), "" if ratio is None else f"{ratio:.3g}"]
+            cells += [three_figures(factor * step["rmse"][part][ALL]), "" if ratio is None else f"{ratio:.3g}"]
         rows.append(cells)
-    rows.append(["noise floor", *[three_figures(factor * floor["all"]), ""] * len(parts)])
+    rows.append(["noise floor", *[three_figures(factor * floor[ALL]), ""] * len(parts)])
     head = ["model"]
     for part in parts:
         head += [f"{_PARTS[part][0]} [{unit}]", "× better than before"]

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pace_actuators.drive_result import ALL
 from pace_optim.report.number_text import angle_text, angle_unit, three_figures
 from pace_optim.run.result import FitResult
 
@@ -36,15 +37,15 @@ def overview(run: RunData) -> Section:
 
 
 def _headline(result: FitResult) -> str:
-    error = result.rmse.get("validation", {}).get("all")
+    error = result.rmse.get("validation", {}).get(ALL)
     if error is not None:
         return f"The simulation follows the robot to {angle_text(error)} on data it was not fitted to"
     return f"The simulation follows the robot to {angle_text(result.rmse['train']['all'])} on the data it was fitted to"
 
 
 def _verdict(run: RunData) -> str:
-    train = run.result.rmse["train"].get("all")
-    held_out = run.result.rmse.get("validation", {}).get("all")
+    train = run.result.rmse["train"].get(ALL)
+    held_out = run.result.rmse.get("validation", {}).get(ALL)
     share = _share_of_motion(run, held_out is not None)
     part = "" if share is None else f", {_percent(share)} of how far they move"
     sentences = [f"That is the root mean square over all joints{part}."]
@@ -80,13 +81,13 @@ def _share_of_motion(run: RunData, held_out: bool) -> float | None:
 
 def _worst_joint(result: FitResult) -> tuple[str, float]:
     errors = result.rmse.get("validation") or result.rmse["train"]
-    return max(((joint, value) for joint, value in errors.items() if joint != "all"), key=lambda item: item[1])
+    return max(((joint, value) for joint, value in errors.items() if joint != ALL), key=lambda item: item[1])
 
 
 def _figures(result: FitResult) -> str:
     """The handful of numbers that everyone asks for."""
     worst, error = _worst_joint(result)
-    held_out, train = result.rmse.get("validation", {}).get("all"), result.rmse["train"].get("all")
+    held_out, train = result.rmse.get("validation", {}).get(ALL), result.rmse["train"].get(ALL)
     factor, unit = angle_unit([held_out, train, error])
 
     def said(value: float | None) -> str:
@@ -129,7 +130,7 @@ def _sentence(text: str) -> str:
 def _errors_by_joint(result: FitResult) -> str:
     """A row of bars per joint; a click shows its curves."""
     parts = [(name, result.rmse[name]) for name in ("train", "validation") if result.rmse.get(name)]
-    every = [value for _, errors in parts for joint, value in errors.items() if joint != "all"]
+    every = [value for _, errors in parts for joint, value in errors.items() if joint != ALL]
     factor, unit = angle_unit(every)
     largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
     rows = []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from pace_actuators.drive_result import ALL
+
 from ..markup import Section, esc, table
 from ..run_data import RunData
 from ..wording import in_words, pretty_unit, value_and_error
@@ -16,12 +18,10 @@ _WIDTH, _HEIGHT, _INSET = 360, 20, 6
 def parameters(run: RunData) -> Section:
     """A table per parameter; those of the whole robot share one."""
     result = run.result
-    shared = [name for name, values in result.parameters.items() if set(values) == {"all"}]
+    shared = [name for name, values in result.parameters.items() if set(values) == {ALL}]
     cards = [_card(run, name) for name in result.parameters if name not in shared]
     if shared:
-        rows = [
-            _row(run, name, "all", in_words(name), pretty_unit(result.unit_of(name, "all")), None) for name in shared
-        ]
+        rows = [_row(run, name, ALL, in_words(name), pretty_unit(result.unit_of(name, ALL)), None) for name in shared]
         note = (
             f"<p>The delay is that of the <b>{esc(result.delay_mode)}</b>: "
             f"{1e3 * result.delay_s:.4g} ms at a control step of {1e3 * result.control_dt:g} ms.</p>"
