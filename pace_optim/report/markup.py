@@ -1,13 +1,23 @@
-"""Small pieces of HTML. Whatever comes from a run goes through :func:`esc` or :func:`json_script`."""
+"""Small pieces of HTML. Whatever comes from a run is escaped by the templates, or goes through :func:`json_script`."""
 
 from __future__ import annotations
 
-import html
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+ENVIRONMENT = Environment(
+    autoescape=True,
+    undefined=StrictUndefined,
+    loader=PackageLoader("pace_optim.report", "."),
+    keep_trailing_newline=True,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,27 +28,56 @@ class Section:
     """Its anchor."""
     title: str
     """Its heading, plain text."""
-    html: str
+    html: Markup
     """Its content."""
     lead: str = ""
     """A sentence under the heading, plain text."""
 
 
-def esc(value: object) -> str:
-    """Text that is safe in HTML and in its attributes."""
-    return html.escape(str(value), quote=True)
+def html(template: str, **values: Any) -> Markup:
+    """HTML of a template of Jinja: what is put into it is escaped, unless it is HTML of this kind already."""
+    return Markup(_template(template).render(values))
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], css: str = "") -> str:
-    """A table of cells that are HTML already; it scrolls sideways where the page is narrow."""
-    head = "".join(f"<th>{cell}</th>" for cell in header)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+@cache
+def _template(text: str) -> Template:
+    return ENVIRONMENT.from_string(text)
 
 
-def bullets(entries: Sequence[str], css: str = "") -> str:
-    """A list of plain texts."""
-    return f'<ul class="{css}">' + "".join(f"<li>{esc(entry)}</li>" for entry in entries) + "</ul>"
+def joined(parts: Iterable[Markup]) -> Markup:
+    """Pieces of HTML one after another."""
+    return Markup("").join(parts)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], css: str = "") -> Markup:
+    """A table of cells that are text or HTML; it scrolls sideways where the page is narrow."""
+    return html(
+        '<div class="scroll"><table class="{{ css }}"><thead><tr>{% for cell in header %}<th>{{ cell }}</th>'
+        "{% endfor %}</tr></thead><tbody>{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}"
+        "</tr>{% endfor %}</tbody></table></div>",
+        header=header,
+        rows=rows,
+        css=css,
+    )
+
+
+def bullets(entries: Sequence[str], css: str = "") -> Markup:
+    """A list of texts."""
+    return html(
+        '<ul class="{{ css }}">{% for entry in entries %}<li>{{ entry }}</li>{% endfor %}</ul>',
+        entries=entries,
+        css=css,
+    )
+
+
+def folded(count: int, content: Markup) -> Markup:
+    """So many entries more, which a click shows."""
+    return html("<details><summary>{{ count }} more</summary>{{ content }}</details>", count=count, content=content)
+
+
+def bold(text: str) -> Markup:
+    """A text in bold."""
+    return html("<b>{{ text }}</b>", text=text)
 
 
 def figure(
@@ -48,7 +87,7 @@ def figure(
     *,
     height: int = 380,
     views: Sequence[dict[str, Any]] = (),
-) -> str:
+) -> Markup:
     """A plotly figure, which the page's script draws in the page's colours.
 
     Args:
@@ -60,13 +99,16 @@ def figure(
             ``Plotly.update`` takes them.
     """
     spec = {"data": list(data), "layout": layout, "views": list(views)}
-    return (
-        f'<figure class="plot" id="{esc(id)}"><div class="views"></div>'
-        f'<div class="canvas" style="height:{height}px"></div>{json_script(spec)}</figure>'
+    return html(
+        '<figure class="plot" id="{{ id }}"><div class="views"></div>'
+        '<div class="canvas" style="height:{{ height }}px"></div>{{ script }}</figure>',
+        id=id,
+        height=height,
+        script=json_script(spec),
     )
 
 
-def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> str:
+def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> Markup:
     """Radio buttons that look like pills: arrow keys go from one to the next.
 
     Args:
@@ -75,23 +117,24 @@ def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> s
         group: Sets them apart from another choice of the same on the page.
         at: Which one the page opens on.
     """
-    pills = "".join(
-        f'<label><input type="radio" name="{esc(group + name)}" value="{i}"{" checked" if i == at else ""}>'
-        f"<span>{esc(entry)}</span></label>"
-        for i, entry in enumerate(entries)
-    )
-    hidden = " hidden" if len(entries) == 1 and name == "recording" else ""
-    return (
-        f'<div class="pills" role="radiogroup" aria-label="{esc(name)}" data-choice="{esc(name)}"{hidden}>'
-        f"<b>{esc(name.capitalize())}</b><div>{pills}</div></div>"
+    return html(
+        '<div class="pills" role="radiogroup" aria-label="{{ name }}" data-choice="{{ name }}"{{ hidden }}>'
+        "<b>{{ name.capitalize() }}</b><div>{% for entry in entries %}"
+        '<label><input type="radio" name="{{ group + name }}" value="{{ loop.index0 }}"'
+        '{{ " checked" if loop.index0 == at }}><span>{{ entry }}</span></label>{% endfor %}</div></div>',
+        name=name,
+        entries=entries,
+        group=group,
+        at=at,
+        hidden=" hidden" if len(entries) == 1 and name == "recording" else "",
     )
 
 
-def json_script(content: Any) -> str:
+def json_script(content: Any) -> Markup:
     """Data for the page's script; numbers that JSON does not have become ``null``."""
     text = json.dumps(_finite(content), separators=(",", ":"), allow_nan=False)
     text = text.replace("<", "\\u003c")  # so that no text in it can close the script
-    return f'<script type="application/json">{text}</script>'
+    return Markup(f'<script type="application/json">{text}</script>')
 
 
 def _finite(content: Any) -> Any:

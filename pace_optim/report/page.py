@@ -8,12 +8,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from pace_actuators.files import write_atomically
 from pace_actuators.joint_units import in_slide_units
 
-from .markup import Section, esc
+from .markup import ENVIRONMENT, Section
 from .run_data import RunData
 from .sections import SECTIONS
 
@@ -52,7 +53,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
     run = RunData.load(Path(folder), new)
     sections = make_sections(run)
     if all(run.result.joint_type(joint) == "slide" for joint in run.result.joint_names):
-        sections = [replace(s, lead=in_slide_units(s.lead), html=in_slide_units(s.html)) for s in sections]
+        sections = [replace(s, lead=in_slide_units(s.lead), html=Markup(in_slide_units(s.html))) for s in sections]
     return render(run, sections).encode()
 
 
@@ -89,34 +90,11 @@ def render(run: RunData, sections: list[Section], *, figures: bool = True) -> st
     here = files(__package__)
     texts = [get_plotlyjs(), here.joinpath("script.js").read_text("utf-8")] if figures else []
     texts.append(here.joinpath("motion", "viewer.js").read_text("utf-8"))
-    scripts = "".join(f"<script>{text}</script>\n" for text in texts)
-    links = "".join(f'<a href="#{esc(s.id)}">{esc(s.title)}</a>' for s in sections)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
-<title>{esc(run.result.robot_name)} · {esc(run.folder.resolve().name)}</title>
-<link rel="icon" href="data:,">
-<style>{here.joinpath("style.css").read_text("utf-8")}</style>
-</head>
-<body>
-<nav>{links}</nav>
-<main>
-{"".join(_section(section, first=i == 0) for i, section in enumerate(sections))}
-</main>
-<footer>The numbers behind this page are in <code>result.json</code> beside it; positions in
-<code>best_trajectory.pt</code>.</footer>
-{scripts}
-</body>
-</html>
-"""
-
-
-def _section(section: Section, *, first: bool) -> str:
-    level = "h1" if first else "h2"
-    lead = f'<p class="lead">{esc(section.lead)}</p>' if section.lead else ""
-    heading = "" if first else f"<{level}>{esc(section.title)}</{level}>"
-    return f'<section id="{esc(section.id)}">{heading}{lead}{section.html}</section>\n'
+    return ENVIRONMENT.get_template("page.html").render(
+        policy=_POLICY,
+        robot=run.result.robot_name,
+        folder=run.folder.resolve().name,
+        style=here.joinpath("style.css").read_text("utf-8"),
+        sections=sections,
+        scripts=texts,
+    )

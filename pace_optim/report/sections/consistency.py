@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from markupsafe import Markup
+
 from pace_actuators.drive_result import ALL
 
-from ..markup import Section, bullets, esc, figure
+from ..markup import Section, bullets, figure, html, joined
 from ..run_data import RunData
 from ..wording import in_words, pretty_unit
 
@@ -22,17 +24,17 @@ def consistency(run: RunData) -> Section | None:
     said = (
         bullets([pretty_unit(text) for text in sentences])
         if sentences
-        else "<p>All recordings agree within their error bars.</p>"
+        else html("<p>All recordings agree within their error bars.</p>")
     )
     return Section(
         id="consistency",
         title="Recordings compared",
         lead="Every recording was fitted alone, starting at the common result. Bars span 95 %.",
-        html=said + "".join(_plot(run, content, i, name) for i, name in enumerate(names)),
+        html=said + joined(_plot(run, content, i, name) for i, name in enumerate(names)),
     )
 
 
-def _plot(run: RunData, content: dict, number: int, name: str) -> str:
+def _plot(run: RunData, content: dict, number: int, name: str) -> Markup:
     labels = [label for label in content["values"] if label.split("/")[0] == name]
     keys = [label.split("/", 1)[1] for label in labels]
     data: list[dict] = []
@@ -63,5 +65,5 @@ def _plot(run: RunData, content: dict, number: int, name: str) -> str:
     ticks = {"tickvals": list(range(len(keys))), "ticktext": ["all joints" if key == ALL else key for key in keys]}
     layout = {"xaxis": {"range": [-0.5, len(keys) - 0.5], "zeroline": False} | ticks, "showlegend": True}
     unit = " or ".join(dict.fromkeys(pretty_unit(run.result.unit_of(name, key)) for key in keys))
-    heading = f"<h3>{esc(in_words(name))} <small>{esc(unit)}</small></h3>"
+    heading = html("<h3>{{ name }} <small>{{ unit }}</small></h3>", name=in_words(name), unit=unit)
     return heading + figure(f"consistency-{number}", data, layout, height=240)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pace_actuators.drive_result import ALL
 
-from ..markup import Section, bullets, figure
+from ..markup import Section, bullets, figure, html
 from ..run_data import RunData
 from ..wording import in_words
 
@@ -24,9 +24,12 @@ def correlation(run: RunData) -> Section | None:
     if len(words) > _MOST_SENTENCES:
         words = [*words[:_MOST_SENTENCES], f"and {len(words) - _MOST_SENTENCES} more"]
     said = (
-        f"<p>Beyond ±{_STRONG:g}, so that the recording hardly tells one from the other:</p>" + bullets(words)
+        html(
+            "<p>Beyond ±{{ strong }}, so that the recording hardly tells one from the other:</p>", strong=f"{_STRONG:g}"
+        )
+        + bullets(words)
         if words
-        else f"<p>No pair is beyond ±{_STRONG:g}.</p>"
+        else html("<p>No pair is beyond ±{{ strong }}.</p>", strong=f"{_STRONG:g}")
     )
     return Section(
         id="correlation",

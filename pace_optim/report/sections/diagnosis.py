@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from markupsafe import Markup
+
 from pace_optim.report.number_text import three_figures
 from pace_optim.report.sizes import size_text
 
-from ..markup import Section, bullets, esc, figure, table
+from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
 from ..wording import in_words
 from .verdict import callout
@@ -34,7 +36,7 @@ def diagnosis(run: RunData) -> Section | None:
         _joints(content),
     ]
     parts += [_advice(content), _data(content)]
-    return Section(id="diagnosis", title="Which effect is missing", html="".join(parts))
+    return Section(id="diagnosis", title="Which effect is missing", html=joined(parts))
 
 
 def _floor(content: dict[str, Any]) -> float:
@@ -43,61 +45,62 @@ def _floor(content: dict[str, Any]) -> float:
     return (sum(floor**2 for floor in floors) / max(1, len(floors))) ** 0.5
 
 
-def _sizes(content: dict[str, Any]) -> str:
+def _sizes(content: dict[str, Any]) -> Markup:
     """How large what was found is."""
     sizes = content.get("sizes")
     if not sizes:
-        return ""
+        return Markup("")
     likes = content.get("likes", {})
     rows = [
         [
-            f"<b>{esc(size['effect'])}</b>",
-            esc(size["parameter"].replace("_", " ")),
-            esc(size["joint"]),
-            esc(size_text(size)),
-            esc(", ".join(likes.get(size["effect"], [])) or "–"),
+            bold(size["effect"]),
+            size["parameter"].replace("_", " "),
+            size["joint"],
+            size_text(size),
+            ", ".join(likes.get(size["effect"], [])) or "–",
         ]
         for size in sizes
     ]
     head = ["effect", "parameter", "joint", "size ± standard deviation", "cannot be told from"]
-    return f"<h3>How large it is</h3>{table(head, rows)}"
+    return _titled("How large it is", table(head, rows))
 
 
-def _ladder(content: dict[str, Any]) -> str:
+def _ladder(content: dict[str, Any]) -> Markup:
     steps = content.get("ladder", [])
     if not steps:
-        return ""
+        return Markup("")
     floor = _floor(content)
     factor, unit = _FACTOR, _UNIT
     rows, before = [], None
     for step in steps:
         error = step["validation_rmse"]
         gain = "" if before is None or error <= 0 else f"{before / error:.3g}"
-        model = esc(step["model"]).replace("|", "|<wbr>")
-        rows.append([f"<b>{model}</b>", three_figures(factor * error), gain])
+        model = html("<b>{{ parts | join(bar) }}</b>", parts=step["model"].split("|"), bar=Markup("|<wbr>"))
+        rows.append([model, three_figures(factor * error), gain])
         before = error
     rows.append(["floor of noise and numerics", three_figures(factor * floor), ""])
     head = ["model, each joint simulated alone", f"validation [{unit}]", "× better than before"]
-    return f"<h3>The error with it</h3>{table(head, rows, 'ladder')}"
+    return _titled("The error with it", table(head, rows, "ladder"))
 
 
-def _ranking(content: dict[str, Any]) -> str:
+def _ranking(content: dict[str, Any]) -> Markup:
     entries = content["ranking"]
-    tried = f"<p>{len(content['tried'])} effects were tried.</p>" if content.get("tried") else ""
-    if not entries:
-        return f"<h3>Effects</h3><p>No effect was worth a refit.</p>{tried}"
-    factor, unit = _FACTOR, _UNIT
-    return (
-        "<h3>Effects<small>refitted one at a time, judged on recordings that were not fitted</small></h3>"
-        f"{_chart(entries[:_SHOWN], _floor(content), factor, unit)}{_evidence(entries, factor, unit)}{tried}"
+    tried = html(
+        "{% if tried %}<p>{{ tried }} effects were tried.</p>{% endif %}", tried=len(content.get("tried") or ())
     )
+    if not entries:
+        return _titled("Effects", html("<p>No effect was worth a refit.</p>") + tried)
+    factor, unit = _FACTOR, _UNIT
+    chart = _chart(entries[:_SHOWN], _floor(content), factor, unit)
+    about = "refitted one at a time, judged on recordings that were not fitted"
+    return _titled("Effects", chart + _evidence(entries, factor, unit) + tried, about)
 
 
 def _name(entry: dict[str, Any]) -> str:
     return entry["effect"] if entry.get("round", 1) == 1 else f"{entry['effect']} (round {entry['round']})"
 
 
-def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str) -> str:
+def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str) -> Markup:
     names = [_name(entry) for entry in reversed(entries)]
     traces = []
     for key, word, color in (  # from the bottom up
@@ -135,18 +138,18 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
     return figure("effect-ranking", [floor_line, *traces], layout, height=130 + 42 * len(names))
 
 
-def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> str:
+def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup:
     rows = []
     for entry in entries:
         state = "added" if entry.get("added") else "pays" if entry["significant"] else "does not pay"
         rows.append(
             [
-                f"<b>{esc(_name(entry))}</b>",
+                bold(_name(entry)),
                 state,
                 " → ".join(three_figures(factor * entry[f"validation_rmse_{when}"]) for when in ("before", "after")),
-                esc(_few(entry["joints"])),
-                esc(", ".join(entry["confounded_with"]) or "–"),
-                esc(entry["evidence"]),
+                _few(entry["joints"]),
+                ", ".join(entry["confounded_with"]) or "–",
+                entry["evidence"],
             ]
         )
     head = ["effect", "", f"validation [{unit}]", "joints", "cannot be told from", "evidence"]
@@ -157,42 +160,43 @@ def _few(names: list[str]) -> str:
     return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
-def _joints(content: dict[str, Any]) -> str:
+def _joints(content: dict[str, Any]) -> Markup:
     joints = content["joints"]
     factor, unit = _FACTOR, _UNIT
     rows = [
         [
-            f"<b>{esc(name)}</b>",
+            bold(name),
             *(
                 three_figures(factor * joint[key])
                 for key in ("validation_rmse_before", "validation_rmse_after", "floor")
             ),
-            esc(", ".join(joint["effects"]) or "–"),
+            ", ".join(joint["effects"]) or "–",
         ]
         for name, joint in joints.items()
     ]
-    return f"<h3>Joint by joint</h3>{table(['joint', f'before [{unit}]', 'after', 'floor', 'effects'], rows)}"
+    return _titled("Joint by joint", table(["joint", f"before [{unit}]", "after", "floor", "effects"], rows))
 
 
-def _error_map(content: dict[str, Any]) -> str:
+def _error_map(content: dict[str, Any]) -> Markup:
     """Which variable carries what is missing, on joints that effects leave far from the floor."""
     joints = {name: each for name, each in content.get("error_map", {}).items() if "explained" in each}
     if not joints:
-        return ""
+        return Markup("")
     curves = list(next(iter(joints.values()))["explained"])
     rows = [
-        [f"<b>{esc(name)}</b>", *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
+        [bold(name), *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
         for name, joint in joints.items()
     ]
     said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
-    return (
-        "<h3>What carries the error<small>part of the squared error above the floor that a curve of any form explains "
-        "by itself, on top of the base model</small></h3>"
-        f"{said}{_curve(joints)}{table(['joint', *(in_words(curve) for curve in curves)], rows)}"
+    about = (
+        "part of the squared error above the floor that a curve of any form explains by itself, "
+        "on top of the base model"
     )
+    shown = table(["joint", *(in_words(curve) for curve in curves)], rows)
+    return _titled("What carries the error", said + _curve(joints) + shown, about)
 
 
-def _curve(joints: dict[str, dict[str, Any]]) -> str:
+def _curve(joints: dict[str, dict[str, Any]]) -> Markup:
     """The curve that takes most away of the squared error."""
     squares = {
         name: joint["validation_rmse_before"] ** 2 - joint["validation_rmse_after"] ** 2
@@ -200,7 +204,7 @@ def _curve(joints: dict[str, dict[str, Any]]) -> str:
         if joint["curve"]
     }
     if not squares:
-        return ""
+        return Markup("")
     worst = max(squares, key=squares.__getitem__)
     best = joints[worst]
     trace = {
@@ -220,16 +224,23 @@ def _curve(joints: dict[str, dict[str, Any]]) -> str:
     return figure("error-map", [trace], layout, height=300)
 
 
-def _advice(content: dict[str, Any]) -> str:
+def _advice(content: dict[str, Any]) -> Markup:
     if not content["advice"]:
-        return ""
-    entries = []
-    for sentence in content["advice"]:
-        first, *commands = _COMMAND.split(sentence)
-        lines = "".join(f"<pre>{esc(command.strip())}</pre>" for command in commands)
-        entries.append(f"<li>{esc(first.strip())}{lines}</li>")
-    return f"<h3>What to do and to record next</h3><ul>{''.join(entries)}</ul>"
+        return Markup("")
+    entries = [_COMMAND.split(sentence) for sentence in content["advice"]]
+    listed = html(
+        "<ul>{% for entry in entries %}<li>{{ entry[0].strip() }}{% for command in entry[1:] %}<pre>"
+        "{{ command.strip() }}</pre>{% endfor %}</li>{% endfor %}</ul>",
+        entries=entries,
+    )
+    return _titled("What to do and to record next", listed)
 
 
-def _data(content: dict[str, Any]) -> str:
-    return f"<h3>The recordings</h3>{bullets(content['data'], 'notes')}" if content["data"] else ""
+def _data(content: dict[str, Any]) -> Markup:
+    return _titled("The recordings", bullets(content["data"], "notes")) if content["data"] else Markup("")
+
+
+def _titled(title: str, content: Markup, about: str = "") -> Markup:
+    """A part under its heading."""
+    text = "<h3>{{ title }}{% if about %}<small>{{ about }}</small>{% endif %}</h3>{{ content }}"
+    return html(text, title=title, about=about, content=content)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from markupsafe import Markup
+
 from pace_optim.report.number_text import angle_unit, three_figures
 
-from ..markup import Section, bullets, choice, esc, json_script, table
+from ..markup import Section, bullets, choice, html, json_script, table
 from ..run_data import RunData
 from .failure_figures import FIGURES
 
@@ -17,11 +19,6 @@ def failure(run: RunData) -> Section | None:
     if not content:
         return None
     recordings = [recording["name"] for recording in content["recordings"]]
-    cards = "".join(
-        f'<div data-figure="{name}"><h3>{esc(made.title)}</h3><p class="said"></p>'
-        f'<div class="canvas" style="height:{made.height}px"></div></div>'
-        for name, made in FIGURES.items()
-    )
     page = {
         "joints": content["joint_names"],
         "figures": {name: {"traces": made.traces, "layout": made.layout} for name, made in FIGURES.items()},
@@ -36,16 +33,23 @@ def failure(run: RunData) -> Section | None:
             for r in range(len(recordings))
         ],
     }
-    notes = bullets(content["notes"], "notes") if content["notes"] else ""
     r, j = _worst_place(content)
     return Section(
         id="failure",
         title="Where the model fails",
         lead=content["summary"] + _basis(content),
-        html=(
-            f"{_places(content)}{_by_joint(content)}{notes}"
-            f'<div class="chooser">{choice("recording", recordings, "failure-", r)}'
-            f"{choice('joint', content['joint_names'], 'failure-', j)}{cards}{json_script(page)}</div>"
+        html=html(
+            '{{ places }}{{ by_joint }}{{ notes }}<div class="chooser">{{ recording }}{{ joint }}'
+            '{% for name, made in figures.items() %}<div data-figure="{{ name }}"><h3>{{ made.title }}</h3>'
+            '<p class="said"></p><div class="canvas" style="height:{{ made.height }}px"></div></div>{% endfor %}'
+            "{{ script }}</div>",
+            places=_places(content),
+            by_joint=_by_joint(content),
+            notes=bullets(content["notes"], "notes") if content["notes"] else "",
+            recording=choice("recording", recordings, "failure-", r),
+            joint=choice("joint", content["joint_names"], "failure-", j),
+            figures=FIGURES,
+            script=json_script(page),
         ),
     )
 
@@ -62,16 +66,16 @@ def _basis(content: dict[str, Any]) -> str:
     return f" On {', '.join(content['data'])}, which are not the run's own recordings." if content["data"] else ""
 
 
-def _places(content: dict[str, Any]) -> str:
+def _places(content: dict[str, Any]) -> Markup:
     """The worst places, one sentence each; a click shows the joint's curves."""
-    entries = "".join(
-        f'<li><a href="#failure" data-joint="{esc(place["joint"])}">{esc(place["sentence"])}</a></li>'
-        for place in content["worst_places"]
+    return html(
+        '{% if places %}<ol class="places">{% for place in places %}<li><a href="#failure" '
+        'data-joint="{{ place.joint }}">{{ place.sentence }}</a></li>{% endfor %}</ol>{% endif %}',
+        places=content["worst_places"],
     )
-    return f'<ol class="places">{entries}</ol>' if entries else ""
 
 
-def _by_joint(content: dict[str, Any]) -> str:
+def _by_joint(content: dict[str, Any]) -> Markup:
     parts = [part for part in ("train", "validation") if part in content["rmse"]]
     joints = content["joints"]
     factor, unit = angle_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts])
@@ -80,11 +84,14 @@ def _by_joint(content: dict[str, Any]) -> str:
         share = 100 * joint["share_above_floor"]
         rows.append(
             [
-                f'<a href="#failure" data-joint="{esc(name)}"><b>{esc(name)}</b></a>',
+                html('<a href="#failure" data-joint="{{ name }}"><b>{{ name }}</b></a>', name=name),
                 *(three_figures(factor * joint["rmse"][part]) for part in parts),
                 three_figures(factor * joint["noise_floor"]),
-                f'<span class="share"><div><i style="width:{share:.0f}%"></i></div>{share:.0f} %</span>',
-                esc(joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} ")),
+                html(
+                    '<span class="share"><div><i style="width:{{ share }}%"></i></div>{{ share }} %</span>',
+                    share=f"{share:.0f}",
+                ),
+                joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} "),
             ]
         )
     words = {"train": "training", "validation": "validation"}

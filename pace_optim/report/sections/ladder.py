@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
+
+from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_optim.report.number_text import angle_unit, three_figures
 
-from ..markup import Section, esc, figure, table
+from ..markup import Section, bold, figure, table
 from ..run_data import RunData
 
 _PARTS = {"validation": ("validation", "var(--heldedge)"), "train": ("training", "var(--target)")}
@@ -63,7 +66,7 @@ def _traces(
             "line": {"width": 1, "color": "var(--target)"},
             "opacity": 0.45,
             "showlegend": False,
-            "hovertemplate": f"{esc(joint)}: %{{y:.3g}} {unit}<extra></extra>",
+            "hovertemplate": f"{escape(joint)}: %{{y:.3g}} {unit}<extra></extra>",
         }
         for joint in (joints if len(joints) > 1 else [])
     ]
@@ -105,10 +108,10 @@ def _layout(unit: str) -> dict[str, Any]:
     return {"yaxis": axis, "xaxis": {"type": "category", "showgrid": False}, "hovermode": "closest"}
 
 
-def _table(steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float], factor: float, unit: str) -> str:
+def _table(steps: list[dict[str, Any]], parts: list[str], floor: dict[str, float], factor: float, unit: str) -> Markup:
     rows = []
     for step in steps:
-        cells = [f"<b>{esc(step['name'])}</b>"]
+        cells: list[str] = [bold(step["name"])]
         for part in parts:
             ratio = step["ratio_to_previous"].get(part)
             cells += [three_figures(factor * step["rmse"][part][ALL]), "" if ratio is None else f"{ratio:.3g}"]

@@ -7,7 +7,7 @@ from typing import Any
 
 from pace_optim.terminal.cli import command
 
-from ..markup import Section, esc
+from ..markup import Section, html
 from ..run_data import RunData
 from ..wording import count_in_short, duration
 
@@ -33,10 +33,13 @@ def making(run: RunData) -> Section:
         "Stopped because": "; ".join(result.stop_reasons),
         "Folder": str(run.folder),
     }
-    rows = "".join(f"<div><dt>{esc(name)}</dt><dd>{esc(value)}</dd></div>" for name, value in facts.items())
-    command = _command(run.settings)
-    again = f"<p>The same fit again:</p><pre>{esc(command)}</pre>" if command else ""
-    return Section(id="making", title="How it was made", html=f'<dl class="facts">{rows}</dl>{again}')
+    text = html(
+        '<dl class="facts">{% for name, value in facts.items() %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd></div>'
+        "{% endfor %}</dl>{% if command %}<p>The same fit again:</p><pre>{{ command }}</pre>{% endif %}",
+        facts=facts,
+        command=_command(run.settings),
+    )
+    return Section(id="making", title="How it was made", html=text)
 
 
 _DELAY_MODES = {

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_optim.report.number_text import angle_text, angle_unit, three_figures
 from pace_optim.run.result import FitResult
 
-from ..markup import Section, bullets, esc
+from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
 from ..wording import duration, pretty_unit
 from .verdict import verdict_first
@@ -24,10 +25,14 @@ _WARNINGS = 6
 def overview(run: RunData) -> Section:
     """The head of the page."""
     result = run.result
-    head = (
-        f'<p class="eyebrow">{esc(result.robot_name)} · {esc(result.task)} · {esc(run.folder.resolve().name)}</p>'
-        f"<h1>{esc(_headline(result))}</h1>"
-        f'<p class="lead">{esc(_verdict(run))}</p>'
+    head = html(
+        '<p class="eyebrow">{{ robot }} · {{ task }} · {{ folder }}</p><h1>{{ headline }}</h1>'
+        '<p class="lead">{{ verdict }}</p>',
+        robot=result.robot_name,
+        task=result.task,
+        folder=run.folder.resolve().name,
+        headline=_headline(result),
+        verdict=_verdict(run),
     )
     return Section(
         id="overview",
@@ -84,7 +89,7 @@ def _worst_joint(result: FitResult) -> tuple[str, float]:
     return max(((joint, value) for joint, value in errors.items() if joint != ALL), key=lambda item: item[1])
 
 
-def _figures(result: FitResult) -> str:
+def _figures(result: FitResult) -> Markup:
     """The handful of numbers that everyone asks for."""
     worst, error = _worst_joint(result)
     held_out, train = result.rmse.get("validation", {}).get(ALL), result.rmse["train"].get(ALL)
@@ -101,25 +106,26 @@ def _figures(result: FitResult) -> str:
         ("Score", f"{result.score:.2e}", "rad², sum over the joints"),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
-    cells = "".join(
-        f"<div><dt>{esc(name)}</dt><dd>{esc(value)}</dd><dd class='small'>{esc(about)}</dd></div>"
-        for name, value, about in figures
+    return html(
+        '<dl class="figures">{% for name, value, about in figures %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd>'
+        "<dd class='small'>{{ about }}</dd></div>{% endfor %}</dl>",
+        figures=figures,
     )
-    return f'<dl class="figures">{cells}</dl>'
 
 
-def _warnings(result: FitResult) -> str:
+def _warnings(result: FitResult) -> Markup:
     count = len(result.warnings)
     if not count:
         text = "No parameter is at a bound, without influence, or impossible to tell from another."
-        return f'<div class="callout good"><h3>No warnings</h3><p>{text}</p></div>'
+        return html('<div class="callout good"><h3>No warnings</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
     sentences = [_sentence(text) for text in result.warnings]
     most = _WARNINGS if count > _WARNINGS + 1 else count  # one more takes no more room than its heading would
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
-        said += f"<details><summary>{len(rest)} more</summary>{bullets(rest)}</details>"
-    return f'<div class="callout bad"><h3>{title}: read before you use the values</h3>{said}</div>'
+        said += folded(len(rest), bullets(rest))
+    text = '<div class="callout bad"><h3>{{ title }}: read before you use the values</h3>{{ said }}</div>'
+    return html(text, title=title, said=said)
 
 
 def _sentence(text: str) -> str:
@@ -127,24 +133,27 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _errors_by_joint(result: FitResult) -> str:
+def _errors_by_joint(result: FitResult) -> Markup:
     """A row of bars per joint; a click shows its curves."""
     parts = [(name, result.rmse[name]) for name in ("train", "validation") if result.rmse.get(name)]
     every = [value for _, errors in parts for joint, value in errors.items() if joint != ALL]
     factor, unit = angle_unit(every)
     largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
-    rows = []
-    for joint in result.joint_names:
-        bars = "".join(
-            f'<div class="bar {name}"><i style="width:{100 * errors[joint] / largest:.1f}%"></i>'
-            f"<span>{three_figures(factor * errors[joint])}</span></div>"
+    rows = {
+        joint: [
+            (name, f"{100 * errors[joint] / largest:.1f}", three_figures(factor * errors[joint]))
             for name, errors in parts
-        )
-        rows.append(
-            f'<a class="error" href="#trajectories" data-joint="{esc(joint)}"><b>{esc(joint)}</b><div>{bars}</div></a>'
-        )
-    key = "".join(
-        f'<span class="key {name}">{ {"train": "training", "validation": "validation"}[name] }</span>'
-        for name, _ in parts
+        ]
+        for joint in result.joint_names
+    }
+    return html(
+        '<h3>Error of each joint [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
+        '{{ words[name] }}</span>{% endfor %}</h3><div class="errors">{% for joint, bars in rows.items() %}'
+        '<a class="error" href="#trajectories" data-joint="{{ joint }}"><b>{{ joint }}</b><div>'
+        '{% for name, width, value in bars %}<div class="bar {{ name }}"><i style="width:{{ width }}%"></i>'
+        "<span>{{ value }}</span></div>{% endfor %}</div></a>{% endfor %}</div>",
+        unit=unit,
+        names=[name for name, _ in parts],
+        words={"train": "training", "validation": "validation"},
+        rows=rows,
     )
-    return f'<h3>Error of each joint [{esc(unit)}] {key}</h3><div class="errors">{"".join(rows)}</div>'

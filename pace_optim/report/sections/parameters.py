@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+
+from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 
-from ..markup import Section, esc, table
+from ..markup import Section, bold, html, joined, table
 from ..run_data import RunData
 from ..wording import in_words, pretty_unit, value_and_error
 
@@ -22,24 +25,32 @@ def parameters(run: RunData) -> Section:
     cards = [_card(run, name) for name in result.parameters if name not in shared]
     if shared:
         rows = [_row(run, name, ALL, in_words(name), pretty_unit(result.unit_of(name, ALL)), None) for name in shared]
-        note = (
-            f"<p>The delay is that of the <b>{esc(result.delay_mode)}</b>: "
-            f"{1e3 * result.delay_s:.4g} ms at a control step of {1e3 * result.control_dt:g} ms.</p>"
-            if "delay" in shared
-            else ""
+        note = html(
+            "{% if delay %}<p>The delay is that of the <b>{{ mode }}</b>: {{ delay }} ms at a control step of "
+            "{{ step }} ms.</p>{% endif %}",
+            mode=result.delay_mode,
+            delay=f"{1e3 * result.delay_s:.4g}" if "delay" in shared else "",
+            step=f"{1e3 * result.control_dt:g}",
         )
         head = ["", "value", "± std", "unit", "between its bounds", ""]
-        cards.append(f"<article><h3>The whole robot</h3>{table(head, rows, 'values')}{note}</article>")
+        cards.append(_article("The whole robot", "", table(head, rows, "values") + note))
     return Section(
         id="parameters",
         title="Parameters",
         lead="Bars span 1.96 standard deviations to either side (95 %). They know of noise and of the residuals' "
         "correlation in time, not of physics that the model lacks.",
-        html=f'<div class="cards">{"".join(cards)}</div>',
+        html=html('<div class="cards">{{ cards }}</div>', cards=joined(cards)),
     )
 
 
-def _card(run: RunData, name: str) -> str:
+def _article(title: str, unit: str, content: Markup) -> Markup:
+    small = html(" <small>{{ unit }}</small>", unit=unit) if unit else ""
+    return html(
+        "<article><h3>{{ title }}{{ small }}</h3>{{ content }}</article>", title=title, small=small, content=content
+    )
+
+
+def _card(run: RunData, name: str) -> Markup:
     """One parameter of all joints: a table whose rows are also a plot."""
     values, std = run.result.parameters[name], run.result.std.get(name, {})
     ends = [v + side * _CONFIDENCE * (std.get(key) or 0.0) for key, v in values.items() for side in (-1, 1)]
@@ -50,8 +61,7 @@ def _card(run: RunData, name: str) -> str:
     rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
     head = ["joint", "value", "± std", "value and 95 % interval", "between its bounds", ""]
-    small = f"<small>{esc(unit)}</small>"
-    return f"<article><h3>{esc(in_words(name))} {small}</h3>{table(head, rows, 'values')}</article>"
+    return _article(in_words(name), unit, table(head, rows, "values"))
 
 
 def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, float]:
@@ -73,8 +83,8 @@ def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[f
     text, error = value_and_error(value, std)
     if run.result.std_means_nothing:
         error = "?"
-    plot = esc(unit) if span is None else _interval(value, std, *span)
-    return [f"<b>{esc(title)}</b>", text, error, plot, _between(run, label, value), _flags(run, label, value)]
+    plot = unit if span is None else _interval(value, std, *span)
+    return [bold(title), text, error, plot, _between(run, label, value), _flags(run, label, value)]
 
 
 def _x(value: float, low: float, high: float) -> float:
@@ -82,33 +92,43 @@ def _x(value: float, low: float, high: float) -> float:
     return round(_INSET + share * (_WIDTH - 2 * _INSET), 1)
 
 
-def _interval(value: float, std: float | None, low: float, high: float) -> str:
+def _interval(value: float, std: float | None, low: float, high: float) -> Markup:
     """A dot with its whiskers, to the scale that the table's last row shows; hollow where there is no error bar."""
     middle, x = _HEIGHT / 2, _x(value, low, high)
-    parts = [f'<line class="base" x1="0" x2="{_WIDTH}" y1="{middle}" y2="{middle}"/>']
+    parts = [_line("base", 0, _WIDTH, middle, middle)]
     if low < 0 < high:
-        parts.append(f'<line class="zero" x1="{_x(0, low, high)}" x2="{_x(0, low, high)}" y1="0" y2="{_HEIGHT}"/>')
+        parts.append(_line("zero", _x(0, low, high), _x(0, low, high), 0, _HEIGHT))
     if std is not None:
         a, b = (_x(value + side * _CONFIDENCE * std, low, high) for side in (-1, 1))
-        parts.append(f'<line class="whisker" x1="{a}" x2="{b}" y1="{middle}" y2="{middle}"/>')
-    parts.append(f'<circle class="{"unknown" if std is None else "dot"}" cx="{x}" cy="{middle}" r="3.5"/>')
-    return _svg("".join(parts))
+        parts.append(_line("whisker", a, b, middle, middle))
+    css = "unknown" if std is None else "dot"
+    circle = html('<circle class="{{ css }}" cx="{{ x }}" cy="{{ y }}" r="3.5"/>', css=css, x=x, y=middle)
+    return _svg([*parts, circle])
 
 
-def _axis(low: float, high: float) -> str:
+def _axis(low: float, high: float) -> Markup:
     """The scale of a table's plots."""
     parts = []
     for tick in nice_ticks(low, high):
         x = _x(tick, low, high)
         anchor = "start" if x < 20 else "end" if x > _WIDTH - 20 else "middle"
-        parts.append(f'<line class="base" x1="{x}" x2="{x}" y1="0" y2="4"/>')
-        parts.append(f'<text x="{x}" y="16" text-anchor="{anchor}">{tick:.6g}</text>')
-    return _svg("".join(parts))
+        parts.append(_line("base", x, x, 0, 4))
+        said = '<text x="{{ x }}" y="16" text-anchor="{{ anchor }}">{{ tick }}</text>'
+        parts.append(html(said, x=x, anchor=anchor, tick=f"{tick:.6g}"))
+    return _svg(parts)
 
 
-def _svg(content: str) -> str:
-    return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" aria-hidden="true">{content}</svg>'
+def _line(css: str, x1: float, x2: float, y1: float, y2: float) -> Markup:
+    text = '<line class="{{ css }}" x1="{{ x1 }}" x2="{{ x2 }}" y1="{{ y1 }}" y2="{{ y2 }}"/>'
+    return html(text, css=css, x1=x1, x2=x2, y1=y1, y2=y2)
+
+
+def _svg(parts: Iterable[Markup]) -> Markup:
+    return html(
+        '<svg viewBox="0 0 {{ w }} {{ h }}" width="{{ w }}" height="{{ h }}" aria-hidden="true">{{ content }}</svg>',
+        w=_WIDTH,
+        h=_HEIGHT,
+        content=joined(parts),
     )
 
 
@@ -130,13 +150,17 @@ def _between(run: RunData, label: str, value: float) -> str:
     low, high = run.bounds[label]
     share = (value - low) / (high - low) if high > low else 0.5
     css = " hit" if label in run.result.at_bound else ""
-    return (
-        f'<span class="range{css}"><small>{low:g}</small><span class="track">'
-        f'<i style="left:{100 * min(max(share, 0.0), 1.0):.1f}%"></i></span><small>{high:g}</small></span>'
+    return html(
+        '<span class="range{{ css }}"><small>{{ low }}</small><span class="track"><i style="left:{{ share }}%"></i>'
+        "</span><small>{{ high }}</small></span>",
+        css=css,
+        low=f"{low:g}",
+        share=f"{100 * min(max(share, 0.0), 1.0):.1f}",
+        high=f"{high:g}",
     )
 
 
-def _flags(run: RunData, label: str, value: float) -> str:
+def _flags(run: RunData, label: str, value: float) -> Markup:
     result, flags = run.result, []
     if label in result.at_bound:
         low, high = run.bounds.get(label, (value, value))
@@ -149,4 +173,4 @@ def _flags(run: RunData, label: str, value: float) -> str:
         if label in group:
             others = [in_words(other.split("/")[0]).lower() for other in group if other != label]
             flags.append("cannot be told from " + " and ".join(dict.fromkeys(others)))
-    return "".join(f'<span class="flag">{esc(flag)}</span>' for flag in flags)
+    return html('{% for flag in flags %}<span class="flag">{{ flag }}</span>{% endfor %}', flags=flags)

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from pace_optim.report.number_text import angle_unit, three_figures
 from pace_optim.report.trajectory_errors import rms
 
-from ..markup import Section, bullets, esc, table
+from ..markup import Section, bold, bullets, folded, html, table
 from ..run_data import RecordingData, RunData
 
 _DRIVES = 40
@@ -27,14 +28,15 @@ def recordings(run: RunData) -> Section:
         notes = [note for note in notes if note not in own]
         said = bullets([note.removeprefix(f"{recording.name}: ") for note in own], "notes") if own else ""
         error = three_figures(factor * error_of(recording))
-        rows.append([f"<b>{esc(recording.name)}</b>", error, *_facts(recording), said])
+        rows.append([bold(recording.name), error, *_facts(recording), said])
     head = ["recording", f"error [{unit}]", "used for", "length", "samples", "rate", "notes"]
-    html = table(head, rows, "recordings") if rows else ""
-    if not rows:
-        for use, names in run.result.recordings.items():
-            html += f"<p>{esc(use.capitalize())}: {esc(', '.join(names) or 'nothing')}</p>"
-    html += bullets(notes, "notes") if notes else ""
-    return Section(id="recordings", title="Recordings", html=html + _drives(run, [each.name for each in ordered]))
+    uses = (
+        "{% for use, names in uses.items() %}<p>{{ use.capitalize() }}: {{ names | join(', ') or 'nothing' }}</p>"
+        "{% endfor %}"
+    )
+    shown = table(head, rows, "recordings") if rows else html(uses, uses=run.result.recordings)
+    shown += bullets(notes, "notes") if notes else ""
+    return Section(id="recordings", title="Recordings", html=shown + _drives(run, [each.name for each in ordered]))
 
 
 def error_of(recording: RecordingData) -> float:
@@ -58,24 +60,20 @@ def _facts(recording: RecordingData) -> list[str]:
     )
     step = float(np.median(np.diff(recording.time))) if len(recording.time) > 1 else np.nan
     return [
-        esc(use.replace("%", " %")),
+        use.replace("%", " %"),
         f"{recording.time[-1] - recording.time[0]:.4g} s",
         f"{len(recording.time)}",
         f"{1 / step:.4g} Hz" if step > 0 else "–",
     ]
 
 
-def _drives(run: RunData, order: list[str]) -> str:
+def _drives(run: RunData, order: list[str]) -> Markup:
     """The drive in force in each recording, what was asked of it, and what gravity takes."""
     every = run.read_json("drives.json") or []
     every = sorted(every, key=lambda each: order.index(each["recording"]) if each["recording"] in order else len(order))
-    rows = [
-        [f"<b>{esc(each['recording'])}</b>", esc(joint), *_drive(own)]
-        for each in every
-        for joint, own in each["joints"].items()
-    ]
+    rows = [[bold(each["recording"]), joint, *_drive(own)] for each in every for joint, own in each["joints"].items()]
     if not rows:
-        return ""
+        return Markup("")
     head = [
         "recording",
         "joint",
@@ -90,9 +88,9 @@ def _drives(run: RunData, order: list[str]) -> str:
     ]
     shown = table(head, rows[:_DRIVES])
     if more := rows[_DRIVES:]:
-        shown += f"<details><summary>{len(more)} more</summary>{table(head, more)}</details>"
+        shown += folded(len(more), table(head, more))
     about = "gains and limits in force; torques in N m, speeds in rad/s, of a slide in N and m/s"
-    return f"<h3>What was asked of the drives<small>{about}</small></h3>{shown}"
+    return html("<h3>What was asked of the drives<small>{{ about }}</small></h3>{{ shown }}", about=about, shown=shown)
 
 
 def _drive(own: dict[str, Any]) -> list[str]:
@@ -112,7 +110,9 @@ def _drive(own: dict[str, Any]) -> list[str]:
 
 def _beyond(value: float, limit: float | None) -> str:
     """A value, flagged where it is beyond its limit."""
-    return f"{value:.3g}" if limit is None or value <= limit else f'{value:.3g} <span class="flag">beyond</span>'
+    text = f"{value:.3g}"
+    within = limit is None or value <= limit
+    return text if within else html('{{ value }} <span class="flag">beyond</span>', value=text)
 
 
 def _number(value: float | None) -> str:

@@ -8,8 +8,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from markupsafe import Markup
 
-from ..markup import Section, choice, json_script
+from ..markup import Section, choice, html, json_script
 from ..motion import Motion, motions_of, scene_of
 from ..motion.scene import scalar_joints
 from ..run_data import RunData
@@ -37,7 +38,7 @@ def replay(run: RunData) -> Section | None:
     )
 
 
-def viewer(model: mujoco.MjModel, motions: Sequence[Motion]) -> str:
+def viewer(model: mujoco.MjModel, motions: Sequence[Motion]) -> Markup:
     """HTML of a viewer that the page's script brings to life."""
     content = {
         "scene": scene_of(model),
@@ -45,16 +46,19 @@ def viewer(model: mujoco.MjModel, motions: Sequence[Motion]) -> str:
         "scale": _scale(motions),
         "recordings": [_encode(motion) for motion in motions],
     }
-    speeds = "".join(f'<option value="{value}">{text}</option>' for text, value in _SPEEDS)
-    times = "".join(f'<option value="{value}">{value}×</option>' for value in _EXAGGERATIONS)
-    return (
-        f'<div class="replay">{choice("recording", [motion.name for motion in motions], group="replay ")}'
+    return html(
+        '<div class="replay">{{ choice }}'
         '<canvas aria-label="The robot, measured and simulated"></canvas>'
         '<div class="controls"><button type="button" class="play">Play</button>'
         '<input type="range" name="at" min="0" max="1" value="0" step="any" aria-label="time">'
-        f'<label>Speed <select name="speed">{speeds}</select></label>'
-        f'<label>Error drawn <select name="exaggerate">{times}</select></label></div>'
-        f'<p class="replay-note"></p>{json_script(content)}</div>'
+        '<label>Speed <select name="speed">{% for text, value in speeds %}<option value="{{ value }}">{{ text }}'
+        '</option>{% endfor %}</select></label><label>Error drawn <select name="exaggerate">{% for value in times %}'
+        '<option value="{{ value }}">{{ value }}×</option>{% endfor %}</select></label></div>'
+        '<p class="replay-note"></p>{{ script }}</div>',
+        choice=choice("recording", [motion.name for motion in motions], group="replay "),
+        speeds=_SPEEDS,
+        times=_EXAGGERATIONS,
+        script=json_script(content),
     )
 
 

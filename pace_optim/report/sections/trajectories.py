@@ -10,7 +10,7 @@ import numpy as np
 from pace_optim.report.number_text import angle_unit, three_figures
 from pace_optim.report.trajectory_errors import held_out_spans, rms
 
-from ..markup import Section, choice, json_script
+from ..markup import Section, choice, html, json_script
 from ..run_data import RecordingData, RunData
 from .recordings import by_error
 
@@ -36,10 +36,12 @@ def trajectories(run: RunData) -> Section | None:
         id="trajectories",
         title="Trajectories",
         lead="Drag to zoom, double click to see all. The zoom stays when the joint changes.",
-        html=(
-            f'<div class="explorer">{choice("recording", [each.name for each in ordered], at=r)}'
-            f"{choice('joint', run.joint_names, at=j)}"
-            f'<p class="errors-here"></p><div class="canvas" style="height:540px"></div>{json_script(content)}</div>'
+        html=html(
+            '<div class="explorer">{{ recording }}{{ joint }}<p class="errors-here"></p>'
+            '<div class="canvas" style="height:540px"></div>{{ script }}</div>',
+            recording=choice("recording", [each.name for each in ordered], at=r),
+            joint=choice("joint", run.joint_names, at=j),
+            script=json_script(content),
         ),
     )
 

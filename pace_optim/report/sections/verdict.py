@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from pace_optim.report.sizes import size_text
 from pace_optim.terminal.cli import command
 
-from ..markup import bullets, esc
+from ..markup import bullets, html, joined
 from ..run_data import RunData
 from ..wording import in_words
 
@@ -25,28 +27,27 @@ _SHOWN = 4
 """Sizes in the overview, at most."""
 
 
-def verdict_first(run: RunData) -> str:
+def verdict_first(run: RunData) -> Markup:
     """For the top of the page: the verdict, sizes, likes, and a link to the run that has what was missing."""
     with run.blaming("diagnosis.json"):
         return _in_short(run)
 
 
-def _in_short(run: RunData) -> str:
+def _in_short(run: RunData) -> Markup:
     content = run.read_json("diagnosis.json")
     if not content:
-        return ""
+        return Markup("")
     sizes = content.get("sizes", [])
     said = [f"{size['effect']} {size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes[:_SHOWN]]
     if len(sizes) > _SHOWN:
         said.append(f"and {len(sizes) - _SHOWN} more")
     said += [f"{effect} cannot be told from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()]
-    more = (bullets(said, "notes") if said else "") + _refit_link(run, content)
-    return callout(
-        content, run.result.effects, more + '<p><a href="#diagnosis">What was tried, and the evidence</a></p>'
-    )
+    link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
+    more = [*([bullets(said, "notes")] if said else []), _refit_link(run, content), link]
+    return callout(content, run.result.effects, joined(more))
 
 
-def callout(content: dict[str, Any], had: Sequence[str], more: str = "") -> str:
+def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = "") -> Markup:
     """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
@@ -55,23 +56,29 @@ def callout(content: dict[str, Any], had: Sequence[str], more: str = "") -> str:
         css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
     elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
-    add = ""
-    if effects and set(effects) == set(had):
-        add = "<p>This run is the fit with it.</p>"
-    elif effects:
-        why = "Add it" if content["added"] else "Until it is known, this lowers the error"
-        add = f"<p>{why}: <code>{command('fit')} … --effects {esc(' '.join(effects))}</code></p>"
-    return f'<div class="callout {css}"><h3>{esc(heading)}</h3><p>{esc(content["summary"])}</p>{add}{more}</div>'
+    return html(
+        '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
+        "fit with it.</p>{% elif effects %}<p>{{ why }}: <code>{{ command }} … --effects "
+        "{{ effects | join(' ') }}</code></p>{% endif %}{{ more }}</div>",
+        css=css,
+        heading=heading,
+        summary=content["summary"],
+        has_it=bool(effects) and set(effects) == set(had),
+        effects=effects,
+        why="Add it" if content["added"] else "Until it is known, this lowers the error",
+        command=command("fit"),
+        more=more,
+    )
 
 
-def _refit_link(run: RunData, content: dict[str, Any]) -> str:
+def _refit_link(run: RunData, content: dict[str, Any]) -> Markup:
     """A link from a run to its refit, and back."""
     here, places = run.folder.resolve(), [Path(each) for each in content["runs"]]
     others = [place for place in places if place.name != here.name]
     if len(places) < 2 or not others:
-        return ""
+        return Markup("")
     beside = here.parent / others[0].name  # runs that are moved are moved together
     other = beside if beside.is_dir() else others[0].resolve()
     what = "The run with it" if places[0].name == here.name else "The run without it"
     href = f"{Path(os.path.relpath(other, here)).as_posix()}/report.html"
-    return f'<p>{what}: <a href="{esc(href)}">{esc(other.name)}</a></p>'
+    return html('<p>{{ what }}: <a href="{{ href }}">{{ name }}</a></p>', what=what, href=href, name=other.name)
