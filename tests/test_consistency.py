@@ -15,6 +15,7 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
 from pace_optim.uncertainty import consistency
+from pace_optim.uncertainty.assessment import assess, error_bars
 from pace_optim.uncertainty.consistency import check_consistency
 
 GAINS = {"soft": (60.0, 1.0), "middle": (85.0, 2.0), "stiff": (120.0, 4.0)}
@@ -96,3 +97,33 @@ def test_a_delay_longer_than_a_controller_of_another_rate_allows_is_refused(monk
     monkeypatch.setattr(ManagerBasedRLEnv, "__init__", lambda *args: pytest.fail("checked too late"))
     with pytest.raises(ValueError, match=r"upper bound is 10 control steps, but the drive allows max_delay = 2\.5"):
         load_problem("Pace-TestBench-v0")
+
+
+def test_recordings_are_fitted_alone_from_the_derivatives_that_are_known(recordings):
+    """The same is said of each, for fewer simulations."""
+    wrong = dataclasses.replace(recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([3.6])))
+    problem = make_problem([*recordings[:2], wrong])
+    evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
+    start = torch.zeros(problem.space.size, dtype=torch.float64)
+    best = least_squares(evaluator, colouring, [start])[0]
+    there = assess(problem, evaluator, colouring, best.x).jacobian
+    anew, known = (check_consistency(problem, best.x, best.score, there=given) for given in (None, there))
+    assert known.simulated_steps < 0.95 * anew.simulated_steps
+    assert [text[:60] for text in known.sentences] == [text[:60] for text in anew.sentences]
+    for label, std in anew.std.items():
+        for one, other, error, again in zip(
+            anew.values[label], known.values[label], std, known.std[label], strict=True
+        ):
+            assert (error is None) == (again is None)
+            if error is not None and again is not None:
+                assert abs(one - other) < 0.5 * error and again == pytest.approx(error, rel=0.1)
+
+
+def test_error_bars_of_known_derivatives_are_those_of_a_whole_assessment(recordings):
+    problem = make_problem(recordings[:1])
+    evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
+    best = least_squares(evaluator, colouring, [torch.zeros(problem.space.size, dtype=torch.float64)])[0]
+    whole = assess(problem, evaluator, colouring, best.x)
+    again = error_bars(problem, evaluator, whole.jacobian, best.x)
+    assert np.allclose(again.std, whole.uncertainty.std, rtol=1e-6, equal_nan=True)
+    assert again.indistinguishable == whole.uncertainty.indistinguishable
