@@ -10,6 +10,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _get_current_dispatch_mode_stack
 
 from pace_envs.fused import structured
+from pace_envs.fused.elementwise import filled
 from pace_envs.fused.memory import Array, Memory, Mode, Operation, elements, row_axis
 from pace_envs.fused.writer import SINGLE_WIDTH, kernels
 from pace_envs.kernels import host_kernels, kernels_of
@@ -160,7 +161,7 @@ class Fusion(TorchDispatchMode):
         if name == "scalar_tensor" and kwargs.get("device") == self.device:
             result = torch.empty((), dtype=kwargs.get("dtype") or torch.get_default_dtype(), device=self.device)
             self.array(result, is_own=True)
-            self._add(structured.filled(self, result, args[0]))
+            self._add(filled(self, result, args[0]))
             self._constants[result.data_ptr()] = result.untyped_storage(), args[0]
             return result
         result = func(*args, **kwargs)
