@@ -102,8 +102,7 @@ class CMAESOptimizer(TreeSearch):
                 f"There are {self._shown_here} candidates of a generation to simulate here, but the rollout simulates "
                 f"{rollout.num_candidates}. Take evaluator.rollout(optimizer.num_shown)."
             )
-        copies = {name: values[mine] for name, values in self._per_joint_copies().items()}
-        rollout.start(self.candidates[mine], per_joint=copies)
+        rollout.start(self.candidates[mine], per_joint=self._per_joint_copies(mine))
         self.sim_params = rollout.physical
         shape = rollout.env.num_envs, len(self.joint_names)
         self.scores_buffer = torch.zeros(shape, dtype=torch.float64, device=rollout.env.device)
@@ -164,8 +163,8 @@ class CMAESOptimizer(TreeSearch):
         """The scores of all candidates, from this process's own, on the processor."""
         return self.processes.gather(scores, self.population_size).cpu()
 
-    def _per_joint_copies(self) -> dict[str, torch.Tensor]:
-        """Shared parameters as each joint's tree has them, {name: (population_size, n)}."""
+    def _per_joint_copies(self, mine: slice) -> dict[str, torch.Tensor]:
+        """Shared parameters of some candidates as each joint's tree has them, {name: (candidates, n)}."""
         if len(self.strategies) == 1:
             return {}
         copies = {}
@@ -175,8 +174,9 @@ class CMAESOptimizer(TreeSearch):
             entry = self.space[parameter.name].start
             per_tree = []
             for strategy, x in zip(self.strategies, self._shown, strict=True):
-                full = torch.zeros(self.population_size, self.space.size, dtype=torch.float64)
-                full[:, entry] = torch.as_tensor(x[:, strategy.entries.tolist().index(entry)])
+                own = torch.as_tensor(x[mine, strategy.entries.tolist().index(entry)])
+                full = torch.zeros(len(own), self.space.size, dtype=torch.float64)
+                full[:, entry] = own
                 per_tree.append(self.space.to_physical(full)[:, entry])
             copies[parameter.name] = torch.stack(per_tree, dim=1)[:, self._joint_group]
         return copies
