@@ -1,10 +1,17 @@
 """A drive whose own loop runs faster than its commands come."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from bench_recordings import Bench, chirp, record
 from problems import BENCH, env_cfg
+from problems import chirp as chirp_of_one
+from problems import record as own_recording
 
+from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive, save_recording
 from pace_optim.run.settings import FitSettings
 
 
@@ -34,3 +41,20 @@ def test_a_rate_that_does_not_divide_the_time_step_is_refused_by_its_name():
 def test_a_rate_that_is_no_time_is_refused():
     with pytest.raises(ValueError, match="drive_dt is 0"):
         FitSettings(task=BENCH, drive_dt=0.0)
+
+
+@pytest.mark.parametrize(("damping", "raised"), [(1.0, False), (60.0, True)])
+def test_the_armature_is_sought_where_the_loop_is_stable(tmp_path, damping, raised):
+    """A search that strayed below found oscillations, and a fit ended in a valley of theirs."""
+    recording = replace(
+        own_recording(chirp_of_one(1.0)), drive=Drive(stiffness=np.array([200.0]), damping=np.array([damping]))
+    )
+    path = str(save_recording(tmp_path / "stiff.npz", recording))
+    plain, problem = ParameterSpace.of(env_cfg().sim2real), load_problem(BENCH, data=[path], env_cfg=env_cfg())
+    lower, env = float(problem.space.lower[0]), problem.make_env(1)
+    inertia = float(env.sim.model.dof_M0[0] - env.sim.model.dof_armature[0])
+    env.close()
+    if raised:
+        assert (damping * 0.0025 + 0.5 * 200.0 * 0.0025**2) / (inertia + lower) == pytest.approx(2.0, rel=1e-3)
+    else:
+        assert lower == float(plain.lower[0])

@@ -89,7 +89,7 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
     for recording in recordings:
         kp = _stated(recording.drive.stiffness, of_joints(env, "stiffness"))
         kd = _stated(recording.drive.damping, of_joints(env, "damping"))
-        pull = np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
+        pull = _pull(env, recording)
         note = ""
         for inverse, certain in ((surely, True), (likely, False)):
             root = np.sqrt(pull)
@@ -110,6 +110,24 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
             note = f"{told}."
         notes.append(note)
     return notes
+
+
+def least_armature(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> np.ndarray:
+    """The armature below which a joint's loop, alone, is unstable at its step in a recording, (n,) [kg m²].
+
+    No recording of such a loop exists: with m the joint's inertia where all others are free, it is stable from
+    (kd dt + kp dt² / 2) / 2 - m on. A search that strays below finds oscillations.
+    """
+    alone = 1.0 / np.linalg.inv(_inertia(env, 0.0)).diagonal()
+    return np.max([0.5 * _pull(env, recording) - alone for recording in recordings], axis=0).clip(min=0.0)
+
+
+def _pull(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+    """Inertia that a loop which holds its torque asks for, twice: kd dt + kp dt² / 2, (n,) [kg m²]."""
+    dt = of_joints(env, "_run_dt")
+    kp = _stated(recording.drive.stiffness, of_joints(env, "stiffness"))
+    kd = _stated(recording.drive.damping, of_joints(env, "damping"))
+    return np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
 
 
 def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
@@ -139,6 +157,11 @@ def of_joints(env: ManagerBasedRLEnv, name: str, only_implicit: bool = False) ->
 
 def _inverse_inertia(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     """(M + armature)⁻¹ of the joints at the default posture, (n, n)."""
+    return np.linalg.inv(_inertia(env, _armature(env, upper)))
+
+
+def _inertia(env: ManagerBasedRLEnv, armature: np.ndarray | float) -> np.ndarray:
+    """M + armature of the joints at the default posture, (n, n) [kg m²]."""
     robot, model = env.scene["robot"], env.sim.model
     data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     columns = robot.dof_columns.numpy()
@@ -146,5 +169,5 @@ def _inverse_inertia(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, mass)
     own = mass[np.ix_(columns, columns)]
-    own[np.diag_indices(len(columns))] += _armature(env, upper) - model.dof_armature[columns]
-    return np.linalg.inv(own + 1e-12 * np.eye(len(columns)))
+    own[np.diag_indices(len(columns))] += armature - model.dof_armature[columns]
+    return own + 1e-12 * np.eye(len(columns))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from pace_actuators.effects import EffectCfg, effect_cfgs
@@ -15,7 +16,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.measured_effort import MeasuredDrives, read_drives
-from pace_optim.problem.drive_steps import check_loops, of_joints, set_control_step, set_drive_step
+from pace_optim.problem.drive_steps import check_loops, least_armature, of_joints, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
@@ -192,12 +193,14 @@ def load_problem(
         cfg = _configured(plain, physics_dt, with_unknown(effects or plain.sim2real.effects, unknown))
         env = ManagerBasedRLEnv(cfg)
     _narrow_delay(cfg, measured)
+    recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
+    for each in (plain, cfg) if not {"stiffness", "damping"} & set(unknown) else ():
+        _raise_armature(each, least_armature(env, [*recordings, *held_out]))
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), max_duration, tell_on_stderr
     )
     refuse_open_loops(env, [*recordings, *held_out])
-    recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     problem = Problem(
         task=task,
         plain_cfg=plain,
@@ -249,6 +252,14 @@ def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:
         bounds = cfg.sim2real.bounds_params.clone()
         bounds[-1] = bounds.new_tensor(measured.delay_bounds)
         cfg.sim2real.bounds_params = bounds
+
+
+def _raise_armature(cfg: PaceSim2realEnvCfg, least: np.ndarray) -> None:
+    """Seek the armature where the drives' loops are stable, and keep a width to seek in."""
+    bounds = cfg.sim2real.bounds_params.clone()
+    low, high = bounds[: len(least)].unbind(dim=1)
+    bounds[: len(least), 0] = torch.maximum(low, torch.minimum(torch.as_tensor(least), 0.5 * (low + high)))
+    cfg.sim2real.bounds_params = bounds
 
 
 def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:
