@@ -79,7 +79,13 @@ def held_at_prior(
             found = _fitted_beside(problem, x, list(chosen), cfg)
             if found is not None:
                 return found, list(chosen)
-    return at_prior(problem, x, silent), silent
+    held = at_prior(problem, x, silent)
+    if silent:  # which a simulation that oscillates does not show
+        evaluator = problem.training_evaluator()
+        before, after = evaluator.residuals(problem.space.to_physical(torch.stack([x, held]))).score.tolist()
+        if after > (1 + AS_GOOD) * before:
+            return x, []
+    return held, silent
 
 
 def without_delay(
