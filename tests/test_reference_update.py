@@ -76,7 +76,7 @@ def test_a_joint_alone_is_fitted_again_until_its_motion_stays():
     [
         ([[1.0, 1.0], [1.0, 1.0]], 2),  # the second motion gains nothing
         ([[4.0, 1.0], [1.0, 1.0], [0.95, 0.97]], 3),
-        ([[8.0, 1.0], [4.0, 1.0], [2.0, 1.0], [1.0, 1.0]], 4),  # at most
+        ([[8.0, 1.0], [4.0, 1.0], [2.0, 1.0], [1.0, 1.0]], 3),  # at most
         ([[0.2, 0.2]], 1),  # near the floor at once
     ],
 )
