@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from problems import BENCH, env_cfg
 
+from pace_envs.task_source import use_task
 from pace_optim.plant import (
     BENCH_LOAD,
     EFFECTS,
@@ -387,3 +388,14 @@ def test_data_collection_says_what_is_wrong_with_a_request(options, message, tmp
     assert collect("--task", BENCH, "--duration", "1", "--no_plot", *options) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_a_plant_reads_a_model_whose_keyframes_move_actuators(tmp_path):
+    path = tmp_path / "swing.xml"
+    path.write_text(
+        "<mujoco><worldbody><body><joint name='hinge' axis='0 1 0' range='-1 1'/><inertial pos='0 0 -0.1' mass='1' "
+        "diaginertia='0.01 0.01 0.01'/></body></worldbody><actuator><position name='a' joint='hinge' kp='8' "
+        "forcerange='-5 5'/></actuator><keyframe><key name='home' qpos='0.1' ctrl='0.1'/></keyframe></mujoco>"
+    )
+    robot = plant_robot(use_task(str(path)))
+    assert robot.spec().compile().nu == 0
