@@ -5,6 +5,8 @@ import torch
 from diagnoses import joint_alone
 
 from pace_actuators.effects import EffectCfg, EffectParameter, available_effects, get_effect
+from pace_envs import load_env_cfg
+from pace_envs.tasks.pace.parameters import effect_parameters
 from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.model.labels import labels
@@ -36,14 +38,25 @@ def test_what_acts_alike_by_construction_is_refitted_together(name):
 )
 def test_bounds_are_widened_as_far_as_physics_allows(bounds, changes, widest):
     options = {"name": "a", "unit": "1", "null": 0.0, "start": 0.0} | changes
-    assert EffectParameter(lower=bounds[0], upper=bounds[1], **options).widest == pytest.approx(widest)
+    assert EffectParameter(lower=bounds[0], upper=bounds[1], **options).widest() == pytest.approx(widest)
+
+
+def test_a_strong_drive_s_torques_are_sought_as_far_as_its_friction_says():
+    effort, velocity = get_effect("stribeck_friction").parameters
+    assert effort.widest(1.0) == (0.0, 16.0) and effort.widest(30.0) == (0.0, 120.0)
+    assert velocity.widest(30.0) == velocity.widest()
+    cfg = load_env_cfg("Pace-AnymalD-v0").sim2real
+    cfg.bounds_params[2 * 12 + 3, 1] = 30.0
+    cfg.effects = ["stribeck_friction@wide"]
+    (strong, _) = effect_parameters(cfg)
+    assert strong.upper[3] == 120.0 and max(strong.upper[:3]) == 16.0
 
 
 def test_no_factor_of_what_was_stated_can_be_negative():
     for effect in ALL:
         if effect.scales:
             (parameter,) = effect.parameters
-            assert parameter.widest[0] > parameter.null - 1.0
+            assert parameter.widest()[0] > parameter.null - 1.0
 
 
 def test_wide_bounds_travel_with_the_effect_s_name():

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 GLOBAL = ALL
 """The key of a parameter that all joints share."""
 
+_FRICTION = PARAMETER_GROUPS.index("friction")
+
 UNITS = {
     "armature": "kg m^2",
     "viscous_friction": "N m s/rad",
@@ -139,12 +141,15 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
         kind = effect.effect_class
         for parameter in kind.parameters:
             keys = (GLOBAL,) if effect.shared else own
-            lower, upper = parameter.widest if effect.wide else (parameter.lower, parameter.upper)
-            if kind is DynamicFriction:
-                lower, upper = cfg.friction_ratio_bounds
             given = cfg.effect_bounds.get(f"{kind.name}.{parameter.name}", {})
-            start = min(max(parameter.start, lower), upper)
-            each = [given.get(joint, (lower, start, upper)) for joint in own]
+            each = []
+            for joint, i in zip(own, ids, strict=True):
+                lower, upper = parameter.lower, parameter.upper
+                if kind is DynamicFriction:
+                    lower, upper = cfg.friction_ratio_bounds
+                elif effect.wide:
+                    lower, upper = parameter.widest(float(cfg.bounds_params[_FRICTION * len(joints) + i, 1]))
+                each.append(given.get(joint, (lower, min(max(parameter.start, lower), upper), upper)))
             if effect.shared and each:
                 lows, starts, highs = zip(*each, strict=True)
                 each = [(min(lows), sum(starts) / len(starts), max(highs))]
@@ -158,7 +163,7 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
                     keys=keys,
                     scale=parameter.scale,
                     units=_units(parameter.unit, own if effect.shared else keys, cfg)[: len(keys)],
-                    start=tuple(at for _, at, _ in each) if given else start,
+                    start=tuple(at for _, at, _ in each),
                 )
             )
     return tuple(result)

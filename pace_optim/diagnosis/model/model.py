@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from pace_actuators.effects import Effect
+from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.problem.box import Box
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import AT_BOUND
@@ -167,18 +167,23 @@ class JointModel:
         lower, upper = model.lower.clone(), model.upper.clone()
         # what was held for a joint's old values is not held for its new ones
         for column, p in enumerate(effect.parameters, start=columns.start):
-            own = physical[joints, column]
-            least, most = p.widest
-            lower[joints, column] = torch.full_like(own, p.lower).masked_fill(own < p.lower, least)
-            upper[joints, column] = torch.full_like(own, p.upper).masked_fill(own > p.upper, most)
+            own, (least, most) = physical[joints, column], model._widest(p, joints)
+            lower[joints, column] = torch.where(own < p.lower, least, p.lower)
+            upper[joints, column] = torch.where(own > p.upper, most, p.upper)
         return replace(model, lower=lower, upper=upper), physical
 
     def widened(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
         """The same with an effect's bounds as wide as physics allows on some joints, (n,) bool."""
         lower, upper = self.lower.clone(), self.upper.clone()
         for column, parameter in enumerate(effect.parameters, start=self.columns(effect).start):
-            lower[joints, column], upper[joints, column] = parameter.widest
+            lower[joints, column], upper[joints, column] = self._widest(parameter, joints)
         return replace(self, lower=lower, upper=upper)
+
+    def _widest(self, parameter: EffectParameter, joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The widest bounds of an effect's parameter on some joints, (n,) bool; physical, one for each of them."""
+        friction = self.upper[joints, BASE.index("friction")].tolist()
+        bounds = torch.tensor([parameter.widest(each) for each in friction], dtype=torch.float64).reshape(-1, 2)
+        return bounds[:, 0], bounds[:, 1]
 
     def is_wide(self, effect: type[Effect]) -> torch.Tensor:
         """Joints on which an effect's bounds are wider than it declares them, (n,) bool."""
