@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from effect_envs import EFFECTS
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators import PaceDCMotor
-from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
+from pace_actuators.effects import Effect, EffectParameter, get_effect, registry
 from pace_envs import set_physics_dt
 from pace_envs.kernels import host
 from pace_optim.recording import Load
@@ -76,12 +77,12 @@ def test_the_plain_drive_of_a_joint_moves_to_the_last_digits(bench):
 @pytest.mark.parametrize(("physics_dt", "first"), [(DT / 4, 0), (DT / 4, 1), (DT / 4, 2), (DT / 4, 3), (DT, 0)])
 def test_effects_move_a_joint_as_in_the_environment(bench, physics_dt, first):
     """Every one of them, several at once: each set takes a compiler a second."""
-    names = [name for name in available_effects() if not get_effect(name).reads_link][first::4]
+    names = [name for name in EFFECTS if not get_effect(name).reads_link][first::4]
     assert apart(*with_effects(bench.with_physics_dt(physics_dt), names)) < 1e-8
 
 
 def test_an_effect_that_reads_the_link_is_left_to_the_environment(bench):
-    name = next(name for name in available_effects() if get_effect(name).reads_link)
+    name = next(name for name in EFFECTS if get_effect(name).reads_link)
     expected, got, compiled = both(*with_effects(bench, [name]))
     assert not compiled and torch.equal(expected, got)
 

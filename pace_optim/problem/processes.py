@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -92,6 +93,7 @@ def join(device: str = "cpu") -> tuple[Processes, str]:
     own = own_device(device)
     if not dist.is_initialized():  # scores are few numbers: by gloo, which tells of a lost process at once
         _together(lambda: dist.init_process_group("gloo", timeout=_LOST_AFTER))
+        atexit.register(_leave)
     return Processes(rank=dist.get_rank(), count=dist.get_world_size()), own
 
 
@@ -100,6 +102,12 @@ def own_device(device: str) -> str:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not device.startswith("cuda"):
         return device
     return f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
+
+
+def _leave() -> None:
+    """End gloo's threads before the interpreter ends: one that still runs then aborts the process."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def _together(action: Callable[[], object]) -> None:
