@@ -18,6 +18,7 @@ from pace_envs.tasks.pace import Parameter, test_bench
 from pace_optim.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
+from pace_optim.run.open import Run
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds, read_trajectory
 from pace_optim.terminal.cli import run_cli
@@ -253,6 +254,16 @@ def test_names_in_lists_of_their_own_are_told_with_their_file(tmp_path):
     path.with_suffix(".json").write_text(json.dumps(facts | {"joint_names": ["servo", ["arm"]]}))
     with pytest.raises(ValueError, match=r"r\.json: joint_names differs from the one in r\.csv"):
         load_recording(path)
+
+
+def test_recordings_that_a_run_names_and_cannot_have_are_told_with_its_settings(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    content = json.loads((run / "settings.json").read_text())
+    content["settings"]["validation"] = ["x"]
+    (run / "settings.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"x: found the suffix ''.*settings\.json"):
+        Run.open(run).problem()
 
 
 def test_scores_of_different_length_are_told_with_their_file(finished, tmp_path):

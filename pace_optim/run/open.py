@@ -93,7 +93,12 @@ class Run:
         if data:
             own = {"data": [str(path) for path in data], "validation": []}
             settings = replace(settings, **own, columns=columns, strict=strict)  # type: ignore[arg-type]
-        problem = problem_of(replace(settings, physics_dt=physics_dt or settings.physics_dt), self.load_cfg())
+        try:
+            problem = problem_of(replace(settings, physics_dt=physics_dt or settings.physics_dt), self.load_cfg())
+        except ValueError as error:
+            if data or str(self.folder) in str(error):
+                raise
+            raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
         return problem if effects is None else problem.with_effects(effects)
 
     def load_cfg(self) -> Any:
