@@ -3,6 +3,7 @@
 import copy
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -249,6 +250,21 @@ def test_a_checkpoint_of_another_robot_or_none_is_refused(run, tmp_path):
         play(PlaySettings(checkpoint=str(wrong)))
     cfg = load_env_cfg(TASKS[0])
     assert cfg.runner.to_dict()["actor"]["hidden_dims"] == (128, 128, 128)
+
+
+def test_a_training_does_not_begin_with_an_optimizer_that_lacks_a_moment(run, tmp_path):
+    """It was missed in the first update, when the folder had been written to."""
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    path = latest_checkpoint(folder)
+    content = torch.load(path, weights_only=True)
+    state = content["optimizer_state_dict"]["state"]
+    state[0]["mean"] = state[0].pop("exp_avg")
+    torch.save(content, path)
+    before = {each.name: each.stat().st_mtime_ns for each in folder.iterdir()}
+    with pytest.raises(ValueError, match="the optimizer's exp_avg is missing"):
+        resume(folder, max_iterations=9)
+    assert {each.name: each.stat().st_mtime_ns for each in folder.iterdir()} == before
 
 
 def test_a_film_needs_a_known_ending_and_pictures(tmp_path):

@@ -126,6 +126,10 @@ def _finite(value: Any, what: str) -> float:
     return value
 
 
+_ADAM = {"step", "exp_avg", "exp_avg_sq"}
+"""What Adam keeps of a parameter."""
+
+
 def _check_optimizer(optimizer: torch.optim.Optimizer, before: list[dict[str, Any]]) -> None:
     """See whether what was loaded can be gone on with: the optimizer itself looks when it steps."""
     for group, own in zip(optimizer.param_groups, before, strict=True):
@@ -136,7 +140,10 @@ def _check_optimizer(optimizer: torch.optim.Optimizer, before: list[dict[str, An
             if type(found) is not type(value) or (isinstance(found, float) and not 0.0 <= found < math.inf):
                 raise ValueError(f"the optimizer's {key} is {found!r:.40}")
         for parameter in group["params"]:
-            for key, value in optimizer.state.get(parameter, {}).items():
+            state = optimizer.state.get(parameter, {})
+            if state and isinstance(optimizer, torch.optim.Adam) and (missing := _ADAM - state.keys()):
+                raise ValueError(f"the optimizer's {missing.pop()} is missing")
+            for key, value in state.items():
                 if isinstance(value, torch.Tensor) and value.shape not in ((), parameter.shape):
                     raise ValueError(f"the optimizer's {key} has the shape {tuple(value.shape)}")
                 if not isinstance(value, torch.Tensor) or not value.isfinite().all():
