@@ -4,7 +4,21 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+
+import pytest
 
 if "PACE_TEST_STATE" not in os.environ:  # processes that tests start share it
     os.environ["PACE_TEST_STATE"] = os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="pace-state-")
     atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
+
+from pace_actuators.effects import registry
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _effects_are_forgotten() -> Iterator[None]:
+    """Effects that one file of tests registers are not those of the next one in the same process."""
+    before = dict(registry._EFFECTS)
+    yield
+    registry._EFFECTS.clear()
+    registry._EFFECTS.update(before)

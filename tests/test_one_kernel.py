@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from effect_envs import EFFECTS
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
-from pace_actuators.effects import Effect, EffectParameter, available_effects, get_effect, registry
+from pace_actuators.effects import Effect, EffectParameter, get_effect, registry
 from pace_envs.kernels import CannotCompileError, HostKernels, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
@@ -83,7 +84,7 @@ def legs():
 
 
 def test_every_effect_moves_a_joint_as_in_the_simulation(kernels, bench):
-    names = available_effects()
+    names = EFFECTS
     models = slots_of(bench.problem, bench.start, *([get_effect(name)] for name in names))
     expected, got = both(bench.twins.in_windows(), models, kernels)
     apart = dict(zip(["base", *names], (expected - got).abs().amax(dim=(1, 2, 3))[::2].tolist(), strict=True))
