@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from problems import BENCH, DT, TRUTH, env_cfg
 
-from pace_actuators.effects import EffectCfg, available_effects, get_effect
+from pace_actuators.effects import Effect, EffectCfg, EffectParameter, available_effects, get_effect
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.problem.parameter_space import ParameterSpace
 
@@ -131,3 +131,15 @@ def long_chirp(duration: float, low: float = 0.3, high: float = 8.0, amplitude: 
     """Targets of one joint, (T, 1) [rad]."""
     t = np.arange(round(duration / DT)) * DT
     return amplitude * np.sin(2 * math.pi * (low * t + (high - low) / (2 * duration) * t**2))[:, None]
+
+
+class Branching(Effect):
+    """An effect of a user's that asks for a tensor's values."""
+
+    name = "branching"
+    stage = "transmission"
+    parameters = (EffectParameter(name="effort", unit="N m", lower=-1.0, upper=1.0, null=0.0, start=0.1),)
+
+    def transmission(self, s):
+        if bool((s.joint_pos > 0).any()):
+            s.effort += self.effort

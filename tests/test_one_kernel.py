@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from effect_envs import EFFECTS
+from effect_envs import EFFECTS, Branching
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
-from pace_actuators.effects import Effect, EffectParameter, get_effect, registry
+from pace_actuators.effects import get_effect, registry
 from pace_envs.kernels import CannotCompileError, HostKernels, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
@@ -123,18 +123,6 @@ def test_drives_that_are_switched_off_and_samples_beside_the_steps(kernels, benc
     expected, got = both(twins, models, kernels)
     assert float((expected - got).abs().max()) < 1e-8
     assert float((expected - both(bench.twins, models, kernels)[0]).abs().max()) > 1e-3
-
-
-class Branching(Effect):
-    """An effect of a user's that asks for a tensor's values."""
-
-    name = "branching"
-    stage = "transmission"
-    parameters = (EffectParameter(name="effort", unit="N m", lower=-1.0, upper=1.0, null=0.0, start=0.1),)
-
-    def transmission(self, s):
-        if bool((s.joint_pos > 0).any()):
-            s.effort += self.effort
 
 
 def test_the_processor_simulates_what_no_kernel_can(kernels, bench, monkeypatch):

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from effect_envs import EFFECTS
+from effect_envs import EFFECTS, Branching
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators import PaceDCMotor
-from pace_actuators.effects import Effect, EffectParameter, get_effect, registry
+from pace_actuators.effects import get_effect, registry
 from pace_envs import set_physics_dt
 from pace_envs.kernels import host
 from pace_optim.recording import Load
@@ -139,18 +139,6 @@ def test_facts_of_recordings_switches_speeds_and_samples_beside_the_steps(bench)
     where = problem.dataset.train.clone()
     where[30:] = where[5:12] = False
     assert apart(problem, where=where) < 1e-14
-
-
-class Branching(Effect):
-    """An effect of a user's that asks for a tensor's values."""
-
-    name = "branching"
-    stage = "transmission"
-    parameters = (EffectParameter(name="effort", unit="N m", lower=-1.0, upper=1.0, null=0.0, start=0.1),)
-
-    def transmission(self, s):
-        if bool((s.joint_pos > 0).any()):
-            s.effort += self.effort
 
 
 class OwnDrive(PaceDCMotor):
