@@ -21,7 +21,8 @@ from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
 from pace_optim.optimizers.jacobian import Colouring, colour
-from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, bounded_step, least_squares
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.optimizers.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
 
 

@@ -1,4 +1,4 @@
-"""Box-constrained Levenberg–Marquardt on rollout residuals, several starts and all trials in one batch."""
+"""Levenberg–Marquardt on rollout residuals of a whole robot, several starts and all trials in one batch."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import mujoco
 import numpy as np
 import torch
 
 from pace_optim.optimizers.jacobian import Colouring, Jacobian, jacobian, perturbed
+from pace_optim.optimizers.levenberg_marquardt import (
+    DAMPING_TRIALS,
+    FIRST_DAMPING,
+    LinearModel,
+    next_damping,
+    rows_of,
+    trial_rows,
+)
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
-FIRST_DAMPING = 1e-3
-"""Relative to the diagonal of JᵀJ."""
-DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
-"""Multiples of the damping that are tried side by side; the next damping is a tenth of the one that was best."""
 _STALLED = 3
 _CREEPING = 4
 _GIVEN = 5
-_SMALLEST_DAMPING = 1e-9
 _NEAR = 1e-2
 """A step that is expected to lower the score by less than this part of it hardly changes the derivatives, ..."""
 _KEPT = 0.5
@@ -118,50 +120,13 @@ class Descent:
         """Steps at several dampings, the favoured first, (trials, size)."""
         if self.jacobian is None:
             return self.x[None]
-        hessian, gradient = self.jacobian.normal_equations()
-        return torch.stack(
-            [bounded_step(self.x, hessian, gradient, self.damping * factor) for factor in DAMPING_TRIALS]
-        )
+        return LinearModel(*self.jacobian.normal_equations()).trials(self.x, self.damping)
 
     def expected_gain(self, x: torch.Tensor) -> float:
-        """How much lower the linear model has the score at x, -(2 gᵀd + dᵀHd) with d the step to x [rad²]."""
+        """How much lower the linear model has the score at x [rad²]."""
         if self.jacobian is None:
             return np.inf
-        hessian, gradient = self.jacobian.normal_equations()
-        move = x - self.x
-        return -float(2 * gradient @ move + move @ hessian @ move)
-
-
-def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor, damping: float) -> torch.Tensor:
-    """The damped Gauss–Newton step inside the box [-1, 1].
-
-        min_d  ½ dᵀ (H + μ diag H) d + gᵀ d   with  -1 ≤ x + d ≤ 1
-
-    solved with MuJoCo's box-constrained quadratic program, so that entries at their bounds leave the active set.
-
-    Args:
-        x: Present vector, (size,).
-        hessian: JᵀJ, (size, size).
-        gradient: Jᵀr, (size,).
-        damping: μ.
-
-    Returns:
-        The new vector x + d, (size,).
-    """
-    # scaled to a unit diagonal: entries of very different influence then weigh the same
-    diagonal = hessian.diagonal()
-    scale = diagonal.clamp(min=1e-14 * float(diagonal.max()) + 1e-300).rsqrt()
-    n = len(x)
-    matrix = (hessian * scale[:, None] * scale[None, :]).numpy() + (damping + 1e-12) * np.eye(n)
-    slope = gradient * scale
-    size = max(float(slope.norm()), 1e-300)  # of the problem; the solver's tolerances are absolute
-    lower = ((-1 - x) / scale / size).clamp(max=0.0).numpy()
-    upper = ((1 - x) / scale / size).clamp(min=0.0).numpy()
-    result, factor = np.zeros(n), np.zeros((n, n + 7))
-    free = mujoco.mju_boxQP(result, factor, None, np.ascontiguousarray(matrix), (slope / size).numpy(), lower, upper)
-    if free < 0:
-        return x.clone()
-    return (x + torch.as_tensor(result) * (size * scale)).clamp(-1.0, 1.0)
+        return LinearModel(*self.jacobian.normal_equations()).expected_gain(x - self.x)
 
 
 def least_squares(
@@ -203,7 +168,7 @@ def least_squares(
             neighbours, step = perturbed(trials[0], colouring)
             if not descent.looks_around(trials[0], cfg):
                 neighbours = neighbours[:0]
-            batches.append(torch.cat([trials[:1], neighbours, trials[1:]]))
+            batches.append(rows_of(trials, neighbours))
             steps.append(step)
         every = evaluator.residuals(evaluator.space.to_physical(torch.cat(batches)), where)
         start = 0
@@ -253,7 +218,7 @@ def _advance(
         descent.look(batch[0], residuals, step, colouring)
         descent.scores = descent.scores or [descent.score]
     else:
-        rows = [0, *range(len(batch) - len(DAMPING_TRIALS) + 1, len(batch))]
+        rows = trial_rows(len(batch), len(DAMPING_TRIALS))
         best = int(scores[rows].argmin())
         gain = descent.score - float(scores[rows[best]])
         expected = descent.expected_gain(batch[0])
@@ -262,7 +227,7 @@ def _advance(
         if gain > 0:
             moved = float((batch[rows[best]] - descent.x).abs().max())
             descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
-            descent.damping = max(_SMALLEST_DAMPING, descent.damping * DAMPING_TRIALS[best] / 10.0)
+            descent.damping = next_damping(descent.damping, best)
             if descent.jacobian is not None and not looked:
                 descent.jacobian = replace(descent.jacobian, residuals=residuals.rows(rows[best], rows[best] + 1))
             elif best == 0:  # its neighbours were simulated beside it
@@ -272,7 +237,7 @@ def _advance(
             if moved < cfg.step_tolerance:
                 descent.stop_reason = "converged"
         elif fresh:
-            descent.damping *= 1e3
+            descent.damping = next_damping(descent.damping, None)
         if not fresh and gain < _KEPT * expected:
             descent.jacobian = None  # the derivatives are those of elsewhere: look around
         stands = expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED

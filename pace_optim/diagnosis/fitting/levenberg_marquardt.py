@@ -6,7 +6,14 @@ import torch
 
 from pace_optim.diagnosis.diagnosis_cfg import FittingCfg
 from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.optimizers.least_squares import DAMPING_TRIALS, FIRST_DAMPING, bounded_step
+from pace_optim.optimizers.levenberg_marquardt import (
+    DAMPING_TRIALS,
+    FIRST_DAMPING,
+    LinearModel,
+    next_damping,
+    rows_of,
+    trial_rows,
+)
 
 TRIALS = DAMPING_TRIALS[:-1]
 """Those of a whole robot's fit without the largest: a joint has few parameters."""
@@ -50,29 +57,24 @@ class LevenbergMarquardt:
 
     def ask(self) -> torch.Tensor:
         """Normalised rows, (P + trials, n, P)."""
-        n, size = self.x.shape
+        size = self.x.shape[1]
         trials = self.x.repeat(len(TRIALS), 1, 1)
-        for j in range(n):
-            free = self._free[j]
-            if not bool(self._known[j]) or not bool(free.any()):
-                continue
-            at = free.nonzero()[:, 0]
-            hessian, gradient = self._hessian[j][at[:, None], at], self._gradient[j][at]
-            for t, factor in enumerate(TRIALS):
-                trials[t, j, at] = bounded_step(self.x[j, at], hessian, gradient, float(self._damping[j]) * factor)
+        for j in self._known.nonzero()[:, 0].tolist():
+            at, linear = self._linear_model(j)
+            trials[:, j, at] = linear.trials(self.x[j, at], float(self._damping[j]), TRIALS)
         favoured = trials[0]
         width = self._widths[self._width][:, None]
         self._step = torch.where(favoured > 0, -width, width)
         neighbours = favoured.repeat(size, 1, 1)
         for p in range(size):
             neighbours[p, :, p] += self._step[:, p]
-        return torch.cat([favoured[None], neighbours, trials[1:]])
+        return rows_of(trials, neighbours)
 
     def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
         """Take the best row of each joint."""
         size = self.x.shape[1]
         scores = error.square().sum(dim=(1, 2), dtype=torch.float64).cpu() / self._samples
-        choice = [0, *range(1 + size, len(x))]
+        choice = trial_rows(len(x), len(TRIALS))
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
         better = lowest < self.score
@@ -88,9 +90,8 @@ class LevenbergMarquardt:
         self.x = torch.where(moved[:, None], chosen, self.x)
         self.score = torch.where(better, lowest, self.score)
         self._scores.append(float(self.score.sum()))
-        factor = torch.tensor(TRIALS, dtype=torch.float64)[best]
-        lowered = (self._damping * factor / 10).clamp(min=1e-9)
-        self._damping = torch.where(moved, lowered, torch.where(fresh, self._damping, self._damping * TRIALS[-1]))
+        for j in (~fresh).nonzero()[:, 0].tolist():
+            self._damping[j] = next_damping(float(self._damping[j]), int(best[j]) if bool(moved[j]) else None)
         at_favoured = fresh | (moved & (best == 0))
         self._known = torch.where(at_favoured, True, torch.where(moved, False, self._known)) & ~narrower
         self._width += narrower
@@ -114,12 +115,16 @@ class LevenbergMarquardt:
         """Joints whose linear model, of the narrowest derivatives, promises next to nothing, (n,) bool."""
         result = self._width + 1 == len(self._widths)
         for j in result.nonzero()[:, 0].tolist():
-            at = self._free[j].nonzero()[:, 0]
-            x, hessian, gradient = self.x[j, at], self._hessian[j][at[:, None], at], self._gradient[j][at]
-            move = bounded_step(x, hessian, gradient, FIRST_DAMPING) - x if len(at) else x
-            promised = -float(2 * gradient @ move + move @ hessian @ move)
+            at, linear = self._linear_model(j)
+            x = self.x[j, at]
+            promised = linear.expected_gain(linear.step(x, FIRST_DAMPING) - x)
             result[j] = promised < self._cfg.enough / 10 * float(self.score[j])
         return result
+
+    def _linear_model(self, joint: int) -> tuple[torch.Tensor, LinearModel]:
+        """Free entries of a joint, and the linear model of its score by them."""
+        at = self._free[joint].nonzero()[:, 0]
+        return at, LinearModel(self._hessian[joint][at[:, None], at], self._gradient[joint][at])
 
     def result(self) -> Fitted:
         """Where it ended."""
