@@ -24,8 +24,7 @@ from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors, c
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.telling.next_experiment import rivals_of
-from pace_optim.diagnosis.verdict.verdict import explained_joints, ranking, verdict
+from pace_optim.diagnosis.verdict.verdict import confounded, explained_joints, ranking, verdict
 from pace_optim.problem.forked import parallel_map
 
 ROOT = Path(__file__).parents[1]
@@ -259,7 +258,7 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     assert entries[0]["confounded_with"] == ["quadratic_friction"]
     assert entries[1]["confounded_with"] == ["stribeck_friction"]
     assert entries[0]["joints"] == ["hip", "knee"]
-    pair = rivals_of(outcome)[0]
+    pair = confounded(outcome)[0]
     assert (pair.chosen, pair.rival, pair.joints) == (STRIBECK, QUADRATIC, [0])
     assert pair.models == ("with stribeck", "with quadratic")
     json.dumps(entries)

@@ -21,10 +21,11 @@ from pace_optim.diagnosis.search.merge_effects import _options, merge_effects
 from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Outcome
-from pace_optim.diagnosis.telling import next_experiment
-from pace_optim.diagnosis.telling.next_experiment import distances, menu, next_experiments, rivals_of
+from pace_optim.diagnosis.telling.advice import rivals
 from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
+from pace_optim.experiment_design import telling_apart
+from pace_optim.experiment_design.telling_apart import MenuCfg, distances, menu, next_experiments
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))
@@ -101,10 +102,11 @@ def test_rivals_are_sent_to_the_recording_where_they_part(bench):
         models=dict(zip((STRIBECK, QUADRATIC), models, strict=True)),
     )
     outcome = outcome_of([1e-3], [2e-4], [STRIBECK], rounds=[this])
-    (apart,) = distances(bench.problem, rivals_of(outcome), [[c.recording for c in menu(bench.problem, 0)]])
-    (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1e-4], dtype=torch.float64))
+    pairs = rivals(bench.problem.joint_names, outcome)
+    (apart,) = distances(bench.problem, pairs, [[c.recording for c in menu(bench.problem, 0, MenuCfg())]])
+    (sentence,) = next_experiments(bench.problem, pairs, torch.tensor([1e-4], dtype=torch.float64))
     assert f"{1e3 * float(apart.max()):.2g} mrad" in sentence and "scripts/data_collection.py --task" in sentence
-    (sentence,) = next_experiments(bench.problem, outcome, torch.tensor([1.0], dtype=torch.float64))
+    (sentence,) = next_experiments(bench.problem, pairs, torch.tensor([1.0], dtype=torch.float64))
     assert "Nor would any of" in sentence
 
 
@@ -119,17 +121,19 @@ def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monk
     def distances_of(_, pairs, recordings):
         counts = map(len, recordings)
         return [
-            torch.tensor([apart[p.rival].get(k, 0.0) for k in range(n)]) for p, n in zip(pairs, counts, strict=True)
+            torch.tensor([apart[get_effect(p.names[1])].get(k, 0.0) for k in range(n)])
+            for p, n in zip(pairs, counts, strict=True)
         ]
 
-    monkeypatch.setattr(next_experiment, "distances", distances_of)
+    monkeypatch.setattr(telling_apart, "distances", distances_of)
+    pairs = rivals(bench.problem.joint_names, outcome)
     noise = torch.tensor([1e-4], dtype=torch.float64)
-    (sentence,) = next_experiments(bench.problem, outcome, noise)
-    choice = list(menu(bench.problem, 0))[1]
+    (sentence,) = next_experiments(bench.problem, pairs, noise)
+    choice = list(menu(bench.problem, 0, MenuCfg()))[1]
     assert "stribeck_friction from quadratic_friction (servo), nor stribeck_friction from torque_gain" in sentence
     assert f"{choice.words} would" in sentence and "1 to 4 mrad, 10 to 40 times the noise" in sentence
     del apart[GAIN][1]
-    told, not_told = next_experiments(bench.problem, outcome, noise)
+    told, not_told = next_experiments(bench.problem, pairs, noise)
     assert "9 mrad, 90 times" in told and "torque_gain" not in told
     assert "from torque_gain (servo). Nor would any of 8 others tried." in not_told
 

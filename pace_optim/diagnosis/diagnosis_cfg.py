@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from pace_optim.experiment_design.telling_apart import MenuCfg
+
 
 @dataclass(frozen=True, kw_only=True)
 class FittingCfg:
@@ -116,8 +118,8 @@ class JudgingCfg:
     """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
-    to this ratio apart, a model is not worth the finer step above this many times the best one's RMSE, a window is an
-    outlier above this many times the median, and predictions part clearly above this many times the noise."""
+    to this ratio apart, a model is not worth the finer step above this many times the best one's RMSE, and a
+    window is an outlier above this many times the median."""
     in_place: int = 3
     """So many of those that came near are tried in place of a joint's effects."""
 
@@ -141,10 +143,6 @@ class VerdictCfg:
     """Joints with effects that are what is missing must hold this part of the robot's error above the floor."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
-    duration: float = 10.0
-    """Of the recordings on the menu of next experiments [s]."""
-    factor: float = 1.5
-    """Of their proportional gain and of their load."""
 
 
 RULES = (
@@ -176,6 +174,7 @@ class DiagnosisCfg:
     candidates: CandidatesCfg = field(default_factory=CandidatesCfg)
     judging: JudgingCfg = field(default_factory=JudgingCfg)
     verdict: VerdictCfg = field(default_factory=VerdictCfg)
+    menu: MenuCfg = field(default_factory=MenuCfg)
     off: tuple[str, ...] = ()
     """Which of ``RULES`` are not made, for an ablation."""
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
+from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.model.labels import found_effects
+from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.telling.next_experiment import next_experiments
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
+from pace_optim.diagnosis.verdict.verdict import confounded
+from pace_optim.experiment_design.telling_apart import Rivals, RobotModel, next_experiments
 from pace_optim.problem.problem import Problem
 
 
@@ -16,7 +20,7 @@ def advise(
     problem: Problem, outcome: Outcome, decision: str, data: DataCheck, absorbed: Iterable[type[Effect]]
 ) -> list[str]:
     """Sentences, the most useful first."""
-    result = next_experiments(problem, outcome, data.noise)
+    result = next_experiments(problem, rivals(problem.joint_names, outcome), data.noise, outcome.cfg.menu)
     if data.loads == 1:
         result.append(
             "All recordings carry the same load: friction that grows with the load, and a wrong torque or mass, cannot "
@@ -39,4 +43,20 @@ def advise(
             "what it is, write an effect of your own (docs/your_own_effect.md) and diagnose again with --effects "
             "module:Class."
         )
+    return result
+
+
+def rivals(joint_names: Sequence[str], outcome: Outcome) -> list[Rivals]:
+    """Effects that the recordings cannot tell apart, as models of the whole robot."""
+
+    def with_it(fitted: Fitted) -> RobotModel:
+        model, values = fitted.model, whole_values(fitted.model, fitted.x, joint_names)
+        return RobotModel(effects=found_effects(model, joint_names), values=values)
+
+    result = []
+    for pair in confounded(outcome):
+        names, separates = (pair.chosen.name, pair.rival.name), pair.chosen.separates or pair.rival.separates
+        models = with_it(pair.models[0]), with_it(pair.models[1])
+        hint = f"What would tell them apart: {separates}." if separates else ""
+        result.append(Rivals(names=names, models=models, joints=pair.joints, hint=hint))
     return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.comparison import least_ratio
+from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import (
     above_floor,
@@ -67,23 +68,39 @@ def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:
     )
 
 
-def likes(outcome: Outcome) -> dict[str, list[str]]:
-    """For each effect of the final model, those that the recordings cannot tell from it; only where there are any.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Confounded:
+    """An effect of the final model and one that does as well."""
 
-    Args:
-        outcome: Where the search ended.
-    """
-    model, found = outcome.final.model, {}
-    for effect, has in zip(model.effects, model.has, strict=True):
-        alike = {
-            other.name: None
-            for this in outcome.rounds
-            for j in has.nonzero()[:, 0].tolist()
-            if this.chosen[j] is effect
-            for other in this.rivals[j]
-        }
-        if alike:
-            found[effect.name] = list(alike)
+    chosen: type[Effect]
+    rival: type[Effect]
+    models: tuple[Fitted, Fitted]
+    """With either, as they were fitted."""
+    joints: list[int]
+
+
+def confounded(outcome: Outcome) -> list[Confounded]:
+    """Pairs of effects that the recordings cannot tell apart, with the joints where that is so."""
+    model, result = outcome.final.model, []
+    for this in outcome.rounds:
+        found: dict[tuple[type[Effect], type[Effect]], list[int]] = {}
+        for j, (chosen, rivals) in enumerate(zip(this.chosen, this.rivals, strict=True)):
+            if chosen in model.effects and bool(model.has[model.effects.index(chosen), j]):
+                for rival in rivals:
+                    found.setdefault((chosen, rival), []).append(j)
+        result += [
+            Confounded(chosen=a, rival=b, models=(this.models[a], this.models[b]), joints=joints)
+            for (a, b), joints in found.items()
+        ]
+    return result
+
+
+def likes(outcome: Outcome) -> dict[str, list[str]]:
+    """For each effect of the final model, those that the recordings cannot tell from it; only where there are any."""
+    found: dict[str, list[str]] = {}
+    for pair in confounded(outcome):
+        own = found.setdefault(pair.chosen.name, [])
+        own += [pair.rival.name] if pair.rival.name not in own else []
     return found
 
 

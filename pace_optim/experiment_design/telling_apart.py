@@ -1,19 +1,14 @@
-"""Which further recording would tell effects apart: the rivals are simulated on a menu of motions, gains and loads."""
+"""Which further recording would tell two models of a robot apart: they are simulated on a menu of motions and loads."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from pace_actuators.effects import Effect
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import found_effects
-from pace_optim.diagnosis.model.model import whole_values
-from pace_optim.diagnosis.search.state import Outcome
+from pace_actuators.effects import EffectCfg
 from pace_optim.excitation import make_excitation
 from pace_optim.problem.forked import parallel_map
 from pace_optim.problem.problem import Problem
@@ -22,6 +17,18 @@ from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.terminal.cli import command
 
 _MOTIONS = ("chirp", "multisine", "ramp", "steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MenuCfg:
+    """What could be recorded next."""
+
+    duration: float = 10.0
+    """Of each recording [s]."""
+    factor: float = 1.5
+    """Of the proportional gain, and of the load."""
+    clear: float = 3.0
+    """Predictions part clearly above this many times the noise."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,19 +44,29 @@ class Choice:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Rivals:
-    """Two effects that do equally well on some joints."""
+class RobotModel:
+    """What a robot may be like."""
 
-    chosen: type[Effect]
-    rival: type[Effect]
-    models: tuple[Fitted, Fitted]
-    """With either effect, fitted."""
+    effects: Sequence[EffectCfg]
+    values: Mapping[str, Mapping[str, float]]
+    """Parameters, as in ``result.json``."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rivals:
+    """Two models that do equally well on some joints."""
+
+    names: tuple[str, str]
+    """Of what they differ in."""
+    models: tuple[RobotModel, RobotModel]
     joints: list[int]
+    hint: str = ""
+    """What tells such models apart in general."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """How far two effects' predictions for an entry of the menu are apart."""
+    """How far two models' predictions for an entry of the menu are apart."""
 
     pair: Rivals
     choice: Choice
@@ -59,33 +76,36 @@ class Prediction:
     """The same as a multiple of the noise."""
 
 
-def next_experiments(problem: Problem, outcome: Outcome, noise: torch.Tensor) -> list[str]:
+def next_experiments(
+    problem: Problem, pairs: Sequence[Rivals], noise: torch.Tensor, cfg: MenuCfg | None = None
+) -> list[str]:
     """Which recordings would tell apart what the present ones cannot, as few of them as do, as sentences.
 
     Args:
         problem: The whole robot with the base model.
-        outcome: What the search found.
+        pairs: What cannot be told apart.
         noise: Of each joint, (n,) [rad].
+        cfg: The menu.
     """
-    pairs = rivals_of(outcome)
+    cfg = cfg or MenuCfg()
     if not pairs or problem.env_cfg.sim2real.excitation is None:
-        return [f"These recordings cannot tell {_named(pair, problem)}. {_hint(pair)}".rstrip() for pair in pairs]
-    menus = [list(menu(problem, pair.joints[0], cfg=outcome.cfg.verdict)) for pair in pairs]
+        return [f"These recordings cannot tell {_named(pair, problem)}. {pair.hint}".rstrip() for pair in pairs]
+    menus = [list(menu(problem, pair.joints[0], cfg)) for pair in pairs]
     apart = distances(problem, pairs, [[choice.recording for choice in choices] for choices in menus])
     predictions = [
         Prediction(pair=pair, choice=choice, apart=each, times=each / float(noise[pair.joints].mean()))
         for pair, choices, own in zip(pairs, menus, apart, strict=True)
         for choice, each in zip(choices, own.tolist(), strict=True)
     ]
-    clear = [each for each in predictions if each.times >= outcome.cfg.judging.far]
-    result, left = [], pairs
+    clear = [each for each in predictions if each.times >= cfg.clear]
+    result, left = [], list(pairs)
     while best := _most_telling([each for each in clear if each.pair in left]):
         result.append(_sentence(best, problem))
         left = [pair for pair in left if pair not in [each.pair for each in best]]
     for pair in left:
         count = sum(each.pair is pair for each in predictions)
         text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
-        result.append(f"{text} {_hint(pair)}".rstrip())
+        result.append(f"{text} {pair.hint}".rstrip())
     return result
 
 
@@ -114,24 +134,7 @@ def _range(values: Sequence[float], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def rivals_of(outcome: Outcome) -> list[Rivals]:
-    """Pairs of a chosen effect and one that does as well, with the joints where that is so and it stayed."""
-    result = []
-    has = dict(zip(outcome.final.model.effects, outcome.final.model.has.tolist(), strict=True))
-    for this in outcome.rounds:
-        found: dict[tuple[type[Effect], type[Effect]], list[int]] = {}
-        for j, (chosen, rivals) in enumerate(zip(this.chosen, this.rivals, strict=True)):
-            for rival in rivals:
-                if chosen is not None and chosen in has and has[chosen][j]:
-                    found.setdefault((chosen, rival), []).append(j)
-        result += [
-            Rivals(chosen=a, rival=b, models=(this.models[a], this.models[b]), joints=joints)
-            for (a, b), joints in found.items()
-        ]
-    return result
-
-
-def menu(problem: Problem, joint: int, *, cfg: VerdictCfg = DEFAULT.verdict) -> Iterator[Choice]:
+def menu(problem: Problem, joint: int, cfg: MenuCfg) -> Iterator[Choice]:
     """Every motion as the robot was, with a larger proportional gain, and with more load on a joint."""
     like = problem.dataset.recordings[problem.dataset.trained()[0]]
     conditions = [("", "", like), *_other_gain(like, cfg), *_other_load(problem, like, joint, cfg)]
@@ -168,22 +171,21 @@ def distances(
         recordings: What each pair is simulated on.
     """
     datasets = [make_dataset(own, train_fraction=1) for own in recordings]
-    items = [(fitted, data) for pair, data in zip(pairs, datasets, strict=True) for fitted in pair.models]
-    errors = parallel_map(lambda own: [_predicted(problem, fitted, data) for fitted, data in own], items)
+    items = [(model, data) for pair, data in zip(pairs, datasets, strict=True) for model in pair.models]
+    errors = parallel_map(lambda own: [_predicted(problem, model, data) for model, data in own], items)
     return [
         (errors[2 * i] - errors[2 * i + 1])[..., pair.joints].square().mean(dim=(0, 2)).sqrt()
         for i, pair in enumerate(pairs)
     ]
 
 
-def _predicted(problem: Problem, fitted: Fitted, data: Dataset) -> torch.Tensor:
+def _predicted(problem: Problem, model: RobotModel, data: Dataset) -> torch.Tensor:
     """A model's motion on recordings, less what is written there, (K, R, n) [rad]."""
-    own = replace(problem.with_effects(found_effects(fitted.model, problem.joint_names)), dataset=data)
-    values = own.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
-    return own.evaluator().residuals(values[None], data.sampled).error[0]
+    own = replace(problem.with_effects(model.effects), dataset=data)
+    return own.evaluator().residuals(own.space.from_dict(model.values)[None], data.sampled).error[0]
 
 
-def _other_gain(like: Recording, cfg: VerdictCfg) -> Iterator[tuple[str, str, Recording]]:
+def _other_gain(like: Recording, cfg: MenuCfg) -> Iterator[tuple[str, str, Recording]]:
     stiffness = like.drive.stiffness
     if stiffness is None:
         return
@@ -193,7 +195,7 @@ def _other_gain(like: Recording, cfg: VerdictCfg) -> Iterator[tuple[str, str, Re
     yield words, arguments, replace(like, drive=replace(like.drive, stiffness=cfg.factor * stiffness))
 
 
-def _other_load(problem: Problem, like: Recording, joint: int, cfg: VerdictCfg) -> Iterator[tuple[str, str, Recording]]:
+def _other_load(problem: Problem, like: Recording, joint: int, cfg: MenuCfg) -> Iterator[tuple[str, str, Recording]]:
     if like.load.load_mass is not None:
         mass = round(cfg.factor * like.load.load_mass, 2)
         yield f", {mass:g} kg on the arm", f" --load_mass {mass:g}", _loaded(like, load_mass=mass)
@@ -217,9 +219,4 @@ def _loaded(like: Recording, **changes: object) -> Recording:
 
 def _named(pair: Rivals, problem: Problem) -> str:
     names = ", ".join(problem.joint_names[j] for j in pair.joints)
-    return f"{pair.chosen.name} from {pair.rival.name} ({names})"
-
-
-def _hint(pair: Rivals) -> str:
-    separates = pair.chosen.separates or pair.rival.separates
-    return f"What would tell them apart: {separates}." if separates else ""
+    return f"{pair.names[0]} from {pair.names[1]} ({names})"
