@@ -17,17 +17,17 @@ import torch
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis import candidate_effects, search_effects
-from pace_optim.diagnosis.beginning.base_fit import fit_base
-from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.fits import Fits, fits_on
-from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
-from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import start_values
 from pace_optim.diagnosis.verdict.verdict import ranking
 from pace_optim.plant import Case, library_effects, outside_effects, write_case
 from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits, fits_on
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import start_values
+from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
 from pace_optim.single_joint_model.problem import TwinProblem
 
 GROUPS = ("effects", "clean", "outside", "pairs", "background", "harmonic")
@@ -62,7 +62,7 @@ class Job:
     @property
     def fits(self) -> Fits:
         """What fits models there."""
-        return fits_on(self.device, DiagnosisCfg(off=self.off))
+        return fits_on(self.device, DEFAULT.fitting)
 
 
 def make_jobs(
@@ -121,7 +121,10 @@ def run_case(job: Job) -> dict[str, Any]:
     middle = problem.space.to_physical(problem.space.start)
     decisions: list[Decision] = []
     fits = job.fits
-    found = search_effects(problem, middle, candidate_effects(), job.max_effects, log=decisions.append, fits=fits)
+    cfg = DiagnosisCfg(off=job.off)
+    found = search_effects(
+        problem, middle, candidate_effects(), job.max_effects, log=decisions.append, cfg=cfg, fits=fits
+    )
     diagnosed = time.perf_counter()
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     job.folder.with_name(f"{job.case.name}.jsonl").write_bytes(as_lines(decisions))

@@ -15,15 +15,15 @@ from pace_actuators.effects import Effect, get_effect
 from pace_actuators.files import write_json
 from pace_envs import set_physics_dt
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Trial
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 
@@ -184,8 +184,8 @@ def errors_of(*rmse, roll=0):
 class FakeFits(Fits):
     """Models stay where they start; their errors follow from the model."""
 
-    def __init__(self, errors, off=()):
-        super().__init__(cfg=DiagnosisCfg(off=off))
+    def __init__(self, errors):
+        super().__init__()
         object.__setattr__(self, "errors", errors)
 
     def side_by_side(self, problem, starts, *args, **kwargs):
@@ -207,8 +207,8 @@ class FakeFits(Fits):
 def make_search(errors, floor=(1e-4,), effects=(None,) * 30, off=(), **changes):
     """A search whose fits stay where they start, with the errors that a function gives of a model."""
     floor = torch.tensor(floor, dtype=torch.float64)
-    fits = FakeFits(errors, off)
-    return Search(effects=effects, effort=5 * floor, floor=floor, max_effects=3, fits=fits, **changes)
+    fits, cfg = FakeFits(errors), DiagnosisCfg(off=off)
+    return Search(effects=effects, effort=5 * floor, floor=floor, max_effects=3, fits=fits, cfg=cfg, **changes)
 
 
 def with_effects(model, values, *effects):

@@ -7,11 +7,11 @@ from diagnoses import joint_alone
 from pace_actuators.effects import EffectCfg, EffectParameter, available_effects, get_effect
 from pace_envs import load_env_cfg
 from pace_envs.tasks.pace.parameters import effect_parameters
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.search.one_round import beyond_bounds, with_likes
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.model import JointModel
 
 OFFSET, PAYLOAD, GAIN = (get_effect(name) for name in ("torque_offset", "payload", "torque_gain"))
 ALL = [get_effect(name) for name in available_effects()]

@@ -9,11 +9,11 @@ from diagnoses import FakeFits, errors_of, joint_alone, with_effects
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.telling.findings import Findings, summary_of
 from pace_optim.diagnosis.verdict.contributions import contributions
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.model import JointModel
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

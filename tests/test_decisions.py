@@ -23,7 +23,7 @@ from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.state import Branch
 
 ROOT = Path(__file__).parents[1]
-DIAGNOSIS = ROOT / "pace_optim" / "diagnosis"
+FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "single_joint_fits")]
 CASES = read_cases(sorted((Path(__file__).parent / "decisions").glob("*.jsonl*")))
 """The decisions of the reference: benchmarks/ablation.md."""
 PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}
@@ -105,12 +105,14 @@ def numbers(path: Path) -> list[str]:
 
 
 def test_every_tuned_number_is_in_the_configuration():
-    files = [path for path in DIAGNOSIS.rglob("*.py") if path.name not in ("diagnosis_cfg.py", "settings.py")]
+    without = ("diagnosis_cfg.py", "fitting_cfg.py", "settings.py")
+    files = [path for folder in FOLDERS for path in folder.rglob("*.py") if path.name not in without]
     assert [each for path in files for each in numbers(path)] == []
 
 
-def test_every_tuned_number_is_documented():
-    tree = ast.parse((DIAGNOSIS / "diagnosis_cfg.py").read_text(encoding="utf-8"))
+@pytest.mark.parametrize("name", ["diagnosis/diagnosis_cfg.py", "single_joint_fits/fitting_cfg.py"])
+def test_every_tuned_number_is_documented(name):
+    tree = ast.parse((ROOT / "pace_optim" / name).read_text(encoding="utf-8"))
     for part in (node for node in tree.body if isinstance(node, ast.ClassDef)):
         for node, after in zip(part.body, part.body[1:], strict=False):
             if isinstance(node, ast.AnnAssign) and part.name != "DiagnosisCfg":
@@ -120,7 +122,7 @@ def test_every_tuned_number_is_documented():
 def test_whoever_is_given_numbers_passes_them_on():
     """A default left in force somewhere would decide by other numbers than those that are saved."""
     given, calls = {}, []
-    for path in DIAGNOSIS.rglob("*.py"):
+    for path in (path for folder in FOLDERS for path in folder.rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):

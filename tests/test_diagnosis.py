@@ -20,12 +20,12 @@ from pace_optim.diagnosis import candidate_effects
 from pace_optim.diagnosis.candidates.screening import _explained
 from pace_optim.diagnosis.diagnose import search_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors, check_long_enough
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.comparison import judge
-from pace_optim.diagnosis.model.labels import labels
 from pace_optim.diagnosis.verdict.verdict import confounded, explained_joints, ranking, verdict
 from pace_optim.problem.forked import parallel_map
+from pace_optim.single_joint_fits.block_errors import BlockErrors, block_errors, check_long_enough
+from pace_optim.single_joint_fits.labels import labels
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -154,12 +154,12 @@ def test_blocks_of_short_recordings_are_shorter(seconds, count, weight):
 def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
     where = torch.zeros(400, 2, dtype=torch.bool)
     where[:200, 0] = where[100:300:2, 1] = True
-    check_long_enough(where, 0.0025)
+    check_long_enough(where, 0.0025, 4)
     where[100:, 0] = False
     with pytest.raises(
         ValueError, match=r"lasts 0\.75 s, .* expected 1 s or more\. Record for longer, or .*--validation"
     ):
-        check_long_enough(where, 0.0025)
+        check_long_enough(where, 0.0025, 4)
     run = hidden_run(tmp_path, None, duration=2.5)
     data = run.problem.dataset
     short = replace(data, train=data.train | (torch.arange(len(data.train)) > 40)[:, None])

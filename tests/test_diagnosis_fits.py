@@ -10,17 +10,17 @@ from diagnoses import joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis.beginning import base_fit
-from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.levenberg_marquardt import LevenbergMarquardt
-from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
-from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot, _merged
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel, start_values, whole_values
+from pace_optim.single_joint_fits import base_fit
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.descent import JointDescent
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel, start_values, whole_values
+from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
+from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot, _merged
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
@@ -29,7 +29,7 @@ FITS = Fits()
 
 def descent(start, rough=False):
     """Of one model, without a simulation."""
-    return LevenbergMarquardt(start, torch.ones(1), False, rough, DEFAULT.fitting)
+    return JointDescent(start, torch.ones(1), False, rough, DEFAULT.fitting)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     model = JointModel.base(bench.problem)
     heavy[:, BASE.index("armature")] = model.upper[:, BASE.index("armature")]
     coarse, now = bench.twins.with_physics_dt(DT), Fitted.start(model, heavy)
-    starts = multistart(FITS, coarse, now, [STRIBECK, get_effect("joint_elasticity")])
+    starts = multistart(FITS, coarse, now, [STRIBECK, get_effect("joint_elasticity")], DEFAULT.candidates)
     stiff = [start.tried.name for start in starts[1:]]
     assert starts[0].tried is STRIBECK and stiff == ["joint_elasticity"] * len(probe_points(starts[1].tried))
     slots = [Slot(model=model, rows=1), *(Slot(model=start.model, rows=1) for start in starts)]

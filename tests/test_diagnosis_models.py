@@ -8,13 +8,13 @@ from diagnoses import FakeFits, errors_of, joint_alone, make_search
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.screening import Probe
-from pace_optim.diagnosis.fitting.validation import BlockErrors
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
 from pace_optim.diagnosis.search.one_round import _ranked
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.state import Branch, Outcome
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

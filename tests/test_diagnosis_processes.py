@@ -15,16 +15,18 @@ from diagnoses import joint_alone
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import screen
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.problem import forked as processes
 from pace_optim.problem.forked import parallel_map
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 
 GAIN, STRIBECK, RIPPLE = (get_effect(name) for name in ("torque_gain", "stribeck_friction", "torque_ripple"))
 ELASTICITY = get_effect("joint_elasticity")
+CFG = DEFAULT.candidates
 
 
 @pytest.fixture(autouse=True)
@@ -178,7 +180,11 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
             for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
         fits = Fits().side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
-        return screen(Fits(), bench.twins, base, effects, effort), fits, multistart(Fits(), bench.twins, base, effects)
+        return (
+            screen(Fits(), bench.twins, base, effects, effort, CFG),
+            fits,
+            multistart(Fits(), bench.twins, base, effects, CFG),
+        )
 
     probes, fits, far = found()
     monkeypatch.setattr(processes, "available_processors", lambda: 1)

@@ -10,12 +10,8 @@ from problems import DT
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.choice import choose
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.alternatives import exchanged
 from pace_optim.diagnosis.search.merge_effects import _options, merge_effects
 from pace_optim.diagnosis.search.replace_effect import replace_effects
@@ -26,6 +22,10 @@ from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 from pace_optim.experiment_design import telling_apart
 from pace_optim.experiment_design.telling_apart import MenuCfg, distances, menu, next_experiments
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.model import BASE, JointModel
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))
@@ -142,10 +142,10 @@ def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
     start, coarse = Fitted.start(JointModel.base(bench.problem), bench.truth_values), bench.twins.with_physics_dt(DT)
     fitted, effort = Fits().side_by_side(bench.twins, [start], 2, True)[0], torch.tensor([5.0], dtype=torch.float64)
     effects = [get_effect(name) for name in ("stribeck_friction", "measurement_delay", "com_offset")]
-    found = absorbed_effects(Fits(), coarse, fitted, effects, effort)
+    found = absorbed_effects(Fits(), coarse, fitted, effects, effort, DEFAULT.candidates)
     assert [effect.name for effect in found] == ["measurement_delay", "com_offset"]
     fitted.jacobian.normal_()  # as rough as a narrow step sees joints that stick
-    rough = absorbed_effects(Fits(), coarse, fitted, effects, effort)
+    rough = absorbed_effects(Fits(), coarse, fitted, effects, effort, DEFAULT.candidates)
     assert [effect.name for effect in rough] == ["measurement_delay", "com_offset"]
 
 

@@ -12,20 +12,20 @@ from problems import BENCH, CALM
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
-from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import summary_of
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.validation import BlockErrors
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.model import BASE, JointModel
 
 CURVES = [name for name in available_effects() if get_effect(name).free_form]
 YES = torch.tensor([True])

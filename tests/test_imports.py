@@ -25,7 +25,7 @@ FLOORS = {
         ["problem"],
         ["optimizers", "single_joint_model"],
         ["uncertainty"],
-        ["run", "experiment_design"],
+        ["run", "experiment_design", "single_joint_fits"],
         ["report", "data_collection"],
         ["comparison"],
         ["identification"],
@@ -35,8 +35,7 @@ FLOORS = {
     ),
     "pace_optim/diagnosis": (
         ["diagnosis_cfg"],
-        ["model", "settings"],
-        ["fitting"],
+        ["settings"],
         ["candidates"],
         ["judging"],
         ["beginning", "search"],

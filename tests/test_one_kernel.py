@@ -12,10 +12,10 @@ from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_p
 from pace_actuators.effects import get_effect, registry
 from pace_envs.kernels import CannotCompileError, HostKernels, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.fits import fits_on
-from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
-from pace_optim.diagnosis.model.model import BASE, JointModel
+from pace_optim.single_joint_fits.fits import fits_on
+from pace_optim.single_joint_fits.fitting_cfg import DEFAULT
+from pace_optim.single_joint_fits.model import BASE, JointModel
+from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STEPS = 80

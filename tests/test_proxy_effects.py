@@ -14,14 +14,14 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnose import Findings, summary_of
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.size_consistency import unevenness
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel
 
 SPRING, QUADRATIC = get_effect("parallel_spring"), get_effect("quadratic_friction")
 FLOOR, YES = torch.tensor([1e-4]), torch.tensor([True])

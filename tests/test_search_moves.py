@@ -8,14 +8,15 @@ import torch
 from diagnoses import FakeFits, errors_of, make_search, make_trial
 
 from pace_actuators.effects import get_effect
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.decisions import unlogged
 from pace_optim.diagnosis.judging.rules import beats
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.diagnosis.search.look_ahead import ends
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel
 
 ELASTICITY, MOUNT, GAIN, SPRING = (
     get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring")
@@ -105,7 +106,8 @@ def some(joints):
 def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
-    fits = InWorld(world.errors, off=("replace", "merge", "drop_last", "trim", "wide_steps"))
+    fits = InWorld(world.errors)
+    cfg = DiagnosisCfg(off=("replace", "merge", "drop_last", "trim", "wide_steps"))
     model = base_model(n)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
     base, candidates = Fitted.start(model, 0 * model.upper), [ELASTICITY, MOUNT, GAIN, SPRING]
@@ -116,6 +118,7 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
         floor=floor,
         max_effects=3,
         fits=fits,
+        cfg=cfg,
         follow=follow,
         say=say,
         log=log,

@@ -10,11 +10,12 @@ from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, re
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints, later_than_most
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.model import BASE
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.model import BASE
 
 LATE_LOG = get_effect("measurement_delay")
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.02, "delay": 2.0}
@@ -81,7 +82,7 @@ def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     assert [float(ms) for ms in said.groups()] == pytest.approx([5.0, 5.0, 5.0], abs=0.5)
     assert bool((held.score[late] > 20 * base.score[late]).all())
     assert torch.allclose(held.score[~late], base.score[~late], rtol=1e-3)
-    absorbed = absorbed_effects(Fits(), twins, held, [LATE_LOG], effort)
+    absorbed = absorbed_effects(Fits(), twins, held, [LATE_LOG], effort, DEFAULT.candidates)
     assert torch.equal(absorbed[LATE_LOG], ~late)
 
 

@@ -8,10 +8,10 @@ import torch
 from diagnoses import joint_alone
 from problems import DT
 
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.recording import windows
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel
 
 ALL = torch.tensor([True])
 

@@ -13,13 +13,13 @@ from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.report.sizes import size_text
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import JointModel
 from pace_optim.uncertainty.uncertainty import sandwich
 
 GAIN = get_effect("torque_gain")
@@ -106,7 +106,7 @@ def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():
 
 def test_likes_are_the_rivals_of_what_the_model_has_in_the_end():
     other = get_effect("payload")
-    round_ = SimpleNamespace(chosen=[GAIN, None], rivals=[[other], []])
+    round_ = SimpleNamespace(chosen=[GAIN, None], rivals=[[other], []], models={GAIN: None, other: None})
     outcome = outcome_of([1e-3, 1e-3], [1e-4, 1e-3], [GAIN], [[True, False]], [round_])
     assert likes(outcome) == {"torque_gain": ["payload"]}
     assert likes(outcome_of([1e-3] * 2, [1e-4] * 2, [GAIN], [[False, True]], [round_])) == {}

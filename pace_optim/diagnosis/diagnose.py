@@ -13,19 +13,12 @@ import torch
 
 from pace_actuators.effects import Effect, available_effects, get_effect
 from pace_actuators.files import json_text, write_together
-from pace_optim.diagnosis.beginning.base_fit import fit_base
 from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
-from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.denormals import flushed_denormals
-from pace_optim.diagnosis.fitting.fits import Fits, fits_on
-from pace_optim.diagnosis.fitting.reference_update import ReferenceUpdate
-from pace_optim.diagnosis.fitting.validation import check_long_enough
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
 from pace_optim.diagnosis.judging.decisions import Decision, Log, as_lines, unlogged
-from pace_optim.diagnosis.model.labels import labels
-from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Search
@@ -44,6 +37,13 @@ from pace_optim.problem.unknown_facts import started_from
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.block_errors import check_long_enough
+from pace_optim.single_joint_fits.denormals import flushed_denormals
+from pace_optim.single_joint_fits.fits import Fits, fits_on
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.model import whole_values
+from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
 
@@ -71,7 +71,7 @@ def diagnose(
     check_folder(folder, anew=FILE)
     result = FitResult.load(folder)
     candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
-    fits = fits_on(settings.device, settings.cfg)
+    fits = fits_on(settings.device, settings.cfg.fitting)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
     problem = run.problem(physics_dt=physics_dt, effects=())
     base = {name: result.parameters[name] for name in problem.space.slices}
@@ -86,9 +86,10 @@ def diagnose(
         progress.say,
         result,
         log=decisions.append,
+        cfg=settings.cfg,
         fits=fits,
     )
-    diagnosis = _told(found, fits, problem, result, folder, candidates)
+    diagnosis = _told(found, fits, settings.cfg, problem, result, folder, candidates)
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()
@@ -102,7 +103,13 @@ def diagnose(
 
 
 def _told(
-    found: Findings, fits: Fits, problem: Problem, run: FitResult, folder: Path, candidates: Sequence[type[Effect]]
+    found: Findings,
+    fits: Fits,
+    cfg: DiagnosisCfg,
+    problem: Problem,
+    run: FitResult,
+    folder: Path,
+    candidates: Sequence[type[Effect]],
 ) -> Diagnosis:
     """What was found, in the words and tables of ``diagnosis.json``."""
     return Diagnosis(
@@ -125,8 +132,8 @@ def _told(
         tried=[effect.name for effect in candidates],
         physics_dt=problem.physics_dt,
         ladder=ladder(found),
-        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=fits.cfg.verdict),
-        cfg=json.loads(json_text(asdict(fits.cfg))),
+        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=cfg.verdict),
+        cfg=json.loads(json_text(asdict(cfg))),
     )
 
 
@@ -231,6 +238,7 @@ def search_effects(
     run: FitResult | None = None,
     *,
     log: Log = unlogged,
+    cfg: DiagnosisCfg = DEFAULT,
     fits: Fits | None = None,
 ) -> Findings:
     """Look for missing effects, each joint simulated alone.
@@ -243,24 +251,33 @@ def search_effects(
         say: Shows how far it is.
         run: The whole robot's own fit, if there is one.
         log: Gets every decision.
-        fits: Fits models, by its numbers; ``None``: on the processor, as shipped.
+        cfg: By what numbers it is decided.
+        fits: Fits models; ``None``: on the processor.
 
     Raises:
         ValueError: If the validation recordings are too short to judge by.
     """
-    fits = fits or fits_on("cpu", DiagnosisCfg())
-    cfg = fits.cfg
-    check_long_enough(problem.dataset.validation, problem.control_dt, cfg=cfg.judging)
+    fits = fits or fits_on("cpu", cfg.fitting)
+    check_long_enough(problem.dataset.validation, problem.control_dt, cfg.judging.fewest, cfg=cfg.fitting)
     twins, base, effort = fit_base(fits, problem, physical, candidates, say)
-    data = check_data(fits, problem, twins, base, run)
+    data = check_data(fits, problem, twins, base, run, cfg=cfg.judging)
     if cfg.has("late_joints"):
-        base, sentences = hold_late_joints(fits, twins, base)
+        base, sentences = hold_late_joints(fits, twins, base, cfg=cfg)
         data = replace(data, sentences=[*data.sentences, *sentences])
-    absorbed = absorbed_effects(fits, twins.with_physics_dt(twins.coarsest_dt), base, candidates, effort)
+    absorbed = absorbed_effects(
+        fits, twins.with_physics_dt(twins.coarsest_dt), base, candidates, effort, cfg.candidates
+    )
     base = replace(base, model=replace(base.model, barred=absorbed))
 
     search = Search(
-        effects=candidates, effort=effort, floor=data.floor, max_effects=max_effects, fits=fits, say=say, log=log
+        effects=candidates,
+        effort=effort,
+        floor=data.floor,
+        max_effects=max_effects,
+        fits=fits,
+        cfg=cfg,
+        say=say,
+        log=log,
     )
     reference = ReferenceUpdate(fits=fits, problem=problem, candidates=candidates, enough=search.at_floor, say=say)
     outcome = add_effects(replace(search, follow=reference.follow), twins, base)

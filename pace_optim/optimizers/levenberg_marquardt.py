@@ -1,6 +1,6 @@
 """Box-constrained Levenberg–Marquardt: where dampings lead, which row is taken, and what the damping is next.
 
-A whole robot's fit (``least_squares``) is one problem, that of single joints (``pace_optim/diagnosis/fitting``) one for
+A whole robot's fit (``least_squares``) is one problem, that of single joints (``pace_optim/single_joint_fits``) one for
 each. Both simulate the same rows: the favoured step, its neighbours for the derivatives there, then steps at larger
 dampings. Where the favoured step wins, the next derivatives are already known.
 """

@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from pace_optim.diagnosis.beginning.base_fit import whole_vector
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.recording.noise import lattice_step, noise_floor
 from pace_optim.run.result import FitResult
+from pace_optim.single_joint_fits.base_fit import whole_vector
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
@@ -38,7 +39,13 @@ class DataCheck:
 
 
 def check_data(
-    fits: Fits, problem: Problem, twins: TwinProblem, base: Fitted, run: FitResult | None = None
+    fits: Fits,
+    problem: Problem,
+    twins: TwinProblem,
+    base: Fitted,
+    run: FitResult | None = None,
+    *,
+    cfg: JudgingCfg = DEFAULT.judging,
 ) -> DataCheck:
     """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are.
 
@@ -49,6 +56,7 @@ def check_data(
         base: The base model, fitted to them.
         run: The whole robot's own fit. Where its base model is at the floor with its own physics step, what another
             step leaves comes from the step: recordings of a simulation are such.
+        cfg: What is at the floor.
     """
     data, names = problem.dataset, problem.joint_names
     squares, steps = [], {}
@@ -79,7 +87,7 @@ def check_data(
     if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
         by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
         left = fits.validation_errors(twins, [base])[0].mse.sqrt()
-        at_floor = fits.cfg.judging.alike * floor
+        at_floor = cfg.alike * floor
         by_step = (by_run <= at_floor) & (left > at_floor)
         if bool(by_step.any()):
             floor = torch.where(by_step, left, floor)

@@ -9,32 +9,35 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, BeginningCfg
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, BeginningCfg, DiagnosisCfg
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE
 from pace_optim.single_joint_model.problem import TwinProblem
 
 _DELAY = BASE.index("delay")
 
 
-def hold_late_joints(fits: Fits, twins: TwinProblem, base: Fitted) -> tuple[Fitted, list[str]]:
+def hold_late_joints(
+    fits: Fits, twins: TwinProblem, base: Fitted, *, cfg: DiagnosisCfg = DEFAULT
+) -> tuple[Fitted, list[str]]:
     """The base model with the robot's delay on joints that are later and have nothing else to explain.
 
     Args:
         fits: Fits models.
         twins: The joints simulated alone.
         base: The base model, fitted, with a delay of each joint's own.
+        cfg: When a joint is late.
 
     Returns:
         The model, fitted with its Jacobian (``base`` itself where no joint is late), and what was held, in a sentence.
     """
     delay = base.physical[:, _DELAY]
-    late = later_than_most(delay, cfg=fits.cfg.beginning)
+    late = later_than_most(delay, cfg=cfg.beginning)
     while bool(late.any()):
         held = _held(fits, twins, base, late, delay.median())
         with_one, with_own = (errors.mse for errors in fits.validation_errors(twins, [held, base]))
-        if (only_late := late & (with_own < (1 - fits.cfg.verdict.nearly_all) * with_one)).equal(late):
+        if (only_late := late & (with_own < (1 - cfg.verdict.nearly_all) * with_one)).equal(late):
             return held, [_sentence(twins, delay, late)]
         late = only_late
     return base, []
@@ -57,7 +60,7 @@ def _held(fits: Fits, twins: TwinProblem, base: Fitted, joints: torch.Tensor, de
     lower, upper = base.model.lower.clone(), base.model.upper.clone()
     lower[joints, _DELAY] = upper[joints, _DELAY] = delay
     start = Fitted.start(replace(base.model, lower=lower, upper=upper), base.physical)
-    return fits.side_by_side(twins, [start], fits.cfg.fitting.again, keep_jacobian=True)[0]
+    return fits.side_by_side(twins, [start], fits.cfg.again, keep_jacobian=True)[0]
 
 
 def _sentence(twins: TwinProblem, delay: torch.Tensor, late: torch.Tensor) -> str:

@@ -11,8 +11,9 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.screening import simulated_probes
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 _LEAST, _MOST, _POINTS = 1e-6, 1e4, 81
@@ -26,6 +27,7 @@ def log_evidence(
     models: Mapping[type[Effect], Fitted],
     effects: Sequence[type[Effect]],
     effort: torch.Tensor,
+    cfg: CandidatesCfg,
 ) -> dict[type[Effect], torch.Tensor]:
     """Log evidence of models that differ in one effect, where all other effects may be there in small amounts.
 
@@ -48,6 +50,7 @@ def log_evidence(
         models: The models, fitted, by the effect in which they differ.
         effects: Everything that may be there.
         effort: Typical torque of each joint, (n,) [N m].
+        cfg: When errors are independent.
 
     Returns:
         Of each joint, (n,).
@@ -55,7 +58,7 @@ def log_evidence(
     coarse = problem.coarse()
     seen = fits.looked_at(coarse, [replace(fitted, tried=effect) for effect, fitted in models.items()])
     found = fits.shared_out(
-        lambda own: [_of_model(fits, coarse, each, effects, effort) for each in own],
+        lambda own: [_of_model(fits, coarse, each, effects, effort, cfg) for each in own],
         seen,
         [each.tried for each in seen],
     )
@@ -63,7 +66,12 @@ def log_evidence(
 
 
 def _of_model(
-    fits: Fits, problem: TwinProblem, seen: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits,
+    problem: TwinProblem,
+    seen: Fitted,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    cfg: CandidatesCfg,
 ) -> torch.Tensor:
     """:func:`log_evidence` of one model."""
     if seen.error is None or seen.tried is None:
@@ -72,7 +80,7 @@ def _of_model(
     probes, changes, where = simulated_probes(fits, problem, seen, others, effort)
     count = Counter(effect for effect, _ in probes)
     parts = torch.tensor([1 / math.sqrt(count[effect]) for effect, _ in probes], dtype=torch.float64)
-    independent = max(2.0, float(where.sum()) * problem.control_dt / fits.cfg.candidates.independent_s)
+    independent = max(2.0, float(where.sum()) * problem.control_dt / cfg.independent_s)
     jacobian, numbers = seen.free_jacobian, len(seen.tried.parameters)
     result = torch.full((seen.model.num_joints,), -torch.inf, dtype=torch.float64)
     for j in range(seen.model.num_joints):

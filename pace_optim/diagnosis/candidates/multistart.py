@@ -7,14 +7,17 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators.effects import Effect, probe_points
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.side_by_side import Slot
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel, start_values
+from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
+from pace_optim.single_joint_fits.side_by_side import Slot
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
-def multistart(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[Fitted]:
+def multistart(
+    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], cfg: CandidatesCfg
+) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
     Of a stiff one, the best point of each probe: the error at a point says little of where it leads, as another
@@ -26,15 +29,17 @@ def multistart(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[
         problem: The joints simulated alone, coarsely.
         now: The present model.
         effects: What is tried.
+        cfg: From which base parameters.
     """
-    starts = fits.shared_out(lambda own: _best_points(fits, problem, now, own), effects, effects)
+    starts = fits.shared_out(lambda own: _best_points(fits, problem, now, own, cfg), effects, effects)
     return [start for of_effect in starts for start in of_effect]
 
 
-def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]]) -> list[list[Fitted]]:
+def _best_points(
+    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], cfg: CandidatesCfg
+) -> list[list[Fitted]]:
     """:func:`multistart` in one process."""
-    cfg = fits.cfg
-    bases = _bases(now, cfg.candidates.frictions)
+    bases = _bases(now, cfg.frictions)
     slots, values = [], []
     for effect in effects:
         own = [start_values(effect, point).repeat(now.model.num_joints, 1) for point in probe_points(effect)]
@@ -44,8 +49,8 @@ def _best_points(fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequenc
         values.append(torch.stack([physical for _, physical in tried]))
     batch = fits.batch(problem, slots, training=True)
     where = batch.dataset.train.clone()
-    where[int(cfg.fitting.part * len(where)) :] = False
-    scores = batch.simulate(values, where, cfg.fitting.stride).square().sum(dim=(1, 2)).cpu()
+    where[int(fits.cfg.part * len(where)) :] = False
+    scores = batch.simulate(values, where, fits.cfg.stride).square().sum(dim=(1, 2)).cpu()
     result = []
     for effect, slot, points_of, score in zip(effects, slots, values, batch.split(scores), strict=True):
         every = torch.arange(len(score))

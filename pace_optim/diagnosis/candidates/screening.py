@@ -10,10 +10,10 @@ import torch
 
 from pace_actuators.effects import PROBED_EFFORT, Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.side_by_side import Slot
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, start_values
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, start_values
+from pace_optim.single_joint_fits.side_by_side import Slot
 from pace_optim.single_joint_model.problem import TwinProblem
 
 _RIDGE = 1e-9
@@ -33,7 +33,12 @@ class Probe:
 
 
 def screen(
-    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits,
+    problem: TwinProblem,
+    now: Fitted,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    cfg: CandidatesCfg,
 ) -> list[Probe]:
     """Look at each effect at its probes.
 
@@ -48,22 +53,27 @@ def screen(
         now: The present model, fitted, with its Jacobian.
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
+        cfg: How it is cross-validated.
     """
-    each = fits.shared_out(lambda own: _screened(fits, problem, now, own, effort), effects, effects)
+    each = fits.shared_out(lambda own: _screened(fits, problem, now, own, effort, cfg), effects, effects)
     return [probe for probes in each for probe in probes]
 
 
 def _screened(
-    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits,
+    problem: TwinProblem,
+    now: Fitted,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    cfg: CandidatesCfg,
 ) -> list[list[Probe]]:
     """:func:`screen` in one process; the probes of each effect."""
     if now.error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
     probes, changes, where = simulated_probes(fits, problem, now, effects, effort)
-    cfg = fits.cfg
-    steps = where.any(dim=1).nonzero()[:, 0][:: cfg.fitting.stride]
-    fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg.candidates), -1)
-    scores, sizes = _explained(now.error, now.free_jacobian, changes, fold, cfg.candidates.folds)
+    steps = where.any(dim=1).nonzero()[:, 0][:: fits.cfg.stride]
+    fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg), -1)
+    scores, sizes = _explained(now.error, now.free_jacobian, changes, fold, cfg.folds)
     result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
     for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
         allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
@@ -73,7 +83,12 @@ def _screened(
 
 
 def absorbed_effects(
-    fits: Fits, problem: TwinProblem, now: Fitted, effects: Sequence[type[Effect]], effort: torch.Tensor
+    fits: Fits,
+    problem: TwinProblem,
+    now: Fitted,
+    effects: Sequence[type[Effect]],
+    effort: torch.Tensor,
+    cfg: CandidatesCfg,
 ) -> dict[type[Effect], torch.Tensor]:
     """Effects that a base parameter absorbs, and on which joints (n,): these recordings would not show them there.
 
@@ -83,12 +98,12 @@ def absorbed_effects(
         now: The base model, fitted, with its Jacobian.
         effects: What is tried; only those count that name such a parameter.
         effort: Typical torque of each joint, (n,) [N m].
+        cfg: How much of it must be left.
     """
     suspects = [effect for effect in effects if effect.absorbed_by]
     if not suspects:
         return {}
     takers = sorted({BASE.index(effect.absorbed_by) for effect in suspects})
-    cfg = fits.cfg.candidates
     steps = torch.where(now.x > 0, -cfg.seen_step, cfg.seen_step)
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
@@ -132,7 +147,7 @@ def simulated_probes(
         values.append(torch.stack([each for _, each in extended]))
         probes += [(effect, each) for each in points]
     batch = fits.batch(problem, slots, training=True)
-    errors = batch.simulate(values, batch.dataset.train, fits.cfg.fitting.stride).cpu()
+    errors = batch.simulate(values, batch.dataset.train, fits.cfg.stride).cpu()
     return probes, errors[1:] - errors[:1], batch.dataset.train
 
 

@@ -9,9 +9,9 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.comparison import judge, within
-from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fitted import Fitted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
-from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.single_joint_fits.block_errors import BlockErrors
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pace_optim.diagnosis.fitting.validation import BlockErrors
+from pace_optim.single_joint_fits.block_errors import BlockErrors
 
 FILE = "decisions.jsonl"
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, JudgingCfg
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Trial
 from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.comparison import judge, within
 from pace_optim.diagnosis.judging.decisions import Decision, Log, Taken
+from pace_optim.single_joint_fits.block_errors import BlockErrors
 
 
 def decide(

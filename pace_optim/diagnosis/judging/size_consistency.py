@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.single_joint_fits.fitted import Fitted
 
 _RIDGE = 1e-9
 

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.fitted import Fitted
 
 
 def grown(search: Search, branch: Branch, found: Round) -> Branch:

@@ -10,10 +10,10 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.alternatives import Alternatives, exchanged
 from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.fitted import Fitted
 
 
 def merge_effects(search: Search, branch: Branch) -> Branch:
@@ -35,7 +35,7 @@ def merge_effects(search: Search, branch: Branch) -> Branch:
         return branch
     for j, effect in taken.items():
         rounds = [this.settled(j, effect if at == 0 else None) for at, this in enumerate(rounds)]
-    start, iterations = tried.with_taken(taken), search.cfg.fitting.again
+    start, iterations = tried.with_taken(taken), search.fits.cfg.again
     one = search.fits.side_by_side(branch.problem.in_windows(), [start], iterations)[0]
     branch = search.along_own_motion(replace(branch, rounds=tuple(rounds)), one)
     return replace_effects(search, branch) if search.cfg.has("replace") else branch

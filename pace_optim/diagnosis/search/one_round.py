@@ -13,11 +13,10 @@ from pace_optim.diagnosis.candidates.evidence import log_evidence
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
-from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.choice import choose, contenders
 from pace_optim.diagnosis.judging.decisions import Decision
-from pace_optim.diagnosis.model.fitted import Fitted
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
     if not begun:
         return None
     fits, problem, now, errors = search.fits, branch.problem, branch.now, branch.errors
-    cfg, first = fits.cfg, not now.model.effects
+    cfg, first = search.cfg, not now.model.effects
     search.say(f"refitting with {_names(list(begun))}")
     fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
     if cfg.has("widen_bounds"):
@@ -73,9 +72,9 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
 def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], list[Probe]]:
     """Where refits with the promising effects start, and how all were screened."""
     fits, problem, now, errors, effects = search.fits, branch.problem, branch.now, branch.errors, search.effects
-    cfg = fits.cfg.candidates
+    cfg = search.cfg.candidates
     seen = fits.looked_at(problem.in_windows(), [replace(now, tried=None)])[0]
-    probes = screen(fits, problem.coarse(), seen, effects, search.effort)
+    probes = screen(fits, problem.coarse(), seen, effects, search.effort, cfg)
     excess = (errors.mse - search.at_floor**2).clamp(min=0.0)
     listed = with_likes(_short_list(_promising(probes, excess, cfg.explains), excess, cfg), effects)
     far = bool((errors.mse.sqrt() > cfg.beyond_screening * search.floor).any())
@@ -84,7 +83,7 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
     if not begin:
         return {}, probes
     search.say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
-    begun = _begun(fits, problem, now, probes, begin, far and fits.cfg.has("multistart"))
+    begun = _begun(search, branch, probes, begin, far and search.cfg.has("multistart"))
     if wide:
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
     # where nothing is listed no effect does better than the base parameters alone
@@ -102,7 +101,9 @@ def _evidence(
     if not every:
         return [{} for _ in weighed]
     search.say(f"weighing {_names(every)}")
-    known = log_evidence(search.fits, problem, {e: models[e] for e in every}, search.effects, search.effort)
+    known = log_evidence(
+        search.fits, problem, {e: models[e] for e in every}, search.effects, search.effort, search.cfg.candidates
+    )
     return [{effect: float(known[effect][j]) for effect in own} for j, own in enumerate(weighed)]
 
 
@@ -169,23 +170,23 @@ def _short_list(
 
 
 def _begun(
-    fits: Fits, problem: TwinProblem, now: Fitted, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
+    search: Search, branch: Branch, probes: Sequence[Probe], effects: Sequence[type[Effect]], far: bool
 ) -> dict[type[Effect] | None, Fitted]:
     """The present model with each effect after a few coarse steps, and without any (None).
 
     Each effect starts at every joint's best two probes, or the best of each structure that it can have; the better one
     goes on, joint by joint. Far from the floor the best of many points is another start.
     """
-    coarse, cfg = problem.coarse(), fits.cfg
+    fits, now, coarse, cfg = search.fits, branch.now, branch.problem.coarse(), search.cfg.candidates
     starts = [Fitted.start(now.model, now.physical)]
     for effect in effects:
         own = [probe for probe in probes if probe.effect is effect]
         ranked = [_ranked(own, j) for j in range(now.model.num_joints)]
-        starts += [_start(now, effect, [best[k] for best in ranked], cfg.candidates) for k in range(len(ranked[0]))]
+        starts += [_start(now, effect, [best[k] for best in ranked], cfg) for k in range(len(ranked[0]))]
     if far:
-        starts = _neighbours_together([*starts, *multistart(fits, coarse, now, effects)])
+        starts = _neighbours_together([*starts, *multistart(fits, coarse, now, effects, cfg)])
     result: dict[type[Effect] | None, Fitted] = {}
-    for each in fits.side_by_side(coarse, starts, cfg.fitting.again, part=cfg.fitting.part):
+    for each in fits.side_by_side(coarse, starts, fits.cfg.again, part=fits.cfg.part):
         best = result.setdefault(each.tried, each)
         result[each.tried] = best.with_joints(each.score < best.score, each)
     return result

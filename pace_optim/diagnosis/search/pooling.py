@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.fits import Fits
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 
 _RIDGE = 1e-12
 
@@ -26,10 +26,10 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
         if effect.shared or int(has.sum()) < 2:
             continue
         held = _held(outcome.final, effect, has)
-        fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.fitting.again, keep_jacobian=True)[0]
+        fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]
         errors = fits.validation_errors(outcome.problem, [fitted])[0]
         joints = has.nonzero()[:, 0].tolist()
-        if decide("pool", joints, outcome.final_errors, {effect.name: errors}, cfg=fits.cfg, log=log):
+        if decide("pool", joints, outcome.final_errors, {effect.name: errors}, cfg=outcome.cfg, log=log):
             outcome = replace(_pooled(outcome, fitted, effect), final_errors=errors)
     return outcome
 

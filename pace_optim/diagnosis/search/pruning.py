@@ -25,7 +25,7 @@ def drop_last(search: Search, branch: Branch) -> Branch:
         dropped = left.taken(search, "drop_last")
         if not dropped:
             return branch if branch is begun else search.along_own_motion(branch, branch.now)
-        start, iterations = left.with_taken(dropped), search.cfg.fitting.again
+        start, iterations = left.with_taken(dropped), search.fits.cfg.again
         now = search.fits.side_by_side(branch.problem, [start], iterations, keep_jacobian=True)[0]
         branch = replace(branch, now=now, errors=search.fits.validation_errors(branch.problem, [now])[0])
         open_joints = torch.tensor([j in dropped for j in range(model.num_joints)])

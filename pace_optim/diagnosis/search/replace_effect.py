@@ -11,9 +11,9 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
 from pace_optim.diagnosis.judging.comparison import within
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.alternatives import Alternatives, exchanged
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.fitted import Fitted
 
 _Exchange = dict[int, tuple[type[Effect], int]]
 """Joint -> the effect that another one takes the place of, and the round that it was chosen in, by index."""
@@ -44,7 +44,7 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
     for j, effect in chosen.items():
         at, mse = exchanges[effect][j][1], float(tried.errors[effect].mse[j])
         rounds[at] = rounds[at].exchanged(j, effect, tie=within(float(errors.mse[j]), mse, cfg.alike))
-    start, iterations = tried.with_taken(chosen), search.cfg.fitting.again
+    start, iterations = tried.with_taken(chosen), search.fits.cfg.again
     other = search.fits.side_by_side(branch.problem.in_windows(), [start], iterations)[0]
     return search.along_own_motion(replace(branch, rounds=tuple(rounds)), other)
 

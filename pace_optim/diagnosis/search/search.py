@@ -8,9 +8,9 @@ import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.size_consistency import unevenness
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.moves import LAST, MOVES, Step
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 

@@ -9,13 +9,13 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.decisions import Decision, Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.one_round import try_effects
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
@@ -54,6 +54,8 @@ class Search:
     """Most effects of a joint."""
     fits: Fits
     """Fits models."""
+    cfg: DiagnosisCfg = DEFAULT
+    """By what numbers it is decided."""
     say: Callable[[str], None] = lambda _: None
     """Shows how far it is."""
     log: Log = unlogged
@@ -62,11 +64,6 @@ class Search:
     """Gives the joints along the motion of the robot with a model, and the model fitted there."""
     try_effects: Callable[..., Round | None] = try_effects
     """Tries what could be missing beside a model."""
-
-    @property
-    def cfg(self) -> DiagnosisCfg:
-        """The diagnosis' numbers."""
-        return self.fits.cfg
 
     @property
     def at_floor(self) -> torch.Tensor:

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import found_effects
-from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.diagnosis.verdict.verdict import confounded
 from pace_optim.experiment_design.telling_apart import Rivals, RobotModel, next_experiments
 from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.labels import found_effects
+from pace_optim.single_joint_fits.model import whole_values
 
 
 def advise(

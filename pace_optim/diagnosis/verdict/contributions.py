@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 
 
 def contributions(fits: Fits, outcome: Outcome) -> dict[type[Effect], float]:

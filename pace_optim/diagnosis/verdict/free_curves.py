@@ -11,14 +11,14 @@ import torch
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.fitting.validation import BlockErrors
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import above_floor, near_floor
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE
 from pace_optim.single_joint_model.problem import TwinProblem
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import torch
 
-from pace_optim.diagnosis.model.model import JointModel
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.single_joint_fits.model import JointModel
 
 
 def above_floor(outcome: Outcome, floor: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectParameter
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.uncertainty.uncertainty import sandwich
 
 _RIDGE = 1e-12

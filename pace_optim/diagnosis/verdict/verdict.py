@@ -12,7 +12,6 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.comparison import least_ratio
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import (
     above_floor,
@@ -21,6 +20,7 @@ from pace_optim.diagnosis.verdict.proxy_effects import (
     near_floor,
     real_effects,
 )
+from pace_optim.single_joint_fits.fitted import Fitted
 
 
 def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:

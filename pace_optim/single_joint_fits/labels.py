@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pace_actuators.effects import Effect, EffectCfg
-from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.single_joint_fits.model import JointModel
 
 
 def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[EffectCfg]:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import BASE, JointModel
 from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -39,7 +39,7 @@ def fit_base(
     names = [effect.name for effect in effects if effect.overrides("write_model")]
     along = measured_path if problem.joints_stand_alone else reference_path
     twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
-    if along is measured_path and float(fitted.score.max()) > fits.cfg.beginning.away**2:
+    if along is measured_path and float(fitted.score.max()) > fits.cfg.away**2:
         twins, fitted = _fit_along(fits, problem, fitted, reference_path, names, say)
     armature = fitted.physical[:, BASE.index("armature")]
     return twins, fitted, twins.path.typical_effort(armature)
@@ -58,13 +58,13 @@ def _fit_along(
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
         return along(of, whole_vector(of, fitted.physical), model_effects)
 
-    cfg = fits.cfg.fitting
+    cfg = fits.cfg
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
     for i in range(cfg.rounds):
         say(f"base model, round {i + 1}")
         coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()
         before, fitted = fitted, fits.side_by_side(coarse, [fitted], cfg.again)[0]
-        if float((fitted.x - before.x).abs().max()) < fits.cfg.beginning.moved:
+        if float((fitted.x - before.x).abs().max()) < fits.cfg.moved:
             break
     twins = twin_problem(problem, path(problem, model_effects))
     return twins, fits.to_whole(twins, fits.side_by_side(twins.in_windows(), [fitted], cfg.again))[0]

@@ -1,4 +1,4 @@
-"""How the models of a diagnosis are simulated and fitted: several side by side, in windows and on whole recordings."""
+"""How models of single joints are simulated and fitted: several side by side, in windows and on whole recordings."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import torch
 from pace_actuators.effects import Effect
 from pace_envs.devices import find_device
 from pace_envs.kernels import host_kernels, kernels_of
-from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.fitting.levenberg_marquardt import TRIALS, LevenbergMarquardt
-from pace_optim.diagnosis.fitting.side_by_side import SideBySide, Slot
-from pace_optim.diagnosis.fitting.validation import BlockErrors, block_errors
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.problem.forked import parallel_map
+from pace_optim.single_joint_fits.block_errors import BlockErrors, block_errors
+from pace_optim.single_joint_fits.descent import TRIALS, JointDescent
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.fitting_cfg import FittingCfg
+from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
@@ -25,7 +25,7 @@ from pace_optim.single_joint_model.problem import TwinProblem
 class Fits:
     """Fits models of single joints and tells their errors; whoever searches is given one, and tests give others."""
 
-    cfg: DiagnosisCfg = field(default_factory=DiagnosisCfg)
+    cfg: FittingCfg = field(default_factory=FittingCfg)
     batch: Callable[..., SideBySide] = SideBySide
     """Makes what simulates: of a problem, slots, and whether only what is trained on is wanted."""
     on_gpu: bool = False
@@ -41,7 +41,7 @@ class Fits:
             starts: Models and where they start.
             rough: Whether to go on over wide steps where narrow ones have led.
         """
-        cfg, coarse = self.cfg.fitting, problem.coarse()
+        cfg, coarse = self.cfg, problem.coarse()
         result = self.side_by_side(coarse, starts, cfg.coarse)
         for _ in range(cfg.rounds - 1):
             falling = [near and each.falls for near, each in zip(self._near(result), result, strict=True)]
@@ -61,11 +61,11 @@ class Fits:
             now: The model.
             kept: Which windows that are trained on count for which joints, (R, n) bool; all if not given.
         """
-        return self.side_by_side(problem.in_windows(), [now], self.cfg.fitting.coarse, rough=True, kept=kept)[0]
+        return self.side_by_side(problem.in_windows(), [now], self.cfg.coarse, rough=True, kept=kept)[0]
 
     def to_whole(self, problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
         """The last iterations of models that windows have led, on whole recordings."""
-        return self.side_by_side(problem, starts, self.cfg.fitting.whole, keep_jacobian=True)
+        return self.side_by_side(problem, starts, self.cfg.whole, keep_jacobian=True)
 
     def looked_at(self, problem: TwinProblem, models: Sequence[Fitted]) -> list[Fitted]:
         """Models where they are, with their errors and derivatives."""
@@ -115,8 +115,7 @@ class Fits:
         every = torch.zeros_like(where)
         every[: batch.dataset.last_step(where)] = True
         errors = batch.simulate([m.physical[None] for m in models], every).cpu()
-        cfg = self.cfg.judging
-        return [block_errors(error, where[: errors.shape[1]], problem.control_dt, cfg=cfg) for error in errors]
+        return [block_errors(error, where[: errors.shape[1]], problem.control_dt, cfg=self.cfg) for error in errors]
 
     def on_joints(
         self, problem: TwinProblem, starts: Sequence[Fitted], joints: torch.Tensor, errors: BlockErrors
@@ -147,12 +146,12 @@ class Fits:
             now: The model.
             joints: Which of them are fitted so, (n,) bool; for the others all windows count.
         """
-        cfg = self.cfg.fitting
+        cfg = self.cfg
         result, best = None, torch.full_like(now.score, torch.inf)
         for _ in range(cfg.rounds):
             rmse = self.window_rmse(problem.in_windows(), now)
             median = rmse.median(dim=0).values
-            kept = (rmse <= self.cfg.judging.far * median) | ~joints
+            kept = (rmse <= self.cfg.behind * median) | ~joints
             if bool(kept.all()) or not bool(((median < cfg.gain * best) & joints).any()):
                 break
             best = median
@@ -177,14 +176,14 @@ class Fits:
         kept: torch.Tensor | None,
     ) -> list[Fitted]:
         """:meth:`side_by_side` in one process."""
-        cfg = self.cfg.fitting
+        cfg = self.cfg
         batch = self._batch_of(problem, starts)
         where = batch.dataset.train.clone()
         where[math.ceil(part * len(where)) :] = False
         counts = where[where.any(dim=1)][:: cfg.stride].sum(dim=0).double()
         weight = torch.ones(len(counts), starts[0].model.num_joints) if kept is None else kept.float()
         samples = counts @ weight.double()
-        ways = running = [LevenbergMarquardt(start, samples, keep_jacobian, rough, cfg) for start in starts]
+        ways = running = [JointDescent(start, samples, keep_jacobian, rough, cfg) for start in starts]
         for _ in range(max_iteration):
             rows = [way.ask() for way in running]
             physical = [way.model.to_physical(x) for way, x in zip(running, rows, strict=True)]
@@ -199,7 +198,7 @@ class Fits:
                 running, batch = going, self._batch_of(problem, going)
         return [way.result() for way in ways]
 
-    def _batch_of(self, problem: TwinProblem, fits: Sequence[Fitted] | Sequence[LevenbergMarquardt]) -> SideBySide:
+    def _batch_of(self, problem: TwinProblem, fits: Sequence[Fitted] | Sequence[JointDescent]) -> SideBySide:
         """What simulates one iteration of each."""
         slots = [Slot(model=each.model, rows=each.model.size + len(TRIALS)) for each in fits]
         return self.batch(problem, slots, training=True)
@@ -207,7 +206,7 @@ class Fits:
     def _near(self, models: Sequence[Fitted]) -> list[bool]:
         """Which models are near the best one on some joint."""
         scores = torch.stack([each.score for each in models])
-        return (scores <= self.cfg.judging.far**2 * scores.amin(dim=0)).any(dim=1).tolist()
+        return (scores <= self.cfg.behind**2 * scores.amin(dim=0)).any(dim=1).tolist()
 
 
 def _again(
@@ -220,7 +219,7 @@ def _again(
     return [next(fitted) if yes else each for each, yes in zip(models, which, strict=True)]
 
 
-def fits_on(device: str, cfg: DiagnosisCfg) -> Fits:
+def fits_on(device: str, cfg: FittingCfg) -> Fits:
     """What fits models on a device: ``"cpu"``, or a GPU as ``"cuda:0"``.
 
     On a processor with a compiler of C++ the same kernels run there; without one, the drives themselves do.

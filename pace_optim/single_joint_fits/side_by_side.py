@@ -11,8 +11,8 @@ import torch
 
 from pace_actuators.effects import Effect, EffectCfg
 from pace_envs.kernels import CannotCompileError
-from pace_optim.diagnosis.model.model import BASE, JointModel
 from pace_optim.problem.rollout import Rollout
+from pace_optim.single_joint_fits.model import BASE, JointModel
 from pace_optim.single_joint_model.kernel_rollout import Compiler, KernelRollout
 from pace_optim.single_joint_model.problem import TwinProblem
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.fitting.fits import Fits
-from pace_optim.diagnosis.model.fitted import Fitted
-from pace_optim.diagnosis.model.labels import found_effects
-from pace_optim.diagnosis.model.model import whole_values
 from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.labels import found_effects
+from pace_optim.single_joint_fits.model import whole_values
 from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.path import ReferencePath
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -43,13 +43,13 @@ class ReferenceUpdate:
         """
         self.say("motion of the robot with what was found")
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
-        for _ in range(cfg.fitting.rounds):
-            if alone and self.away(twins, now) < cfg.beginning.near:  # gravity is linear there
+        for _ in range(cfg.rounds):
+            if alone and self.away(twins, now) < cfg.near:  # gravity is linear there
                 break
             before = now.score
             twins = self.along(self.path(now))
-            now = self.fits.side_by_side(twins.in_windows(), [now], cfg.fitting.again)[0]
-            if bool(((now.score <= self.enough**2) | (now.score > cfg.fitting.gain * before)).all()):
+            now = self.fits.side_by_side(twins.in_windows(), [now], cfg.again)[0]
+            if bool(((now.score <= self.enough**2) | (now.score > cfg.gain * before)).all()):
                 break
         return twins, now
 

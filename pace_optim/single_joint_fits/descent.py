@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.diagnosis_cfg import FittingCfg
-from pace_optim.diagnosis.model.fitted import Fitted
 from pace_optim.optimizers.levenberg_marquardt import (
     DAMPING_TRIALS,
     FIRST_DAMPING,
@@ -14,12 +12,14 @@ from pace_optim.optimizers.levenberg_marquardt import (
     rows_of,
     trial_rows,
 )
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.fitting_cfg import FittingCfg
 
 TRIALS = DAMPING_TRIALS[:-1]
 """Those of a whole robot's fit without the largest: a joint has few parameters."""
 
 
-class LevenbergMarquardt:
+class JointDescent:
     """One model's descent: rows are the favoured step, its P neighbours for the next Jacobian, and the other trials."""
 
     def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool, cfg: FittingCfg):

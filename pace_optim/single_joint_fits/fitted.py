@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.model.model import JointModel
+from pace_optim.single_joint_fits.model import JointModel
 from pace_optim.uncertainty.uncertainty import AT_BOUND
 
 

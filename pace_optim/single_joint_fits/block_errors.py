@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
+from pace_optim.single_joint_fits.fitting_cfg import DEFAULT, FittingCfg
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +35,7 @@ class BlockErrors:
 
 
 def block_errors(
-    error: torch.Tensor, where: torch.Tensor, control_dt: float, *, cfg: JudgingCfg = DEFAULT.judging
+    error: torch.Tensor, where: torch.Tensor, control_dt: float, *, cfg: FittingCfg = DEFAULT
 ) -> BlockErrors:
     """Cut errors into blocks.
 
@@ -52,26 +52,27 @@ def block_errors(
     )
 
 
-def check_long_enough(where: torch.Tensor, control_dt: float, *, cfg: JudgingCfg = DEFAULT.judging) -> None:
+def check_long_enough(where: torch.Tensor, control_dt: float, fewest: int, *, cfg: FittingCfg = DEFAULT) -> None:
     """See that recordings are long enough to judge by.
 
     Args:
         where: Which samples count, (T, R) bool.
         control_dt: [s].
-        cfg: How long blocks are, and how many are needed.
+        fewest: How many blocks are needed.
+        cfg: How long they are.
 
     Raises:
         ValueError: If they are not.
     """
-    if len(_blocks(where, control_dt, cfg)) < cfg.fewest:
+    if len(_blocks(where, control_dt, cfg)) < fewest:
         raise ValueError(
             f"What was kept for validation lasts {sum(_spans(where)) * control_dt:.2g} s, too short to judge a model "
-            f"by; expected {cfg.fewest * cfg.shortest_s:g} s or more. Record for longer, or fit again with further "
+            f"by; expected {fewest * cfg.shortest_s:g} s or more. Record for longer, or fit again with further "
             "recordings as --validation."
         )
 
 
-def _blocks(where: torch.Tensor, control_dt: float, cfg: JudgingCfg) -> list[tuple[int, torch.Tensor]]:
+def _blocks(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> list[tuple[int, torch.Tensor]]:
     """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
     length = min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
     steps = max(1, round(length / control_dt))

@@ -1,1 +1,0 @@
-"""Fitting many joints and effects side by side."""

@@ -1,1 +1,0 @@
-"""What a diagnosis fits: base parameters and effects, and a fitted model of every joint."""

@@ -1,0 +1,1 @@
+"""Models of single joints with effects, fitted side by side: joint by joint, along a reference of the robot."""
