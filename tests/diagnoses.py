@@ -94,7 +94,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
     }
 
 
-def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True, likely: bool = False) -> Trial:
+def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True) -> Trial:
     """An effect that was tried on a joint, with its RMSE after [rad]."""
     return Trial(
         effect=effect,
@@ -105,7 +105,6 @@ def make_trial(effect: type[Effect], joint: int, after: float, significant: bool
         ratio=1e-3 / after,
         t=4.0,
         significant=significant,
-        likely=likely,
         values={},
     )
 

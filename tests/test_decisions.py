@@ -4,23 +4,19 @@ import ast
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-from diagnoses import errors_of, make_search, with_effects
-from test_search_moves import BOTH_LACK, NEIGHBOUR, STANDS_IN, base_model, searched, together
+from diagnoses import errors_of
+from test_search_moves import NEIGHBOUR, STANDS_IN, searched, together
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 from decisions import read_cases, save_cases, table
 
-from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
-from pace_optim.diagnosis.judging.rules import decided
-from pace_optim.diagnosis.search.moves import LAST, MOVES
-from pace_optim.diagnosis.search.pruning import drop_last
-from pace_optim.diagnosis.search.state import Branch
+from pace_optim.diagnosis.judging.rules import decide, decided
+from pace_optim.diagnosis.search.moves import MOVES
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "single_joint_fits")]
@@ -42,19 +38,19 @@ def test_decisions_of_whole_diagnoses_come_out_as_they_did(case):
 
 def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
     log: list[Decision] = []
-    for joints in ((STANDS_IN,), (BOTH_LACK,), (NEIGHBOUR, together(1, 2), together(1, 2))):
+    for joints in ((STANDS_IN,), (NEIGHBOUR, together(1, 2), together(1, 2))):
         searched(*joints, log=log.append)
     path = tmp_path / "decisions.jsonl"
     path.write_bytes(as_lines(log))
     read = read_decisions(path.read_text(encoding="utf-8"))
-    assert {decision.rule for decision in read} == {"look_ahead", "add_pair", "add_to_group"}
+    assert {decision.rule for decision in read} == {"look_ahead", "add_to_group"}
     for decision in read:
         assert [bool(name) for name in decided(decision)] == [bool(name) for name in decision.taken]
 
 
 def test_saved_cases_are_read_as_they_were(tmp_path):
     log: list[Decision] = []
-    searched(BOTH_LACK, log=log.append)
+    searched(STANDS_IN, log=log.append)
     save_cases({"two": log, "none": []}, tmp_path / "saved.jsonl.gz")
     read = read_cases([tmp_path / "saved.jsonl.gz"])
     assert read["none"] == [] and as_lines(read["two"]) == as_lines(read_decisions(as_lines(log).decode()))
@@ -62,28 +58,23 @@ def test_saved_cases_are_read_as_they_were(tmp_path):
 
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
     log: list[Decision] = []
-    searched(BOTH_LACK, log=log.append)
+    searched(NEIGHBOUR, together(1, 2), together(1, 2), log=log.append)
     lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1e9))
     rows = table({"one": log, "two": log}, lenient).splitlines()
-    assert rows[2] == "| add_pair | 2 | 2 | 2 of 2 | 2 |"
+    assert rows[2] == "| add_to_group | 2 | 2 | 2 of 2 | 2 |"
 
 
 def test_another_comparison_decides_otherwise():
-    model = base_model()
-    effects = [get_effect(name) for name in ("stribeck_friction", "torque_gain")]
-    now = with_effects(model, 0 * model.upper, (effects[0], [True], [1.0, 0.1]), (effects[1], [True], [0.1]))
-    left = {effects[0]: errors_of(1.2e-3, roll=1), effects[1]: errors_of(3e-3, roll=1), None: errors_of(1e-3)}
-    log: list[Decision] = []
-    search = make_search(lambda of: left[of.tried], log=log.append)
-    drop_last(search, Branch(problem=SimpleNamespace(on_joints=lambda _: None), now=now, errors=left[None]))
-    first = log[0]
-    assert first.taken == ["stribeck_friction"] == decided(first)  # 1.2 times is less than a further effect must bring
+    errors, after = errors_of(1.2e-3), {"stribeck_friction": errors_of(1e-3, roll=1)}
+    facts = {"candidates": 30, "first": False}
+    taken = decide("add", [0], errors, after, cfg=DEFAULT, log=lambda _: None, **facts)
+    assert taken == {}  # 1.2 times is less than a further effect must bring
     lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1.1, clear=1.1))
-    assert decided(first, lenient) == [None]
+    assert decide("add", [0], errors, after, cfg=lenient, log=lambda _: None, **facts) == {0: "stribeck_friction"}
 
 
 def test_every_rule_can_be_switched_off_and_no_other():
-    assert {*MOVES, *LAST} - {"add"} <= set(RULES)
+    assert {*MOVES} - {"add"} <= set(RULES)
     assert not DiagnosisCfg(off=("pool",)).has("pool") and DiagnosisCfg().has("pool")
     with pytest.raises(ValueError, match=r"no rule 'pol'.*pool"):
         DiagnosisCfg(off=("pol",))

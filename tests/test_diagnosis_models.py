@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnoses import FakeFits, errors_of, joint_alone, make_search
+from diagnoses import FakeFits, joint_alone
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.screening import Probe
 from pace_optim.diagnosis.search.one_round import _ranked
 from pace_optim.diagnosis.search.pooling import pool
-from pace_optim.diagnosis.search.pruning import drop_last
-from pace_optim.diagnosis.search.state import Branch, Outcome
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
@@ -80,37 +79,6 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
             assert bool(outcome.final.model.free.all())
         else:
             assert values == pytest.approx(found)
-
-
-def left_at_last(bench, rmse):
-    """The effects that a joint with three keeps, where its RMSE without some of them stands in a table, or is 9."""
-    model, values, yes = JointModel.base(bench.problem), bench.truth_values, torch.tensor([True])
-    for effect, own in ((STRIBECK, [1.0, 0.1]), (QUADRATIC, [0.1]), (GAIN, [0.1])):
-        model, values = model.extended(values, effect, yes, torch.tensor([own], dtype=torch.float64))
-
-    def errors(now):
-        pairs = zip(now.model.effects, now.model.has[:, 0], strict=True)
-        return errors_of(1e-3 * rmse.get(frozenset(effect for effect, has in pairs if not has), 9.0))
-
-    now = Fitted.start(model, values)
-    branch = Branch(problem=bench.twins, now=now, errors=errors(now))
-    end = drop_last(make_search(errors), branch)
-    assert torch.equal(end.errors.square, errors(end.now).square)
-    return {e for e, has in zip(end.now.model.effects, end.now.model.has[:, 0], strict=True) if has}
-
-
-@pytest.mark.parametrize(
-    ("without", "kept"),
-    [
-        # of two that stand in for each other the one goes without which less is lost; the other one pays then
-        ({(): 1.0, (QUADRATIC,): 1.1, (GAIN,): 1.15}, {STRIBECK, GAIN}),
-        ({(): 1.0, (STRIBECK,): 2.0, (QUADRATIC,): 3.0, (GAIN,): 1.5}, {STRIBECK, QUADRATIC, GAIN}),
-        # whether the last one pays is the verdict's
-        ({(): 1.0, (STRIBECK,): 1.1, (STRIBECK, QUADRATIC): 1.2, (STRIBECK, QUADRATIC, GAIN): 1.25}, {GAIN}),
-    ],
-)
-def test_effects_that_no_longer_pay_go_one_after_another(bench, without, kept):
-    assert left_at_last(bench, {frozenset(each): rmse for each, rmse in without.items()}) == kept
 
 
 def test_every_structure_that_an_effect_can_have_starts_a_fit():

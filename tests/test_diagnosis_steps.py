@@ -12,9 +12,7 @@ from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.choice import choose
-from pace_optim.diagnosis.search.alternatives import exchanged
-from pace_optim.diagnosis.search.merge_effects import _options, merge_effects
-from pace_optim.diagnosis.search.replace_effect import replace_effects
+from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Outcome
 from pace_optim.diagnosis.telling.advice import rivals
@@ -183,57 +181,16 @@ def test_joints_agree_on_the_effect_that_most_want_where_it_does_as_well(bench, 
     assert this.chosen == [GAIN, GAIN] and this.rivals == [[], [STRIBECK]]
 
 
-@pytest.mark.parametrize(
-    ("alone", "agree"),
-    [
-        ((1.1e-4, 1.1e-4), ["torque_gain"]),
-        ((1.1e-4, 3e-4), ["stribeck_friction@knee", "quadratic_friction@knee", "torque_gain@hip"]),
-        ((3e-4, 3e-4), None),
-    ],
-)
-def test_one_effect_takes_the_place_of_several_that_do_not_pay_beside_it(bench, alone, agree):
-    base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
-    now = with_effects(base, values, (STRIBECK, both, [1.0, 0.1]), (QUADRATIC, both, [0.2]))
-    models = {GAIN: with_effects(base, 1.1 * values, (GAIN, both, [0.9]))}
-    trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4, significant=False)] for j in range(2)]
-    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []], models=models)
-    later = Round(trials=[[], []], chosen=[QUADRATIC, QUADRATIC], rivals=[[STRIBECK], []])
-    errors = {GAIN: errors_of(*alone, roll=1), None: errors_of(1e-4, 1e-4)}
-    branch = Branch(problem=bench.twins, now=now, errors=errors[None], rounds=(this, later))
-    search = make_search(lambda of: errors[of.tried], floor=(1e-4, 1e-4), effects=(None,) * 15, off=("replace",))
-    end = merge_effects(search, branch)
-    if agree is None:
-        assert end is branch
-        return
-    final, (this, later) = end.now, end.rounds
-    assert labels(final.model, ["hip", "knee"]) == agree and this.chosen[0] is GAIN
-    physical = final.model.to_physical(final.x)[0]
-    assert physical[: len(BASE)].tolist() == pytest.approx((1.1 * values[0]).tolist())
-    assert physical[final.model.columns(GAIN)].tolist() == pytest.approx([0.9])
-    assert later.chosen[0] is None and list(later.rivals[0]) == []
-
-
-def test_an_effect_of_the_whole_robot_is_not_replaced_on_one_joint(bench):
-    base, values, both = two_joints(bench), bench.truth_values.repeat(2, 1), [True, True]
-    now = with_effects(base, values, (CLOCK, both, [1e-3]), (STRIBECK, both, [1.0, 0.1]))
-    trials = [[make_trial(STRIBECK, j, 5e-4), make_trial(GAIN, j, 6e-4)] for j in range(2)]
-    this = Round(trials=trials, chosen=[STRIBECK, STRIBECK], rivals=[[], []])
-    assert _options(now, [this], DEFAULT.judging) == {}
-    now = with_effects(base, values, (GAIN, both, [1.1]), (STRIBECK, both, [1.0, 0.1]))
-    this = replace(this, trials=[[make_trial(STRIBECK, j, 5e-4), make_trial(CLOCK, j, 6e-4)] for j in range(2)])
-    assert _options(now, [this], DEFAULT.judging) == {}
-
-
 def test_where_an_encoder_sits_is_held_in_exchanges(bench):
     base, here = JointModel.base(bench.problem), torch.tensor([True])
-    sides = []
+    with_gain, sides = with_effects(base, bench.truth_values, (GAIN, [True], [0.9])), []
     for side in (0.0, 1.0):
         elasticity = with_effects(base, bench.truth_values, (ELASTICITY, [True], [300.0, 1.0, side]))
-        now = exchanged(Fitted.start(base, bench.truth_values), here, [], elasticity, ELASTICITY)
+        now = exchanged(with_gain, here, GAIN, elasticity, ELASTICITY)
         column = now.model.columns(ELASTICITY).stop - 1
         assert not bool(now.model.free[0, column]) and float(now.physical[0, column]) == side
         sides.append((now, elasticity))
-    now = exchanged(sides[0][0], here, [ELASTICITY], sides[1][1], ELASTICITY)
+    now = exchanged(sides[0][0], here, ELASTICITY, sides[1][1], ELASTICITY)
     assert float(now.physical[0, column]) == 1.0  # and not where it was held before
 
 
@@ -276,7 +233,7 @@ def test_beside_a_newer_effect_another_one_may_take_the_older_one_s_place(bench)
 
 @pytest.mark.parametrize(("elastic", "chosen"), [(1.01, ELASTICITY), (1.04, BACKLASH), (0.99, ELASTICITY)])
 def test_of_two_effects_that_are_as_good_the_one_with_fewer_numbers_is_taken(elastic, chosen):
-    choice = choose([[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]], [{}])
+    choice = choose([[make_trial(BACKLASH, 0, 1e-4), make_trial(ELASTICITY, 0, elastic * 1e-4)]])
     (taken,), ((other,),) = choice.chosen, choice.rivals
     assert {taken, other} == {BACKLASH, ELASTICITY} and taken is chosen
 

@@ -13,9 +13,9 @@ from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.diagnose import summary_of
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
+from pace_optim.diagnosis.telling.findings import summary_of
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report

@@ -41,6 +41,7 @@ FLOORS = {
         ["beginning", "search"],
         ["verdict"],
         ["telling"],
+        ["method"],
         ["diagnose"],
     ),
 }

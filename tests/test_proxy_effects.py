@@ -13,9 +13,10 @@ from problems import CALM, DT
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.diagnose import Findings, summary_of
 from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.telling import findings
+from pace_optim.diagnosis.telling.findings import Findings, summary_of
 from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
 from pace_optim.diagnosis.verdict.verdict import verdict
 from pace_optim.report import write_report
@@ -169,9 +170,10 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, monkeypatch, stopped)
         return SimpleNamespace(stop_reasons=[stopped]), refit
 
     (run.folder.parent / "refit").mkdir(exist_ok=True)
-    module = sys.modules[search_effects.__module__]
-    for name, made in (("search_effects", found), ("advise", []), ("error_map", {}), ("sizes", [])):
-        monkeypatch.setattr(module, name, lambda *_, made=made, **__: made)
+    module = sys.modules[diagnose.__module__]
+    for name, made in (("advise", []), ("error_map", {}), ("sizes", [])):
+        monkeypatch.setattr(findings, name, lambda *_, made=made, **__: made)
+    monkeypatch.setattr(module, "search_effects", lambda *_, **__: found)
     monkeypatch.setattr(module, "fit", fit)
     line = SimpleNamespace(say=said.append, restart=lambda: None, close=lambda: None)
     assert diagnose(DiagnosisSettings(run=run.folder), line).runs == [str(run.folder)] and not refits

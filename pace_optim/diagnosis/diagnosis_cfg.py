@@ -44,8 +44,6 @@ class CandidatesCfg:
     """A refit starts at the best multiple of a probe, between these."""
     frictions: tuple[float, ...] = (-0.9, -0.5)
     """Normalised armature and friction that far starts begin with too, with a quarter of the delay."""
-    independent_s: float = 0.4
-    """Errors of a wrong model that are further apart than this count as independent [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +62,10 @@ class JudgingCfg:
     clear: float = 1.5
     """A fall that is this large needs no more than t > ``clear_t``."""
     clear_t: float = 2.0
-    """A fall may be there above this t, though it does not show it."""
+    """See ``clear``."""
     as_good: float = 1.025
     """A simpler model is as good up to this ratio: the effect with the fewest parameters is chosen, joints share one
     value, and a way with fewer parameters is taken."""
-    weighed: float = 1.15
-    """Where more than one effect is missing, those up to this ratio apart are decided by evidence."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
     to this ratio apart."""
@@ -101,15 +97,11 @@ class VerdictCfg:
 RULES = (
     "add_to_group",
     "look_ahead",
-    "add_pair",
     "replace",
-    "merge",
-    "drop_last",
     "pool",
     "trim",
     "wide_steps",
     "second_try",
-    "evidence",
     "widen_bounds",
     "multistart",
     "late_joints",

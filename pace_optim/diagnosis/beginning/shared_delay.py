@@ -32,6 +32,8 @@ def hold_late_joints(
     Returns:
         The model, fitted with its Jacobian (``base`` itself where no joint is late), and what was held, in a sentence.
     """
+    if not cfg.has("late_joints"):
+        return base, []
     delay = base.physical[:, _DELAY]
     late = later_than_most(delay, cfg=cfg.beginning)
     while bool(late.any()):

@@ -29,7 +29,6 @@ class Trial:
     """RMSE before / after."""
     t: float = 0.0
     significant: bool = False
-    likely: bool = False
 
     def judged(
         self, before: BlockErrors, after: BlockErrors, tried: int, first: bool, *, cfg: JudgingCfg = DEFAULT.judging
@@ -43,7 +42,6 @@ class Trial:
             ratio=verdict.ratio,
             t=verdict.t,
             significant=verdict.significant,
-            likely=verdict.likely,
         )
 
 
@@ -69,11 +67,9 @@ class Round:
     def exchanged(self, joint: int, new: type[Effect] | None, tie: bool) -> Round:
         """The same with another effect on a joint; with ``tie`` what it had becomes its rival."""
         old, others = self.chosen[joint], [effect for effect in self.rivals[joint] if effect is not new]
-        return self._with(joint, new, others if old is None or not tie else [*others, old])
-
-    def settled(self, joint: int, new: type[Effect] | None) -> Round:
-        """The same with another effect on a joint, or none, and no rivals."""
-        return self._with(joint, new, [])
+        chosen, every = list(self.chosen), list(self.rivals)
+        chosen[joint], every[joint] = new, others if old is None or not tie else [*others, old]
+        return replace(self, chosen=chosen, rivals=every)
 
     def with_trials(self, judged: Mapping[int, Trial]) -> Round:
         """The same with a joint's trial of an effect in place of what it was, best first."""
@@ -93,11 +89,6 @@ class Round:
             trials[j], chosen[j], rivals[j] = [replace(trial, joint=j) for trial in own], choice, others
         models = {e: replace(now.with_joints(joints, own), tried=e) for e, own in self.models.items()}
         return Round(trials=trials, chosen=chosen, rivals=rivals, models=models)
-
-    def _with(self, joint: int, new: type[Effect] | None, rivals: Sequence[type[Effect]]) -> Round:
-        chosen, every = list(self.chosen), list(self.rivals)
-        chosen[joint], every[joint] = new, rivals
-        return replace(self, chosen=chosen, rivals=every)
 
 
 def near_trials(trials: Sequence[Trial], chosen: type[Effect], *, cfg: JudgingCfg = DEFAULT.judging) -> list[Trial]:

@@ -21,8 +21,6 @@ class Judgement:
     t: float
     """t statistic of the blocks' log ratio."""
     significant: bool
-    likely: bool
-    """Whether it may be there, though this does not show it: a fall that would count were it as even as a clear one."""
 
 
 def within(mse: float, best: float, ratio: float) -> bool:
@@ -62,14 +60,14 @@ def judge(
     logs = (before.square[:, joint].clamp(min=1e-30) / after.square[:, joint].clamp(min=1e-30)).log()
     count = len(logs)
     if count < cfg.fewest:
-        return Judgement(ratio=ratio, t=0.0, significant=False, likely=False)
+        return Judgement(ratio=ratio, t=0.0, significant=False)
     falls = (before.square[:, joint] - after.square[:, joint]) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
     threshold = float(stats.t.isf(cfg.level / (2 * max(1, tried)), count - 1))
     least = least_ratio(first, cfg=cfg)
     enough = t > threshold or (ratio >= cfg.clear and t > cfg.clear_t)
-    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough, likely=ratio >= least and t > cfg.clear_t)
+    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)
 
 
 def _t(values: torch.Tensor) -> float:

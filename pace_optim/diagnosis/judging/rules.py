@@ -50,8 +50,7 @@ def _add(decision: Decision, cfg: DiagnosisCfg) -> Taken:
         for place in decision.places(name):
             trial = Trial(effect=get_effect(name), joint=place, screen_score=0.0, values={})
             trials[place].append(trial.judged(before, after, facts["candidates"], facts["first"], cfg=cfg.judging))
-    evidence = [{get_effect(name): value for name, value in own.items()} for own in facts["evidence"]]
-    return [None if effect is None else effect.name for effect in choose(trials, evidence, cfg=cfg.judging).chosen]
+    return [None if effect is None else effect.name for effect in choose(trials, cfg=cfg.judging).chosen]
 
 
 def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
@@ -70,29 +69,6 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     total = {name: sum(options.get(name, 0.0) for options in near) for name in wanted}
     best = [min(options, key=lambda name: (-wanted[name], -used[name], total[name])) for options in near]
     return [name if str(j) in olds.get(name, {}) else None for j, name in zip(joints, best, strict=True)]
-
-
-def _drop_last(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """What a joint does best without, where it does not pay."""
-    taken: Taken = []
-    for place in range(len(decision.joints)):
-        tried = [name for name in decision.after if place in decision.places(name)]
-        best = min(tried, key=lambda name: float(decision.after[name].mse[place]))
-        taken.append(None if _pays(decision, best, place, cfg) else best)
-    return taken
-
-
-def _merge(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """One effect beside which a joint's several do not pay: of those the one that does for most joints."""
-    enough = {n: [p for p in decision.places(n) if not _pays(decision, n, p, cfg)] for n in decision.after}
-
-    def order(name: str, place: int) -> tuple[int, float]:
-        return -len(enough[name]), float(decision.after[name].mse[place])
-
-    return [
-        min((name for name in enough if place in enough[name]), key=lambda name: order(name, place), default=None)
-        for place in range(len(decision.joints))
-    ]
 
 
 def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
@@ -146,21 +122,12 @@ def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 
-def _pays(decision: Decision, without: str, place: int, cfg: DiagnosisCfg) -> bool:
-    """Whether what the present model has pays beside what was tried in place of it, or without it."""
-    other, tried = decision.after[without], decision.facts["candidates"]
-    return judge(other, decision.before, place, tried, first=False, cfg=cfg.judging).significant
-
-
 _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "add": _add,
     "replace": _replace,
     "look_ahead": _look_ahead,
-    "drop_last": _drop_last,
-    "merge": _merge,
     "pool": _pool,
     "trim": _trim,
     "add_to_group": _together,
-    "add_pair": _together,
     "curves": _curves,
 }

@@ -10,12 +10,10 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.search.alternatives import Alternatives
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
-from pace_optim.diagnosis.search.merge_effects import merge_effects
-from pace_optim.diagnosis.search.pruning import drop_last
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.fitted import Fitted
 
 Step = tuple[Branch, Round | None]
 """A branch, and what could come next on it."""
@@ -37,7 +35,7 @@ def add_to_group(search: Search, branch: Branch, found: Round) -> Step | None:
             search.say(f"trying {effect.name} on {len(joints)} more joint{'' if len(joints) == 1 else 's'} at once")
             chosen = [effect if j in joints else old for j, old in enumerate(found.chosen)]
             end = grown(search, branch, found.choosing(chosen))
-            trials = _judged_again(search, "add_to_group", effect, joints, found, end)
+            trials = _judged_again(search, effect, joints, found, end)
             if all(trial.significant for trial in trials.values()):
                 end = replace(end, rounds=(*end.rounds[:-1], end.rounds[-1].with_trials(trials)))
                 return end, search.tried(end)
@@ -56,59 +54,28 @@ def add(search: Search, branch: Branch, found: Round) -> Step | None:
     return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)
 
 
-def add_pair(search: Search, branch: Branch, found: Round) -> Step | None:
-    """Two rounds on by effects that are likely only, where they pay beside the next ones.
-
-    Where several effects of a size are missing, what one of them brings is uneven: the others cover it here and there.
-    """
-    likely = [next((t.effect for t in own if t.likely), None) for own in found.trials]
-    far = search.far(branch.errors).tolist()
-    guesses = [effect if yes else None for effect, yes in zip(likely, far, strict=True)]
-    if not any(guesses) or len(branch.rounds) + 2 > search.max_effects:
-        return None
-    wanted = list(dict.fromkeys(effect for effect in guesses if effect is not None))
-    search.say(f"looking beyond what is likely: {', '.join(effect.name for effect in wanted)}")
-    one = grown(search, branch, found.choosing(guesses))
-    ahead = search.tried(one)
-    if ahead is None or not any(ahead.chosen):
-        return None
-    two = grown(search, one, ahead)
-    trials: dict[int, Trial] = {}
-    for effect in wanted:
-        joints = [j for j, guess in enumerate(guesses) if guess is effect]
-        if effect not in two.now.model.effects:  # another has taken its place
-            return None
-        trials |= _judged_again(search, "add_pair", effect, joints, found, two)
-    if not all(trial.significant for trial in trials.values()):
-        return None
-    at = len(branch.rounds)
-    two = replace(two, rounds=(*two.rounds[:at], two.rounds[at].with_trials(trials), *two.rounds[at + 1 :]))
-    return two, search.tried(two)
-
-
 def _judged_again(
-    search: Search, rule: str, effect: type[Effect], joints: Sequence[int], found: Round, end: Branch
+    search: Search, effect: type[Effect], joints: Sequence[int], found: Round, end: Branch
 ) -> dict[int, Trial]:
     """What an effect brings each of several joints, held against them without it along the same motion."""
     model = end.now.model
     here = torch.zeros(model.num_joints, dtype=torch.bool)
     here[list(joints)] = True
-    without = Alternatives.without(search, end, {effect: here & model.has[model.effects.index(effect)]}).errors
-    before = without.get(effect, end.errors)  # nothing is gained where it is not there any more
+    here &= model.has[model.effects.index(effect)]
+    before = end.errors  # nothing is gained where it is not there any more
+    if bool(here.any()):
+        start = Fitted.start(model.without_effect(effect, here), end.now.physical, tried=effect)
+        before = search.fits.on_joints(end.problem, [start], here, end.errors)[1][0]
     tried, cfg = search.tried_over_joints, search.cfg.judging
     old = {j: next(t for t in found.trials[j] if t.effect is effect) for j in joints}
     trials = {j: trial.judged(before, end.errors, tried, first=False, cfg=cfg) for j, trial in old.items()}
     after = {effect.name: end.errors}
-    decide(rule, joints, before, after, cfg=search.cfg, log=search.log, candidates=tried)
+    decide("add_to_group", joints, before, after, cfg=search.cfg, log=search.log, candidates=tried)
     return trials
 
 
 MOVES: Mapping[str, Callable[[Search, Branch, Round], Step | None]] = {
     "add_to_group": add_to_group,
     "add": add,
-    "add_pair": add_pair,
 }
 """What is tried with each round, in this order; the first that leads somewhere is made."""
-
-LAST: Mapping[str, Callable[[Search, Branch], Branch]] = {"merge": merge_effects, "drop_last": drop_last}
-"""What makes the model simple in the end, in this order."""

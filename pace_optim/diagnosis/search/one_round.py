@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.candidates.evidence import log_evidence
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.judging.choice import choose, contenders
+from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.decisions import Decision
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_model.problem import TwinProblem
 
 if TYPE_CHECKING:
     from pace_optim.diagnosis.search.state import Branch, Search
@@ -51,9 +49,7 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
             score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
             trial = Trial(effect=effect, joint=j, screen_score=score, values=values)
             trials[j].append(trial.judged(errors, after[effect], tried, first, cfg=cfg.judging))
-    weighed = contenders(trials, search.floor, cfg=cfg.judging) if cfg.has("evidence") else [[] for _ in trials]
-    evidence = _evidence(search, problem, models, weighed)
-    choice = choose(trials, evidence, cfg=cfg.judging)
+    choice = choose(trials, cfg=cfg.judging)
     made = Decision.of(
         "add",
         range(len(trials)),
@@ -62,8 +58,6 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
         {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
         candidates=tried,
         first=first,
-        floor=search.floor.tolist(),
-        evidence=[{effect.name: value for effect, value in own.items()} for own in evidence],
     )
     search.log(replace(made, taken=[None if effect is None else effect.name for effect in choice.chosen]))
     return Round(trials=choice.trials, chosen=choice.chosen, rivals=choice.rivals, models=models)
@@ -88,23 +82,6 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
     # where nothing is listed no effect does better than the base parameters alone
     return {effect: begun[effect] for effect in listed}, probes
-
-
-def _evidence(
-    search: Search,
-    problem: TwinProblem,
-    models: Mapping[type[Effect], Fitted],
-    weighed: Sequence[Sequence[type[Effect]]],
-) -> list[dict[type[Effect], float]]:
-    """Of each joint, the log evidence of effects between which its error does not decide."""
-    every = list(dict.fromkeys(effect for own in weighed for effect in own))
-    if not every:
-        return [{} for _ in weighed]
-    search.say(f"weighing {_names(every)}")
-    known = log_evidence(
-        search.fits, problem, {e: models[e] for e in every}, search.effects, search.effort, search.cfg.candidates
-    )
-    return [{effect: float(known[effect][j]) for effect in own} for j, own in enumerate(weighed)]
 
 
 def with_likes(listed: Sequence[type[Effect]], effects: Sequence[type[Effect]]) -> list[type[Effect]]:

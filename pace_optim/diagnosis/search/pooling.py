@@ -23,7 +23,7 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
     complement of the Gauss–Newton matrix); the other parameters are fitted again with it held.
     """
     for effect, has in zip(outcome.final.model.effects, outcome.final.model.has, strict=True):
-        if effect.shared or int(has.sum()) < 2:
+        if not outcome.cfg.has("pool") or effect.shared or int(has.sum()) < 2:
             continue
         held = _held(outcome.final, effect, has)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]

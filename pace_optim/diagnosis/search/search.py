@@ -8,7 +8,7 @@ import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.size_consistency import unevenness
-from pace_optim.diagnosis.search.moves import LAST, MOVES, Step
+from pace_optim.diagnosis.search.moves import MOVES, Step
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -34,9 +34,6 @@ def add_effects(
     found = search.tried(branch)
     while found is not None and (step := _first_step(search, branch, found)) is not None:
         branch, found = step
-    for name, simplify in LAST.items():
-        if cfg.has(name):
-            branch = simplify(search, branch)
     return Outcome(
         problem=branch.problem,
         base=base,

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from pace_actuators.effects import Effect
+from pace_actuators.files import json_text
 from pace_optim.diagnosis.beginning.data_check import DataCheck
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.free_curves import Curves
+from pace_optim.diagnosis.telling.advice import advise
+from pace_optim.diagnosis.telling.result import Diagnosis
+from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
+from pace_optim.diagnosis.verdict.sizes import sizes
+from pace_optim.diagnosis.verdict.verdict import likes, ranking
 from pace_optim.problem.problem import Problem
+from pace_optim.run.result import FitResult
+from pace_optim.single_joint_fits.fits import Fits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +56,60 @@ class Findings:
     def added(self) -> list[str]:
         """Those that are what is missing."""
         return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
+
+
+def told(
+    found: Findings,
+    fits: Fits,
+    cfg: DiagnosisCfg,
+    problem: Problem,
+    run: FitResult,
+    folder: Path,
+    candidates: Sequence[type[Effect]],
+) -> Diagnosis:
+    """What was found, as ``diagnosis.json`` has it."""
+    return Diagnosis(
+        run=str(folder),
+        verdict=found.verdict,
+        summary=summary_of(found, problem),
+        explained=found.explained,
+        added=found.added,
+        paying=found.paying,
+        shares={effect.name: share for effect, share in found.shares.items()},
+        free_form=found.free_form,
+        ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
+        sizes=sizes(fits, found.outcome, problem.joint_names),
+        likes=likes(found.outcome),
+        joints=by_joint(found, problem),
+        data=[*found.data.sentences, *_about_run(found, problem, run)],
+        absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
+        advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
+        runs=[str(folder)],
+        tried=[effect.name for effect in candidates],
+        physics_dt=problem.physics_dt,
+        ladder=ladder(found),
+        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=cfg.verdict),
+        cfg=json.loads(json_text(asdict(cfg))),
+    )
+
+
+def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
+    """What the run has, and why it tells another error of the same model, where it does."""
+    if run.effects:
+        return [
+            f"The run has {', '.join(run.effects)}: the search started from the base model, and looked for it again."
+        ]
+    own, here = run.rmse["validation"].get("all"), float(found.outcome.base_errors.mse.mean().sqrt())
+    if own is None or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
+        return []
+    ways = []
+    if not math.isclose(run.physics_dt, problem.physics_dt):
+        ways.append(f"the physics step is {1e3 * problem.physics_dt:g} instead of {1e3 * run.physics_dt:g} ms")
+    ways.append("each joint is simulated alone with a delay of its own, in blocks of up to one second")
+    return [
+        f"The run's own validation error of the base model is {1e3 * own:.3g} mrad, here it is {1e3 * here:.3g} mrad: "
+        f"{', and '.join(ways)}."
+    ]
 
 
 def summary_of(found: Findings, problem: Problem) -> str:

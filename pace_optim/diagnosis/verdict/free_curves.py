@@ -68,7 +68,7 @@ def fit_curves(
     joints = ~near_floor(outcome, floor)
     for effect, has in zip(model.effects, model.has, strict=True):
         joints &= ~(has & effect.shared)
-    if not bool(joints.any()):
+    if not bool(joints.any()) or not outcome.cfg.has("curves"):
         return None
     say("fitting curves of any form in place of effects")
     ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
@@ -98,8 +98,10 @@ def fit_curves(
     )
 
 
-def take_curves(outcome: Outcome, curves: Curves) -> Outcome:
+def take_curves(outcome: Outcome, curves: Curves | None) -> Outcome:
     """The outcome with a joint's best curve in place of its effects, where that says more."""
+    if curves is None:
+        return outcome
     final, errors = outcome.final, outcome.final_errors
     for j in curves.instead.nonzero()[:, 0].tolist():
         here, k = torch.arange(len(curves.instead)) == j, curves.best(j)

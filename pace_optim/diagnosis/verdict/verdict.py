@@ -42,6 +42,20 @@ def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
     return "nothing_missing", explained
 
 
+def final_verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float, Outcome]:
+    """The verdict, the part explained, and the outcome with the effects and curves that stand.
+
+    Where something is known to be missing, joints whose effects do not explain it go back to the base model.
+    """
+    decision, explained = verdict(outcome, floor)
+    if decision == "unknown":
+        return decision, explained, outcome
+    with_curve = curves_in(outcome.final.model).any(dim=0)
+    known = explained_joints(outcome, floor) & (decision == "effect")
+    outcome = restrict_to(outcome, with_curve | known)
+    return decision, verdict(outcome, floor)[1], outcome
+
+
 def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 

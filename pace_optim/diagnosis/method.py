@@ -1,0 +1,104 @@
+"""The method: each joint alone, from its base model to what is missing (docs/diagnosis.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.beginning.data_check import check_data
+from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
+from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.search.pooling import pool
+from pace_optim.diagnosis.search.search import add_effects
+from pace_optim.diagnosis.search.state import Search
+from pace_optim.diagnosis.telling.findings import Findings
+from pace_optim.diagnosis.verdict.contributions import contributions
+from pace_optim.diagnosis.verdict.free_curves import fit_curves, take_curves
+from pace_optim.diagnosis.verdict.verdict import final_verdict
+from pace_optim.problem.problem import Problem
+from pace_optim.run.result import FitResult
+from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.block_errors import check_long_enough
+from pace_optim.single_joint_fits.denormals import flushed_denormals
+from pace_optim.single_joint_fits.fits import Fits, fits_on
+from pace_optim.single_joint_fits.labels import labels
+from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
+
+
+@flushed_denormals()
+def search_effects(
+    problem: Problem,
+    physical: torch.Tensor,
+    candidates: Sequence[type[Effect]],
+    max_effects: int,
+    say: Callable[[str], None] = lambda _: None,
+    run: FitResult | None = None,
+    *,
+    log: Log = unlogged,
+    cfg: DiagnosisCfg = DEFAULT,
+    fits: Fits | None = None,
+) -> Findings:
+    """Look for missing effects, each joint simulated alone.
+
+    Args:
+        problem: The whole robot with the base model.
+        physical: A first guess of its parameters, (size,).
+        candidates: What is tried.
+        max_effects: Most effects of a joint.
+        say: Shows how far it is.
+        run: The whole robot's own fit, if there is one.
+        log: Gets every decision.
+        cfg: By what numbers it is decided.
+        fits: Fits models; ``None``: on the processor.
+
+    Raises:
+        ValueError: If the validation recordings are too short to judge by.
+    """
+    fits = fits or fits_on("cpu", cfg.fitting)
+    check_long_enough(problem.dataset.validation, problem.control_dt, cfg.judging.fewest, cfg=cfg.fitting)
+
+    # the base model of each joint, and what these recordings can show beside it
+    twins, base, effort = fit_base(fits, problem, physical, candidates, say)
+    data = check_data(fits, problem, twins, base, run, cfg=cfg.judging)
+    base, late = hold_late_joints(fits, twins, base, cfg=cfg)
+    coarse = twins.with_physics_dt(twins.coarsest_dt)
+    absorbed = absorbed_effects(fits, coarse, base, candidates, effort, cfg.candidates)
+    base = replace(base, model=replace(base.model, barred=absorbed))
+
+    # one effect after another, as long as they pay on held-out recordings
+    enough = cfg.judging.alike * data.floor
+    reference = ReferenceUpdate(fits=fits, problem=problem, candidates=candidates, enough=enough, say=say)
+    search = Search(
+        effects=candidates,
+        effort=effort,
+        floor=data.floor,
+        max_effects=max_effects,
+        fits=fits,
+        cfg=cfg,
+        follow=reference.follow,
+        say=say,
+        log=log,
+    )
+    outcome = pool(fits, add_effects(search, twins, base), log)
+
+    # where no effect is it, a curve
+    curves = fit_curves(fits, outcome, data.floor, say, log)
+    outcome = take_curves(outcome, curves)
+
+    verdict, explained, outcome = final_verdict(outcome, data.floor)
+    shares = contributions(fits, outcome)
+    return Findings(
+        outcome=outcome,
+        data=replace(data, sentences=[*data.sentences, *late]),
+        absorbed=absorbed,
+        verdict=verdict,
+        explained=explained,
+        paying=labels(outcome.final.model, problem.joint_names, list(shares)),
+        shares=shares,
+        curves=curves,
+    )
