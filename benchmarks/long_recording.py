@@ -2,7 +2,8 @@
 
     python benchmarks/long_recording.py --optimizer least_squares
 
-Five limbs of six joints; twenty seconds are simulated and repeated, which is as much to read and to choose from.
+Five limbs of six joints; the last two of a multisine's four periods are repeated, as much to read and to choose
+from.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 ROOT = Path(__file__).parents[1]
-LIMBS, JOINTS, SECONDS, RATE, MOTION = 5, 6, 600, 1000, 20
+LIMBS, JOINTS, SECONDS, RATE, MOTION = 5, 6, 600, 1000, 40
 
 
 def write_robot(path: Path) -> None:
@@ -50,10 +52,11 @@ def write_recording(folder: Path, suffix: str) -> Path:
     with np.load(short) as archive:
         content = dict(archive)
     own = content["time"]
-    grid = np.arange(0.0, MOTION, 1 / RATE)
-    for key in ("dof_pos", "des_dof_pos"):
-        once = np.stack([np.interp(grid, own, column) for column in content[key].T], axis=1)
-        content[key] = np.tile(once, (SECONDS // MOTION, 1))
+    grid = np.arange(MOTION / 2, MOTION, 1 / RATE)  # periodic: of the start nothing is left
+    held = np.searchsorted(own, grid + 1e-6, side="right") - 1
+    read = CubicSpline(own, content["dof_pos"])(grid)
+    for key, once in {"dof_pos": read, "des_dof_pos": content["des_dof_pos"][held]}.items():
+        content[key] = np.tile(once, (2 * SECONDS // MOTION, 1))
     content["time"] = np.arange(len(content["dof_pos"])) / RATE
     np.savez(folder / "long.npz", **content)
     if suffix == ".npz":

@@ -16,6 +16,7 @@ import pace_envs
 from pace_envs.tasks.pace import go2
 from pace_optim.data_collection import Encoder, true_parameters
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import load_problem
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import conform_recording, load_recording
 from pace_optim.recording.dataset import make_dataset
@@ -373,3 +374,18 @@ def test_a_missing_key_and_a_file_error_read_as_sentences(capsys):
     assert run_cli(missing) == run_cli(absent) == 2
     lines = ["error: There is no parameter 'x'.", "error: /no/such/file: No such file or directory"]
     assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_loops_of_a_file_are_simulated_as_a_fit_does(tmp_path):
+    (tmp_path / "stiff.xml").write_text(
+        '<mujoco model="stiff"><compiler angle="radian"/><worldbody><body>'
+        '<joint name="j" axis="0 1 0" range="-2 2"/>'
+        '<inertial pos="0 0.02 -0.08" mass="0.5" diaginertia="2e-3 2e-3 1e-3"/></body></worldbody>'
+        '<actuator><position joint="j" kp="160" kv="20" forcerange="-60 60"/></actuator></mujoco>'
+    )
+    task = ("--task", str(tmp_path / "stiff.xml"))
+    record(tmp_path, *task, *SHORT, "--parameter", "armature=1e-3")
+    problem = load_problem(task[1], data=[tmp_path / "r.npz"])
+    assert problem.physics_dt < problem.coarsest_dt
+    values = true_parameters(problem.env_cfg.sim2real, problem.space, {"armature": 1e-3})
+    assert float(problem.evaluator().residuals(values[None], problem.dataset.sampled).score) < EXACT

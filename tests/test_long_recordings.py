@@ -51,19 +51,26 @@ def test_a_part_is_what_was_recorded_there(vel):
 def test_what_can_be_afforded_stays_whole():
     whole = joint_by_joint()
     told: list[str] = []
-    (kept,), (other,) = affordable([[whole], [whole]], DT, 9, None, told.append)
+    (kept,), (other,) = affordable([[whole], [whole]], DT, 9, 4, None, told.append)
     assert kept is whole and other is whole and told == []
-    assert affordable([[whole]], DT, 9, 80.0, told.append)[0][0] is whole
+    assert affordable([[whole]], DT, 9, 4, 80.0, told.append)[0][0] is whole
 
 
 def test_too_many_derivatives_and_too_little_memory(monkeypatch):
     whole = joint_by_joint()
     told: list[str] = []
     monkeypatch.setattr(parts_module, "_NUMBERS", 9 * 4 * 100 * 20)  # of 20 s
-    kept = affordable([[whole], []], DT, 9, None, told.append)
+    kept = affordable([[whole], []], DT, 9, 4, None, told.append)
     assert len(kept[0]) == 4 and kept[1] == [] and len(told) == 1
     with pytest.raises(ValueError, match=r"Fitting 79.99 s would take .* GB of memory.*smaller --max_duration"):
-        affordable([[whole]], DT, 10**9, 80.0, told.append)
+        affordable([[whole]], DT, 10**9, 4, 80.0, told.append)
+
+
+def test_fine_steps_make_a_recording_dear(monkeypatch):
+    whole = joint_by_joint()
+    monkeypatch.setattr(parts_module, "_EVALUATIONS", 9 * 4 * 100 * 4 * 40)  # of 40 s, at four a step
+    for evaluations, parts in ((1, 1), (4, 8), (8, 4)):
+        assert len(affordable([[whole], []], DT, 9, evaluations, None, [].append)[0]) == parts
 
 
 def test_parts_of_a_motion_show_the_truth(tmp_path, capsys):

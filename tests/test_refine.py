@@ -72,3 +72,12 @@ def test_a_start_that_is_better_than_its_coarse_end_is_kept(problem, colouring, 
     monkeypatch.setattr("pace_optim.optimizers.refine.least_squares", led_astray)
     best = refine(problem.training_evaluator(), colouring, [Descent(x=normalised(problem))])[0]
     assert torch.equal(best.x, normalised(problem)) and best.score < 1e-14
+
+
+def test_most_of_the_way_is_gone_at_the_longer_step(problem, colouring):
+    fine, coarse = problem.with_physics_dt(problem.physics_dt / 4).training_evaluator(), problem.training_evaluator()
+    alone = problem.with_physics_dt(problem.physics_dt / 4).training_evaluator()
+    best = refine(fine, colouring, [Descent(x=centre(problem))], coarse=coarse)[0]
+    expected = refine(alone, colouring, [Descent(x=centre(problem))])[0]
+    torch.testing.assert_close(best.x, expected.x, atol=1e-4, rtol=0)
+    assert coarse.simulated_steps > 0 and fine.simulated_steps < alone.simulated_steps

@@ -24,6 +24,7 @@ from pace_optim.experiment_design.motion_check import (
     summarise,
 )
 from pace_optim.plant import write_truth
+from pace_optim.problem.drive_steps import set_control_step, set_drive_step
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import save_recording
 
@@ -88,8 +89,10 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
     space = ParameterSpace.of(sim2real)
     truth = None if cfg.command_only else true_parameters(sim2real, space, cfg.parameters)
 
+    set_control_step(env_cfg)  # as a fit simulates them
+    physics_dt = set_drive_step(env_cfg) if cfg.physics_dt is None else cfg.physics_dt
     count = len(trajectories)
-    env: Any = make_env(cfg.task, cfg=env_cfg, num_envs=count, physics_dt=cfg.physics_dt, delay_mode=cfg.delay_mode)
+    env: Any = make_env(cfg.task, cfg=env_cfg, num_envs=count, physics_dt=physics_dt, delay_mode=cfg.delay_mode)
     try:
         limits = _limits_of(env)
         design = design_motion(cfg, env, trajectories[0], limits, report) if cfg.optimize else None

@@ -73,6 +73,8 @@ class Optimization:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
+        longest = problem.for_search()
+        self.coarse = longest.training_evaluator() if longest.physics_dt > problem.physics_dt else self.evaluator
         self.searcher = make_searcher(problem.for_search(settings.device), settings)
         self.assessor: Evaluator = problem.evaluator()
         self.processes = processes or Processes()
@@ -91,7 +93,7 @@ class Optimization:
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        every = {self.searcher, self.evaluator, self.assessor}
+        every = {self.searcher, self.coarse, self.evaluator, self.assessor}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
@@ -128,9 +130,7 @@ class Optimization:
         if others:  # resumed
             self.processes.agree(None)
         else:
-            self.descents = [found] = refine(
-                self.evaluator, self.colouring, [found], self._after_iteration, on_beginning=self._on_beginning
-            )
+            self.descents = [found] = self._refine([found])
             others = self._elsewhere(found)
         if others:
             self._try_others(found, others)
@@ -161,15 +161,13 @@ class Optimization:
         """Refine other starts, as far as an interrupted run had not done it yet."""
         self.descents = [found, *others]
         self._write_checkpoint()
-        self.descents = refine(
-            self.evaluator,
-            self.colouring,
-            others,
-            self._after_iteration,
-            found=[found],
-            on_beginning=self._on_beginning,
-        )
+        self.descents = self._refine(others, [found])
         self.searched = self.descents[0] is found
+
+    def _refine(self, starts: Sequence[Descent], found: Sequence[Descent] = ()) -> list[Descent]:
+        return refine(
+            self.evaluator, self.colouring, starts, self._after_iteration, found, self._on_beginning, self.coarse
+        )
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)

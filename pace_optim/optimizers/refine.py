@@ -27,6 +27,7 @@ def refine(
     on_iteration: Callable[[list[Descent]], None] | None = None,
     found: Sequence[Descent] = (),
     on_beginning: Callable[[list[Descent]], None] | None = None,
+    coarse: Evaluator | None = None,
 ) -> list[Descent]:
     """Least squares from several starts; most of the way is gone on a part of each recording, which is cheaper.
 
@@ -37,13 +38,15 @@ def refine(
         on_iteration: Called with all descents after each iteration on the whole recordings.
         found: Descents that have ended: a start that comes into their valley, or stays far above them, is dropped.
         on_beginning: The same on the part of each recording, whose descents are not yet those of the whole.
+        coarse: Simulates that part, at a longer physics step; ``None``: as the whole.
 
     Returns:
         The descents, those that had ended too, the best first.
     """
     descents = list(starts)
     if all(descent.iteration == 0 for descent in descents):
-        descents = _near_their_valleys(evaluator, colouring, [descent.x for descent in descents], on_beginning)
+        vectors = [descent.x for descent in descents]
+        descents = _near_their_valleys(evaluator, coarse or evaluator, colouring, vectors, on_beginning)
         if on_iteration is not None:
             on_iteration([*found, *descents])
     return least_squares(evaluator, colouring, [*found, *descents], on_iteration=on_iteration)
@@ -51,6 +54,7 @@ def refine(
 
 def _near_their_valleys(
     evaluator: Evaluator,
+    coarse: Evaluator,
     colouring: Colouring,
     starts: Sequence[torch.Tensor],
     on_iteration: Callable[[list[Descent]], None] | None,
@@ -59,8 +63,8 @@ def _near_their_valleys(
 
     Ends that are far worse than the best, or next to it, are left out.
     """
-    where = evaluator.dataset.beginning(BEGINNING)
-    ends = [d.x for d in least_squares(evaluator, colouring, starts, COARSE, on_iteration, where)]
+    where = coarse.dataset.beginning(BEGINNING)
+    ends = [d.x for d in least_squares(coarse, colouring, starts, COARSE, on_iteration, where)]
     candidates = torch.stack([*ends, *starts])
     neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
     residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))

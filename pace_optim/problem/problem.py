@@ -198,7 +198,7 @@ def load_problem(
         _raise_armature(each, least_armature(env, [*recordings, *held_out]))
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
-        [recordings, held_out], control_dt, _columns(space, trees), max_duration, tell_on_stderr
+        [recordings, held_out], control_dt, _columns(space, trees), _evaluations(cfg), max_duration, tell_on_stderr
     )
     refuse_open_loops(env, [*recordings, *held_out])
     problem = Problem(
@@ -266,6 +266,11 @@ def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:
     """Parameters whose derivatives take a simulation each: those of one tree are perturbed beside those of others."""
     owners = space.owners(trees)
     return max((owners.count(i) for i in range(len(trees))), default=0) + owners.count(None)
+
+
+def _evaluations(cfg: PaceSim2realEnvCfg) -> int:
+    """Times that accelerations are computed in a control step: a Runge-Kutta step does so four times."""
+    return cfg.decimation * (4 if cfg.sim.integrator == "rk4" else 1)
 
 
 def _configured(

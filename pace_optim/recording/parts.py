@@ -20,6 +20,8 @@ from .keys import MEASURED_SERIES
 
 _NUMBERS = 20_000_000
 """Derivatives that a fit keeps unless it is told otherwise: 0.16 GB."""
+_EVALUATIONS = 200_000_000
+"""Times that a joint's acceleration is computed for them: half a minute of two cores."""
 _COPIES = 4
 """Arrays of that size that there are at once."""
 _LENGTH = 5.0
@@ -34,6 +36,7 @@ def affordable(
     recordings: Sequence[Sequence[Recording]],
     control_dt: float,
     columns: int,
+    evaluations: int,
     max_duration: float | None,
     tell: Callable[[str], None],
 ) -> list[list[Recording]]:
@@ -43,6 +46,7 @@ def affordable(
         recordings: Conformed; those to train on, and those to validate on.
         control_dt: Control step [s].
         columns: Parameters whose derivatives are computed each by itself.
+        evaluations: Of the accelerations in a control step.
         max_duration: How long each may be [s]; ``None``: as long as there are not too many derivatives.
         tell: Is told what was left out.
 
@@ -51,7 +55,8 @@ def affordable(
     """
     every = [recording for group in recordings for recording in group]
     per_second = columns * max((recording.num_joints for recording in every), default=1) / control_dt
-    share = min(1.0, _NUMBERS / max(1.0, per_second * sum(recording.duration for recording in every)))
+    affordable_numbers = min(_NUMBERS, _EVALUATIONS / evaluations)
+    share = min(1.0, affordable_numbers / max(1.0, per_second * sum(recording.duration for recording in every)))
     result: list[list[Recording]] = [[] for _ in recordings]
     for group, kept in zip(recordings, result, strict=True):
         for recording in group:
