@@ -139,8 +139,8 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
 def _finished(run: Optimization, record: EnvironmentRecord, keep_interrupted: bool = True) -> tuple[FitResult, Path]:
     """Search, refine, conclude, write."""
     outcome = run.run(keep_interrupted)
-    run.progress.close()
     result = conclude(run, record, outcome)
+    run.progress.close()
     run.log.log_result(result)
     run.log.close()
     write_report(run.folder.path)

@@ -382,3 +382,12 @@ def test_the_time_left_is_that_of_the_phase(monkeypatch):
     assert "2/10" in out.getvalue() and "100k steps/s  120 s, at most 80 s left" in out.getvalue()
     line.restart()
     assert line.elapsed == 0.0
+
+
+def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, monkeypatch):
+    told = io.StringIO()
+    monkeypatch.setattr("pace_optim.identification.conclusion._LONG", 0.0)
+    settings = FitSettings(task=BENCH, data=[str(save_recording(tmp_path / "r.npz", record()))], log_dir=str(tmp_path))
+    fit(settings, ProgressLine(told))
+    first, checked, _ = told.getvalue().partition("That was the fit; what follows checks it.")
+    assert "error, all joints" in first and "armature" in first and checked

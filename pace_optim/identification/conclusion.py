@@ -13,6 +13,7 @@ from pace_optim.identification.optimization import NEAR, Optimization, Outcome
 from pace_optim.optimizers.jacobian import Jacobian
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
+from pace_optim.run.summary import summary
 from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
@@ -20,6 +21,9 @@ from pace_optim.uncertainty.other_solutions import with_other_solutions
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without, without_delay
 from pace_optim.uncertainty.warnings import fit_warnings
+
+_LONG = 60.0
+"""A fit that took longer tells its result before it is checked [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,17 +66,33 @@ def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> 
     Raises:
         ValueError: If there the simulation diverges.
     """
-    problem, space, data, settings = run.problem, run.problem.space, run.problem.dataset, run.settings
-    end = _settled(run, outcome)
-    every, physical = end.residuals, space.to_physical(end.x)
-    uncertainty = with_other_solutions(end.uncertainty, run.descents, space)
+    end = _reached(run, outcome)
+    if run.progress.elapsed > _LONG and not outcome.is_interrupted:
+        run.progress.tell(f"{summary(_result(run, record, outcome, end))}\nThat was the fit; what follows checks it.")
+    if left_open := undetermined(run.problem, end.uncertainty, end.is_far):
+        end = _with_prior(run, outcome, end, left_open)
+    if not end.is_far and not outcome.is_interrupted:
+        end = _perhaps_without_delay(run, end)
+    space, physical = run.problem.space, run.problem.space.to_physical(end.x)
+    run.folder.write_tensors("best_trajectory.pt", trajectories(run.problem, end.residuals))
+    drives = drive_loads(run.problem, run.assessor, physical[space["encoder_bias"]].numpy())
+    run.folder.write_json("drives.json", drives)
+    result = _result(run, record, outcome, end, _check_consistency(run, outcome, end))
+    result.save(run.folder.path / "result.json")
+    return result
+
+
+def _result(
+    run: Optimization, record: EnvironmentRecord, outcome: Outcome, end: _End, consistency: Consistency | None = None
+) -> FitResult:
+    """What is known so far, as a run keeps it."""
+    problem, data, settings = run.problem, run.problem.dataset, run.settings
+    every, consistency = end.residuals, consistency or Consistency()
     where = {"train": data.train[every.step], "validation": data.validation[every.step]}
     rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
-    run.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
-    run.folder.write_json("drives.json", drive_loads(problem, run.assessor, physical[space["encoder_bias"]].numpy()))
-    score = float(every.error[0].square()[where["train"]].sum(dim=1).mean())
-    consistency = _check_consistency(run, outcome, end, score)
-    result = make_result(
+    uncertainty = with_other_solutions(end.uncertainty, run.descents, problem.space)
+    physical = problem.space.to_physical(end.x)
+    return make_result(
         problem,
         end.x,
         every,
@@ -97,21 +117,14 @@ def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> 
             *consistency.sentences,
         ],
     )
-    result.save(run.folder.path / "result.json")
-    return result
 
 
-def _settled(run: Optimization, outcome: Outcome) -> _End:
-    """Error bars at the end; what the recordings leave open is put to its prior, and a delay that is none to none."""
-    problem, interrupted = run.problem, outcome.is_interrupted
-
-    def known_at(x: torch.Tensor) -> Assessment:
-        return assess(problem, run.assessor, run.colouring, x)
-
-    known = known_at(outcome.x)
+def _reached(run: Optimization, outcome: Outcome) -> _End:
+    """Where the optimizers ended, with error bars."""
+    problem, known = run.problem, _known_at(run, outcome.x)
     run.refuse_divergence(float(known.residuals.score[0]))
     train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)[ALL]
-    end = _End(
+    return _End(
         x=outcome.x,
         uncertainty=known.uncertainty,
         residuals=known.residuals,
@@ -120,22 +133,33 @@ def _settled(run: Optimization, outcome: Outcome) -> _End:
         train_rmse=train,
         times=times_noise(problem, train),
     )
-    left_open = undetermined(problem, end.uncertainty, end.is_far)
-    if left_open:
-        x, left_open = held_at_prior(problem, end.x, end.uncertainty, left_open, None if interrupted else NEAR)
-        end = replace(end.moved(x, known_at(x), left_open, run), left_open=left_open)
-    if not end.is_far and not interrupted:
-        none = without_delay(problem, end.x, end.uncertainty, left_open, NEAR)
-        if none is not None:
-            end = end.moved(none, known_at(none), [*left_open, DELAY], run)
-    return end
 
 
-def _check_consistency(run: Optimization, outcome: Outcome, end: _End, score: float) -> Consistency:
+def _known_at(run: Optimization, x: torch.Tensor) -> Assessment:
+    return assess(run.problem, run.assessor, run.colouring, x)
+
+
+def _with_prior(run: Optimization, outcome: Outcome, end: _End, left_open: list[str]) -> _End:
+    """What the recordings leave open is put to its prior, and the rest fitted again."""
+    run.progress.say(f"fitting again with what the recordings do not determine at its prior: {len(left_open)} values")
+    cfg = None if outcome.is_interrupted else NEAR
+    x, left_open = held_at_prior(run.problem, end.x, end.uncertainty, left_open, cfg)
+    return replace(end.moved(x, _known_at(run, x), left_open, run), left_open=left_open)
+
+
+def _perhaps_without_delay(run: Optimization, end: _End) -> _End:
+    """A delay that is none is put to none."""
+    x = without_delay(run.problem, end.x, end.uncertainty, end.left_open, NEAR)
+    return end if x is None else end.moved(x, _known_at(run, x), [*end.left_open, DELAY], run)
+
+
+def _check_consistency(run: Optimization, outcome: Outcome, end: _End) -> Consistency:
     """Fit each recording alone, where there are several and the optimizer can afford it."""
     wanted = run.settings.check_consistency and run.settings.optimizer != "cmaes"
     if not wanted or outcome.is_interrupted:
         return Consistency()
+    train = run.problem.dataset.train[end.residuals.step]
+    score = float(end.residuals.error[0].square()[train].sum(dim=1).mean())
     result = check_consistency(run.problem, end.x, score, run.progress.say, end.jacobian)
     if result.recordings:
         run.folder.write_json("consistency.json", asdict(result))

@@ -70,6 +70,11 @@ class ProgressLine:
             self._stream.write(text + "\n")
         self._stream.flush()
 
+    def tell(self, text: str) -> None:
+        """Show lines that stay."""
+        self._stream.write(("\n" if self._live else "") + text + "\n")
+        self._stream.flush()
+
     def close(self) -> None:
         """End the line."""
         if self._live:
