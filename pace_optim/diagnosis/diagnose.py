@@ -68,7 +68,7 @@ def diagnose(
         cfg=settings.cfg,
         fits=fits,
     )
-    diagnosis = told(found, fits, settings.cfg, problem, result, folder, candidates)
+    diagnosis = told(found, fits, problem, result, folder, candidates)
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()

@@ -14,7 +14,6 @@ import torch
 from pace_actuators.effects import Effect
 from pace_actuators.files import json_text
 from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.telling.result import Diagnosis
@@ -61,13 +60,13 @@ class Findings:
 def told(
     found: Findings,
     fits: Fits,
-    cfg: DiagnosisCfg,
     problem: Problem,
     run: FitResult,
     folder: Path,
     candidates: Sequence[type[Effect]],
 ) -> Diagnosis:
     """What was found, as ``diagnosis.json`` has it."""
+    cfg = found.outcome.cfg
     return Diagnosis(
         run=str(folder),
         verdict=found.verdict,
