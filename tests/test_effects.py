@@ -325,6 +325,10 @@ def test_gains_torques_and_encoders():
     assert Drive(["torque_offset"], {"torque_offset.effort": -0.7}).one(0.1) == pytest.approx(9.3)
     spring = Drive(["parallel_spring"], {"parallel_spring.stiffness": 5.0, "parallel_spring.rest": 0.1})
     assert spring.one(0.3, q=0.3) == pytest.approx(-5.0 * 0.2)
+    assert spring.one(50.0, q=50.0) == pytest.approx(-5.0 * 49.9)
+    away = Drive(["parallel_spring"], {"parallel_spring.stiffness": -2.0, "parallel_spring.rest": 0.1})
+    assert away.one(0.3, q=0.3) == pytest.approx(2.0 * 0.2)
+    assert away.one(50.0, q=50.0) == pytest.approx(2.0 * math.pi)  # it throws a joint no harder than that
     ripple = Drive(
         ["torque_ripple"], {"torque_ripple.sine": 1.0, "torque_ripple.cosine": 2, "torque_ripple.periods": 7}
     )

@@ -232,6 +232,21 @@ def test_a_policy_is_played_and_filmed_without_a_screen(run, tmp_path, suffix):
         assert Image.open(film).n_frames == 10
 
 
+@pytest.mark.parametrize(
+    ("seconds", "message"),
+    [(1e99, r"--seconds 1e\+99: expected more than 0, at most 3600"), (0.0, "--seconds 0: expected more than 0")],
+)
+def test_nobody_plays_for_ever(run, seconds, message):
+    with pytest.raises(ValueError, match=message):
+        play(PlaySettings(checkpoint=str(run), seconds=seconds))
+
+
+def test_a_film_that_memory_cannot_hold_is_refused(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("pace_actuators.memory.available_memory", lambda: 1e9)
+    with pytest.raises(ValueError, match=r"--video would take .* Give fewer --seconds"):
+        play(PlaySettings(checkpoint=str(run), num_envs=2, seconds=3600.0, video=str(tmp_path / "walk.gif")))
+
+
 def test_the_window_needs_a_screen(run, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

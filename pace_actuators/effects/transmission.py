@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -31,7 +33,11 @@ class TorqueOffset(Effect):
 
 @register_effect
 class ParallelSpring(Effect):
-    """A spring beside the drive, such as a cable or a hose: - k (q - q₀)."""
+    """A spring beside the drive, such as a cable or a hose: - k (q - q₀).
+
+    One that pushes away from its rest (k < 0) does so as at half a turn from there on: else it would throw a joint with
+    a torque that grows without end.
+    """
 
     name = "parallel_spring"
     stage = "transmission"
@@ -49,4 +55,5 @@ class ParallelSpring(Effect):
 
     def transmission(self, s: DriveState) -> None:
         """Pull towards its rest position."""
-        s.effort -= self.stiffness * (s.joint_pos - self.rest)
+        away = s.joint_pos - self.rest
+        s.effort -= self.stiffness * torch.where(self.stiffness < 0, away.clamp(-math.pi, math.pi), away)

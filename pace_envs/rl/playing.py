@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pace_actuators.files import refuse_taken
+from pace_actuators.memory import check_memory
 from pace_envs.rendering import OffscreenRenderer
 from pace_envs.rl.evaluation import Evaluation, evaluate
 from pace_envs.rl.export import EXPORTED, export_policy, exported_files
@@ -22,6 +23,10 @@ from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.velocity import fix_command, play_cfg
 
 _FRAME_EVERY = 2  # environment steps: 25 pictures per second at 50 Hz
+_SIZE = (640, 360)
+"""Of a film's pictures [pixels]."""
+_LONGEST = 3600.0
+"""Of playing [s]."""
 
 
 @dataclass(kw_only=True)
@@ -71,6 +76,8 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
     Raises:
         ValueError: If the checkpoint or the task does not exist, or they do not fit.
     """
+    if not 0.0 < settings.seconds <= _LONGEST:
+        raise ValueError(f"--seconds {settings.seconds:g}: expected more than 0, at most {_LONGEST:g}.")
     if settings.video is not None:
         check_video_path(settings.video)
         refuse_taken([settings.video], option="--video", overwrite=settings.overwrite)
@@ -101,7 +108,7 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
         steps = max(round(settings.seconds / env.unwrapped.step_dt), 1)
         if settings.video is None:
             return evaluate(env, policy, steps)
-        film = _Film(env)
+        film = _Film(env, steps)
         result = evaluate(env, policy, steps, film.step)
         write_video(settings.video, film.frames, 1.0 / (_FRAME_EVERY * env.unwrapped.step_dt))
         film.renderer.close()
@@ -111,8 +118,10 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
 
 
 class _Film:
-    def __init__(self, env: RslRlVecEnvWrapper):
-        self.renderer = OffscreenRenderer(env.unwrapped.sim, 640, 360)
+    def __init__(self, env: RslRlVecEnvWrapper, steps: int):
+        width, height = _SIZE
+        check_memory(3.0 * width * height * (steps // _FRAME_EVERY), "--video", "Give fewer --seconds.")
+        self.renderer = OffscreenRenderer(env.unwrapped.sim, width, height)
         self.frames: list[np.ndarray] = []
         self._steps = 0
 
