@@ -100,14 +100,20 @@ class Plant:
 
 
 def effort_limits(plant: Plant) -> np.ndarray:
-    """Largest torque of each driven joint by its own range or its motor's, (n,) [N m]."""
+    """Largest torque of each driven joint by its own range, its motor's or its servo's force, (n,) [N m]."""
     model = plant.model
     joints = model.dof_jntid[plant.dofs]
     limits = np.where(model.jnt_actfrclimited[joints], model.jnt_actfrcrange[joints, 1], np.inf)
     for i in range(model.nu):
-        if model.actuator_ctrllimited[i] and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
-            most = model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i, 1] * abs(model.actuator_gear[i, 0])
-            limits[joints == model.actuator_trnid[i, 0]] = most
+        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        most = np.inf
+        if model.actuator_ctrllimited[i] and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
+            most = model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i, 1]
+        if model.actuator_forcelimited[i]:
+            most = min(most, model.actuator_forcerange[i, 1])
+        if np.isfinite(most):
+            limits[joints == model.actuator_trnid[i, 0]] = most * abs(model.actuator_gear[i, 0])
     return limits
 
 
@@ -126,16 +132,19 @@ def home_of(full: mujoco.MjModel, model: mujoco.MjModel) -> np.ndarray:
     return home
 
 
-def draw_truth(plant: Plant, joints: tuple[str, ...], kp: np.ndarray, amplitude: np.ndarray, seed: int) -> Truth:
+def draw_truth(
+    plant: Plant, joints: tuple[str, ...], kp: np.ndarray, kd: np.ndarray, amplitude: np.ndarray, seed: int
+) -> Truth:
     """Armature and damping near the file's, friction that the motion overcomes, biases."""
     rng, n, model = np.random.default_rng(seed), len(joints), plant.model
     armature, damping = model.dof_armature[plant.dofs], model.dof_damping[plant.dofs]
     slide = np.array([model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_SLIDE for dof in plant.dofs])
     critical = 2 * np.sqrt(np.maximum(kp, 1e-3) * plant.inertia)
+    undamped = np.where(kd > 0, 0.1, 0.5)  # of the critical damping, where the file gives the joint none
     return Truth(
         joints=joints,
         armature=rng.uniform(0.7, 1.5, n) * np.where(armature > 0, armature, rotor(plant)),
-        viscous_friction=rng.uniform(0.7, 1.5, n) * np.where(damping > 0, damping, 0.1 * critical),
+        viscous_friction=rng.uniform(0.7, 1.5, n) * np.where(damping > 0, damping, undamped * critical),
         friction=rng.uniform(0.05, 0.15, n) * np.minimum(kp * amplitude, effort_limits(plant)),
         encoder_bias=rng.uniform(-1, 1, n) * np.where(slide, 0.001, 0.02),
     )
@@ -160,7 +169,7 @@ def record(path: Path, command: Path, step: float | None, seed: int, hidden: str
     amplitude = np.ptp(target, axis=0) / 2
     own = plant.actuators_of()
     kp, kd = np.array([pair[2:] for pair in own]).T if own else stated_gains(plant)
-    truth = draw_truth(plant, joints, kp, amplitude, seed)
+    truth = draw_truth(plant, joints, kp, kd, amplitude, seed)
     if not own:
         truth = replace(truth, delay=float(np.ceil(LATE / CONTROL_DT - 1e-6) * CONTROL_DT))
     if hidden:

@@ -99,6 +99,16 @@ class ClosedLoops:
             there, other = self._newton(there, self.passive)
         return there if other < gap else here
 
+    def following(self, qpos: np.ndarray) -> np.ndarray:
+        """How all speeds follow from those of the driven joints at a posture (nq,): v = T v_d, (nv, nv).
+
+        Columns of passive joints are of no meaning; one that nothing ties stands still.
+        """
+        jacobian, _ = self._constraints(qpos)
+        result = np.eye(self.model.nv)
+        result[self.passive] = -np.linalg.lstsq(jacobian[:, self.passive], jacobian, rcond=1e-9)[0]
+        return result
+
     def gap(self, qpos: np.ndarray) -> tuple[float, str]:
         """How far the loops of a posture (nq,) are from closed [m or rad], and the worst constraint's name."""
         _, residual = self._constraints(qpos)

@@ -210,6 +210,16 @@ class RobotState:
             speeds[:, place] = speeds[:, place].clamp(-fastest, fastest)
 
     @property
+    def qpos_columns(self) -> torch.Tensor:
+        """Column of each joint in the simulation's positions, (num_joints,)."""
+        return self._layout.qpos_columns
+
+    @property
+    def has_passive_joints(self) -> bool:
+        """Whether joints without drives move too."""
+        return bool(self._layout.passive_names)
+
+    @property
     def closed_loops(self) -> ClosedLoops | None:
         """What closes the robot's kinematic loops; ``None`` where it has none."""
         return self._loops

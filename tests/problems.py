@@ -155,6 +155,7 @@ def make_problem(
         trees=independent_trees(env),
         delay_mode=delay_mode,
         control_dt=DT,
+        passive_joints=env.scene["robot"].has_passive_joints,
     )
     env.close()
     return problem

@@ -5,27 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from closed_chain import FOUR_BAR
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.recording import Recording
-
-FOUR_BAR = """
-<mujoco model="four_bar">
-  <compiler angle="radian"/>
-  <default><joint axis="0 1 0"/><geom type="capsule" size="0.008"/></default>
-  <worldbody>
-    <body><joint name="crank" range="0.3 1.3"/><geom fromto="0 0 0 0 0 0.08"/>
-      <body pos="0 0 0.08"><joint name="coupler"/><geom fromto="0 0 0 0.2 0 0"/><site name="tip" pos="0.2 0 0"/></body>
-    </body>
-    <body pos="0.2 0 0"><joint name="rocker"/><geom fromto="0 0 0 0 0 0.12"/><site name="end" pos="0 0 0.12"/></body>
-  </worldbody>
-  <equality><connect site1="tip" site2="end"/></equality>
-  <actuator><position joint="crank" kp="8" kv="0.2" forcerange="-3 3"/></actuator>
-</mujoco>
-"""
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """A configuration from a model file alone."""
 
+import dataclasses
 import importlib.util
 import re
 import sys
@@ -12,6 +13,7 @@ import torch
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
 from pace_optim.commands.new_robot import main as new_robot
+from pace_optim.problem.parameter_space import ParameterSpace
 
 ARM = """
 <mujoco model="two link arm">
@@ -101,6 +103,20 @@ def test_bounds_scale_with_each_joints_drive(tmp_path):
     upper = cfg.sim2real.bounds_params[:-1, 1].reshape(4, 3)
     assert upper[0, 0] >= 10 * 0.05 > upper[0, 1] and upper[2, 0] > 5 * upper[2, 1]
     assert upper[3].tolist() == pytest.approx([0.1, 0.1, 0.01])
+
+
+def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
+    """In their middle a drive may have more friction than it moves against, which leads a descent astray."""
+    sim2real = cfg_of(tmp_path, ARM).sim2real
+    n, space = len(sim2real.joint_order), ParameterSpace.of(sim2real)
+    expected = 0.1 * sim2real.bounds_params[: 3 * n, 1]
+    start = space.to_physical(space.start)
+    assert start[: 3 * n].tolist() == pytest.approx(expected.tolist())
+    sim2real.bounds_params[0, 0] = 0.5 * sim2real.bounds_params[0, 1]  # such as where the loop is stable
+    raised = ParameterSpace.of(sim2real)
+    assert float(raised.to_physical(raised.start)[0]) == pytest.approx(float(sim2real.bounds_params[0, 0]))
+    with pytest.raises(ValueError, match="start_params names mass"):
+        dataclasses.replace(sim2real, start_params={"mass": 1.0})
 
 
 def test_the_excitation_stays_within_range_and_command_range(tmp_path):
@@ -245,6 +261,8 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
     written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml")
     assert written.sim2real.joint_order == own.sim2real.joint_order
     torch.testing.assert_close(written.sim2real.bounds_params, own.sim2real.bounds_params, rtol=1e-4, atol=1e-9)
+    starts = [ParameterSpace.of(sim2real).start for sim2real in (written.sim2real, own.sim2real)]
+    torch.testing.assert_close(*starts, rtol=1e-4, atol=1e-9)
     for field in ("stiffness", "damping", "effort_limit", "implicit", "control_decimation"):
         assert getattr(drive_of(written), field) == getattr(drive_of(own), field)
     assert (written.sim.dt, written.decimation, written.sim.gravity) == (own.sim.dt, own.decimation, own.sim.gravity)

@@ -10,10 +10,10 @@ from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, re
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints, later_than_most
+from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.single_joint_fits.base_fit import fit_base
+from pace_optim.single_joint_fits.base_fit import fit_base, later_than_most
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.model import BASE
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed_chain import FOUR_BAR
 from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, record
 
 from pace_envs import set_physics_dt
+from pace_envs.from_model import cfg_from_model
 from pace_optim.recording import Load
 from pace_optim.single_joint_model import measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.simulation import _with_friction
@@ -48,14 +50,16 @@ def test_a_joint_without_speed_push_and_friction_stays():
 @pytest.mark.parametrize("payload", [0.0, 0.3])
 def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     """Its drives are told of weight, and not of what their neighbours' accelerations do."""
-    cfg = env_cfg(ANYMAL)
-    problem = make_problem(record(legs_chirp(cfg, 0.5), TRUTH, cfg=cfg), cfg=cfg)
-    whole = problem.with_effects(["load_dependent_friction", "payload"]).with_physics_dt(0.00025)
-    values = {**TRUTH, "load_dependent_friction.coefficient": 0.1, "payload.ratio": payload}
-    physical = whole.space.from_dict(values)
-    path = reference_path(whole, physical, ["payload"])
+    effects, fine = ["load_dependent_friction", "payload"], env_cfg(ANYMAL)
+    set_physics_dt(fine, 0.00025)
+    fine.set_effects(effects)
+    truth = {**TRUTH, "load_dependent_friction.coefficient": 0.1, "payload.ratio": payload}
+    recording = record(legs_chirp(fine, 0.5), truth, cfg=fine)
+    whole = make_problem(recording, cfg=env_cfg(ANYMAL)).with_effects(effects)
+    sought = whole.space.from_dict(truth)
+    path = reference_path(whole.with_physics_dt(0.00025), sought, ["payload"])
     twins = twin_problem(whole, path).with_physics_dt(0.00125)
-    assert float((moved_by(twins, physical) - path.position).abs().max()) < 3e-4
+    assert float((moved_by(twins, sought)[:, 0] - torch.as_tensor(recording.dof_pos)).abs().max()) < 3e-4
 
 
 def test_a_joint_s_own_payload_is_that_of_its_link_alone():
@@ -91,3 +95,72 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     without = moved_by(twin_problem(plain, path).with_physics_dt(0.00025), plain.space.from_dict(truth))
     assert float(apart) < 2e-4
     assert float((without - robot).abs().max()) > 2e-3  # the payload shows
+
+
+def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_be():
+    """A knee that is said to have a thirtieth of its friction moves wrongly, and its thigh would with it."""
+    cfg, fine = env_cfg(ANYMAL), env_cfg(ANYMAL)
+    set_physics_dt(fine, 0.0005)
+    target, names = legs_chirp(cfg, 1.0), cfg.sim2real.joint_order
+    truth = {**TRUTH, "friction": {name: 3.0 if name == "LF_KFE" else 0.1 for name in names}}
+    problem = make_problem(record(target, truth, cfg=fine, noise=1e-4), cfg=cfg).with_physics_dt(0.0005)
+    twins = twin_problem(problem, reference_path(problem, problem.space.from_dict(TRUTH)))
+    moved = moved_by(twins, problem.space.from_dict(truth))[:, 0].numpy()
+    off = np.sqrt(np.mean((moved - record(target, truth, cfg=fine).dof_pos) ** 2, axis=0))
+    assert off[[names.index("LF_HAA"), names.index("LF_HFE")]].max() < 5e-5  # 3e-4 along the wrong knee's motion
+
+
+SPRUNG = FOUR_BAR.replace('"rocker"', '"rocker" stiffness="0.6" springref="0.3" damping="0.02" armature="0.002"')
+
+
+@pytest.mark.parametrize("model", [FOUR_BAR, SPRUNG], ids=["four_bar", "sprung"])
+def test_a_crank_feels_what_follows_it(tmp_path, model):
+    """Inertia, springs and friction of joints without drives, along the loop that they close."""
+    path = tmp_path / "four_bar.xml"
+    path.write_text(model)
+    cfg = env_cfg(lambda: cfg_from_model(path))
+    cfg.scene.robot.init_state.joint_pos = {"crank": 0.8, "(coupler|rocker)": 0.0}
+    truth = {"armature": 0.004, "viscous_friction": 0.05, "friction": 0.04, "encoder_bias": 0.0, "delay": 2.0}
+    target = 0.8 + chirp(2.0, 0.5, 4.0, 0.3)
+    whole = make_problem(record(target, truth, cfg=cfg), cfg=cfg).with_physics_dt(0.00025)
+    assert not whole.joints_stand_alone
+    sought = whole.space.from_dict(truth)
+    twins = twin_problem(whole, reference_path(whole, sought))
+    moved = moved_by(whole, sought)
+    assert float((moved_by(twins, sought) - moved).abs().max()) < 1e-3
+    other = whole.space.from_dict({**truth, "friction": 0.06})  # beside its reference
+    assert float((moved_by(twins, other) - moved_by(whole, other)).abs().max()) < 2e-3
+
+
+def test_effects_of_hinges_are_asked_for_on_a_robot_with_a_slide_too(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0" range="-1 1"/>'
+        '<geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3"/><body pos="0 0 -0.3">'
+        '<joint name="b" type="slide" axis="1 0 0" range="-0.1 0.1"/><geom size="0.03" pos="0.05 0 0"/></body></body>'
+        '</worldbody><actuator><position joint="a" kp="20" kv="1"/><position joint="b" kp="90" kv="4"/></actuator>'
+        "</mujoco>"
+    )
+    cfg = env_cfg(lambda: cfg_from_model(path))
+    cfg.sim2real.slide_joints = ("b",)
+    recording = record(chirp(1.0) * np.array([1.0, 0.1]), {**CALM, "armature": 0.02, "friction": 0.1}, cfg=cfg)
+    whole = make_problem(recording, cfg=cfg)
+    path = reference_path(whole, whole.space.from_dict(CALM), ["com_offset", "payload"])
+    assert float(path.model_effects["com_offset", "angle"].torque[..., 0].abs().max()) > 0.1
+    assert float(path.model_effects["payload", "ratio"].inertia[..., 1].min()) > 0.01
+
+
+def test_a_spring_at_a_joint_acts_on_it_alone_too(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body>'
+        '<joint name="a" axis="0 1 0" range="-1 1" stiffness="6" springref="0.4"/>'
+        '<geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3"/></body></worldbody>'
+        '<actuator><position joint="a" kp="20" kv="1"/></actuator></mujoco>'
+    )
+    cfg = env_cfg(lambda: cfg_from_model(path))
+    truth = {"armature": 0.02, "viscous_friction": 0.1, "friction": 0.1, "encoder_bias": 0.0, "delay": 1.0}
+    whole = make_problem(record(chirp(2.0, 0.5, 4.0, 0.3), truth, cfg=cfg), cfg=cfg).with_physics_dt(0.00025)
+    sought = whole.space.from_dict(truth)
+    for path in (reference_path(whole, sought), measured_path(whole, sought)):
+        assert float((moved_by(twin_problem(whole, path), sought) - moved_by(whole, sought)).abs().max()) < 5e-4

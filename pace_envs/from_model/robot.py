@@ -17,7 +17,7 @@ from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
-from pace_envs.from_model.scaling import base_bounds, gains, motion, runs_continuously, sample_values
+from pace_envs.from_model.scaling import base_bounds, gains, motion, runs_continuously, sample_values, start_values
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -106,6 +106,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     )
     rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
     moves = [motion(joint) for joint in joints]
+    starts = [start_values(joint) for joint in joints]
     samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
@@ -125,6 +126,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
                 scale=tuple(amplitude for _, amplitude in moves),
             ),
             sample_params={**samples, "delay": 2.0},
+            start_params={group: dict(zip(names, [at[group] for at in starts], strict=True)) for group in starts[0]},
             slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
             notes=robot.notes,
         ),
@@ -220,7 +222,7 @@ def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
 def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel) -> str:
     if runs_continuously(joints, model):
         return "the drives' loops run continuously, as MuJoCo holds the file's gains"
-    return "the drives' loops run at the control rate and hold their torque; drive_dt or implicit in a configuration"
+    return "the drives' loops run at the control rate and hold their torque (--drive_dt: a faster loop)"
 
 
 def _folder_name(file: ModelFile) -> str:

@@ -15,6 +15,8 @@ _ACCELERATION, _SLIDE_ACCELERATION = 25.0, 10.0
 """A drive's largest torque over its rotor inertia is above this [rad/s^2] (a slide: [m/s^2])."""
 _OF_EFFORT = 0.2
 """Largest Coulomb friction, as a part of the drive's largest torque."""
+_OF_BOUNDS = 0.1
+"""Where a fit begins, as a part of the upper bounds: from their middle, friction that hides the rest leads astray."""
 _SEEN_BY_FILE = 10.0
 """How much larger than the file says a parameter may be."""
 _SAFE = 0.7
@@ -78,6 +80,12 @@ def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
         "friction": (0.0, friction),
         "encoder_bias": (-bias, bias),
     }
+
+
+def start_values(joint: JointFacts) -> dict[str, float]:
+    """Where a fit begins: the bounds are what a drive may have at most, and most have a small part of it."""
+    bounds = base_bounds(joint)
+    return {group: _OF_BOUNDS * bounds[group][1] for group in ("armature", "viscous_friction", "friction")}
 
 
 def motion(joint: JointFacts) -> tuple[float, float]:

@@ -83,6 +83,10 @@ def env_cfg() -> PaceSim2realEnvCfg:
                 scale=tuple(column(5)),
             ),
             sample_params={sample},
+            start_params={{  # of a fit: a tenth of the upper bounds
+                group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
+                for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
+            }},
         ),
     )
 

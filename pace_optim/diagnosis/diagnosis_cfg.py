@@ -9,16 +9,6 @@ from pace_optim.single_joint_fits.fitting_cfg import FittingCfg
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeginningCfg:
-    """The base model that everything is held against."""
-
-    late: float = 0.2
-    """A joint is late that is so many control steps later than the median, ..."""
-    scatters: float = 6.0
-    """and so many times the joints' scatter."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class CandidatesCfg:
     """Which effects are refitted, and from where."""
 
@@ -115,7 +105,6 @@ class DiagnosisCfg:
     """A diagnosis' numbers, and which of its moves are made."""
 
     fitting: FittingCfg = field(default_factory=FittingCfg)
-    beginning: BeginningCfg = field(default_factory=BeginningCfg)
     candidates: CandidatesCfg = field(default_factory=CandidatesCfg)
     judging: JudgingCfg = field(default_factory=JudgingCfg)
     verdict: VerdictCfg = field(default_factory=VerdictCfg)

@@ -53,6 +53,8 @@ class Problem:
     """What the recordings' torques say of the drives."""
     unknown: tuple[str, ...] = ()
     """Facts of the drives that are identified because nobody knows them."""
+    passive_joints: bool = False
+    """Whether joints without drives move too."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -83,7 +85,7 @@ class Problem:
     @property
     def joints_stand_alone(self) -> bool:
         """Whether no joint moves another."""
-        return max(len(tree) for tree in self.trees) == 1
+        return not self.passive_joints and max(len(tree) for tree in self.trees) == 1
 
     def make_env(self, num_envs: int, simulation: Callable[..., Simulation] | None = None) -> ManagerBasedRLEnv:
         """Build the environment.
@@ -213,6 +215,7 @@ def load_problem(
         measured=measured,
         unknown=unknown,
         contradictions=_contradictions(env, [*recordings, *held_out]),
+        passive_joints=env.scene["robot"].has_passive_joints,
     )
     env.close()
     return problem

@@ -10,6 +10,7 @@ from pace_actuators.effects import Effect
 from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.fitting_cfg import DEFAULT, FittingCfg
 from pace_optim.single_joint_fits.model import BASE, JointModel
 from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -37,10 +38,10 @@ def fit_base(
     """
     fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
     names = [effect.name for effect in effects if effect.overrides("write_model")]
-    along = measured_path if problem.joints_stand_alone else reference_path
-    twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
-    if along is measured_path and float(fitted.score.max()) > fits.cfg.away**2:
-        twins, fitted = _fit_along(fits, problem, fitted, reference_path, names, say)
+    alone = problem.joints_stand_alone
+    twins, fitted = _fit_along(fits, problem, fitted, alone, names, say)
+    if alone and float(fitted.score.max()) > fits.cfg.away**2:
+        twins, fitted = _fit_along(fits, problem, fitted, False, names, say)
     armature = fitted.physical[:, BASE.index("armature")]
     return twins, fitted, twins.path.typical_effort(armature)
 
@@ -49,14 +50,27 @@ def _fit_along(
     fits: Fits,
     problem: Problem,
     fitted: Fitted,
-    along: Callable[[Problem, torch.Tensor, Sequence[str]], ReferencePath],
+    alone: bool,
     model_effects: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[TwinProblem, Fitted]:
-    """The joints along a reference that follows the model, and the model fitted there."""
+    """The joints along a reference that follows the model, and the model fitted there.
+
+    Args:
+        fits: Fits models.
+        problem: The whole robot.
+        fitted: Where to begin.
+        alone: Whether the reference is the measured motion itself.
+        model_effects: Effects whose influence on the rigid bodies is wanted.
+        say: Shows how far it is.
+    """
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
-        return along(of, whole_vector(of, fitted.physical), model_effects)
+        vector = whole_vector(of, fitted.physical)
+        if alone:
+            return measured_path(of, vector, model_effects)
+        late = later_than_most(fitted.physical[:, BASE.index("delay")], cfg=fits.cfg)
+        return reference_path(of, vector, model_effects, late=late)
 
     cfg = fits.cfg
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
@@ -68,6 +82,18 @@ def _fit_along(
             break
     twins = twin_problem(problem, path(problem, model_effects))
     return twins, fits.to_whole(twins, fits.side_by_side(twins.in_windows(), [fitted], cfg.again))[0]
+
+
+def later_than_most(delay: torch.Tensor, *, cfg: FittingCfg = DEFAULT) -> torch.Tensor:
+    """Joints that are later than the delay that most joints have, (n,) bool; nobody knows it of one joint or two.
+
+    Args:
+        delay: Of each joint, (n,) [control steps].
+        cfg: From when on a joint is late.
+    """
+    behind = delay - delay.median()
+    scatter = behind.abs().median()
+    return (behind > max(cfg.late, cfg.scatters * float(scatter))) & (len(delay) > 2)
 
 
 def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:

@@ -47,6 +47,10 @@ class FittingCfg:
     [rad]: then gravity is not linear in between."""
     near: float = 0.01
     """With effects its reference is renewed unless it is this near (RMS) [rad]."""
+    late: float = 0.2
+    """A joint is late that is so many control steps later than the median, ..."""
+    scatters: float = 6.0
+    """and so many times the joints' scatter."""
     block_s: float = 1.0
     """Length of a block of held-out samples [s]; shorter where that gives fewer than ``blocks``, ..."""
     shortest_s: float = 0.25

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +13,10 @@ import torch
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
-from pace_optim.recording.dataset import Dataset
+from pace_optim.single_joint_model.feel import JointLoad, Links, Motion
+from pace_optim.single_joint_model.measured_motion import at_every_step, beside_simulation
 
 if TYPE_CHECKING:
-    from pace_envs import ManagerBasedEnv
     from pace_optim.problem.rollout import Rollout
 
 _STEP = 1e-4
@@ -25,30 +25,6 @@ _STIFFNESS_EVERY = 8
 """The derivative of the torque varies slowly: it is computed at every so many control steps."""
 _SPAN = 0.02
 """Accelerations are differences of slopes over so much time before and after [s]: measured positions have noise."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class JointLoad:
-    """What each joint feels in the interval after a control step: (T, R, n) each."""
-
-    inertia: torch.Tensor
-    """Rigid-body inertia, without armature [kg m²]."""
-    torque: torch.Tensor
-    """Torque of gravity and of the other joints' motion [N m]."""
-    load: torch.Tensor
-    """The same without what the other joints' accelerations do: what a robot's drives are told of their load [N m]."""
-
-    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
-        """The same change of each."""
-        return JointLoad(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
-
-    def less(self, other: JointLoad, times: torch.Tensor) -> JointLoad:
-        """This less a multiple of another."""
-        return JointLoad(
-            inertia=self.inertia - times * other.inertia,
-            torque=self.torque - times * other.torque,
-            load=self.load - times * other.load,
-        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,27 +110,46 @@ class ReferencePath:
         )
 
 
-def reference_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
+def reference_path(
+    problem: Problem,
+    physical: torch.Tensor,
+    model_effects: Sequence[str] = (),
+    late: torch.Tensor | None = None,
+) -> ReferencePath:
     """Simulate a candidate on all recordings, and compute what each joint feels on its way.
+
+    Where the robot was measured elsewhere, joints are taken there: what a joint's neighbours do to it is what they did,
+    not what the candidate lets them do.
 
     Args:
         problem: The problem; its own effects count too.
         physical: The candidate's physical parameters, (size,).
         model_effects: Effects on the rigid-body model whose influence is wanted.
+        late: Joints that are not taken there, (n,) bool: it may be their log that is late. ``None``: no joint.
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
-    robot, positions, velocities = rollout.robot, [], []
-    for _ in rollout.simulated(rollout.duration_steps):
-        positions.append(robot.data.joint_pos.clone())
-        velocities.append(robot.data.joint_vel.clone())
-    return _along(problem, values, model_effects, rollout, torch.stack(positions), torch.stack(velocities))
+    sim, positions, speeds = rollout.env.sim, [], []
+
+    def noted(steps: int) -> Iterator[torch.Tensor]:
+        for shown in rollout.simulated(steps):
+            positions.append(sim.qpos.clone())
+            speeds.append(sim.qvel.clone())
+            yield shown
+
+    shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
+    steps = len(shown)
+    motion = torch.stack(positions[:steps]), torch.stack(speeds[:steps])
+    beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
+    if late is not None:
+        beside[..., late] = 0.0
+    return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
 
 
 def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
     """What each joint feels along the measured motion, straight between samples.
 
-    For robots whose joints have no neighbours: what those feel depends on their position only.
+    For robots whose joints have no neighbours, and all have drives: what those feel depends on their position only.
 
     Args:
         problem: The problem, without effects.
@@ -162,29 +157,48 @@ def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Seque
         model_effects: Effects on the rigid-body model whose influence is wanted.
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
-    bias = torch.tensor([values["encoder_bias"][name] for name in problem.joint_names], dtype=torch.float64)
     rollout = _begun(problem, values)
-    position = bias + _at_every_step(problem.dataset, rollout.duration_steps)
-    return _along(problem, values, model_effects, rollout, position, torch.zeros_like(position))
+    sim, steps = rollout.env.sim, rollout.duration_steps
+    positions, speeds = sim.qpos.repeat(steps, 1, 1), torch.zeros(steps, *sim.qvel.shape, dtype=torch.float64)
+    positions[..., rollout.robot.qpos_columns] = _biases(problem, values) + at_every_step(
+        problem.dataset, problem.dataset.measured.numpy(), steps
+    )
+    return _along(problem, values, model_effects, rollout, positions, speeds)
+
+
+def _biases(problem: Problem, values: dict[str, dict[str, float]]) -> torch.Tensor:
+    """Encoder biases of a candidate, (n,) [rad]."""
+    return torch.tensor([values["encoder_bias"][name] for name in problem.joint_names], dtype=torch.float64)
+
+
+def _taken(
+    rollout: Rollout, positions: torch.Tensor, speeds: torch.Tensor, beside: torch.Tensor, dt: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A motion with its driven joints moved by (T, R, n) [rad]; those without drives follow."""
+    robot = rollout.robot
+    faster = torch.gradient(beside, spacing=dt, dim=0)[0]
+    if robot.closed_loops is None:
+        positions[..., robot.qpos_columns] += beside
+        speeds[..., robot.dof_columns] += faster
+        return positions, speeds
+    model, columns, moved = rollout.env.sim.model, robot.dof_columns.numpy(), np.empty(positions.shape[-1])
+    for k, r in np.ndindex(positions.shape[:2]):
+        moved[:] = positions[k, r]
+        follow = robot.closed_loops.following(moved)[:, columns]
+        mujoco.mj_integratePos(model, moved, follow @ beside[k, r].numpy(), 1.0)
+        positions[k, r] = torch.from_numpy(moved)
+        speeds[k, r] += torch.from_numpy(follow @ faster[k, r].numpy())
+    return positions, speeds
 
 
 def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
     """One candidate at the beginning of all recordings."""
-    rollout = problem.evaluator().rollout(1)
-    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
+    rollout, space = problem.evaluator().rollout(1), problem.space
+    own = {
+        p.name: {key: values[p.name][key] for key in p.keys} for p in space.parameters
+    }  # some mean nothing on slides
+    rollout.start(space.from_dict(own)[None], problem.dataset.sampled)
     return rollout
-
-
-def _at_every_step(dataset: Dataset, count: int) -> torch.Tensor:
-    """Measured positions at control steps, (count, R, n), straight between samples and held after the last."""
-    steps, measured = np.arange(count), dataset.measured.numpy()
-    result = np.empty((count, *measured.shape[1:]))
-    for r in range(dataset.num_recordings):
-        at = dataset.sampled[:, r].nonzero()[:, 0].numpy()
-        taken = at if dataset.sample_offset is None else at + dataset.sample_offset[at, r].numpy()
-        for j in range(measured.shape[2]):
-            result[:, r, j] = np.interp(steps, taken, measured[at, r, j])
-    return torch.from_numpy(result)
 
 
 def _along(
@@ -192,16 +206,14 @@ def _along(
     values: dict[str, dict[str, float]],
     model_effects: Sequence[str],
     rollout: Rollout,
-    q: torch.Tensor,
-    v: torch.Tensor,
+    positions: torch.Tensor,
+    speeds: torch.Tensor,
 ) -> ReferencePath:
-    """What each joint feels along a motion, (T, R, n) [rad] and [rad/s]; closes the rollout's environment."""
-    middle_q, middle_v = 0.5 * (q[:-1] + q[1:]), 0.5 * (v[:-1] + v[1:])
-    motion = (middle_q, middle_v, (v[1:] - v[:-1]) / problem.control_dt)
-    models = _models(rollout.env)
-    columns = rollout.robot.dof_columns.numpy()
-    whole = feel = _feel(models, columns, *motion)
-    stiffness = _stiffness(models, columns, problem, *motion)
+    """What each joint feels along a motion of all, (T, R, nq) and (T, R, nv); closes the rollout's environment."""
+    motion = Motion.between(positions, speeds, problem.control_dt)
+    links = Links.of(rollout.env)
+    whole = feel = links.feel(motion)
+    stiffness = _stiffness(links, problem, motion)
     changes = {}
     for name in model_effects:
         for parameter in get_effect(name).parameters:
@@ -211,11 +223,11 @@ def _along(
             changes[name, parameter.name] = change
     rollout.env.close()
     return ReferencePath(
-        position=q,
+        position=positions[..., rollout.robot.qpos_columns],
         feel=feel,
         stiffness=stiffness,
         model_effects=changes,
-        columns=torch.as_tensor(columns),
+        columns=rollout.robot.dof_columns,
         control_dt=problem.control_dt,
     )
 
@@ -236,62 +248,14 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _models(env: ManagerBasedEnv) -> list[mujoco.MjModel]:
-    """The model of each recording's load; without armature, which the twins have of their own."""
-    env.sim.forward()
-    models = [env.sim.batch.get_model(r, None) for r in range(env.num_envs)]
-    for model in models:
-        model.dof_armature[:] = 0.0
-    return models
-
-
-def _feel(
-    models: Sequence[mujoco.MjModel],
-    columns: np.ndarray,
-    q: torch.Tensor,
-    v: torch.Tensor,
-    a: torch.Tensor,
-) -> JointLoad:
-    """Inertia of each joint, and the torque that the rest of the robot leaves on it, -(bias_j + Σ_{k≠j} M_jk a_k)."""
-    steps, count, n = q.shape
-    own_block = np.ix_(columns, columns)
-    inertia, torque, load = (np.empty((steps, count, n)) for _ in range(3))
-    for r, model in enumerate(models):
-        data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-        data.qpos[:] = model.qpos0
-        addresses = model.jnt_qposadr[model.dof_jntid[columns]]
-        positions, speeds, accelerations = q[:, r].numpy(), v[:, r].numpy(), a[:, r].numpy()
-        for k in range(steps):
-            data.qpos[addresses], data.qvel[columns] = positions[k], speeds[k]
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            mujoco.mj_fullM(model, data, mass)
-            own = mass[own_block]
-            diagonal = own.diagonal()
-            inertia[k, r] = diagonal
-            load[k, r] = -data.qfrc_bias[columns]
-            torque[k, r] = load[k, r] - (own @ accelerations[k] - diagonal * accelerations[k])
-    return JointLoad(inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load))
-
-
-def _stiffness(
-    models: Sequence[mujoco.MjModel],
-    columns: np.ndarray,
-    problem: Problem,
-    q: torch.Tensor,
-    v: torch.Tensor,
-    a: torch.Tensor,
-) -> torch.Tensor:
+def _stiffness(links: Links, problem: Problem, motion: Motion) -> torch.Tensor:
     """Derivative of f_j - M_j a_j by the joint's own position, the i-th joint of each tree at once."""
-    some = slice(None, None, _STIFFNESS_EVERY)
-    q, v, a = q[some], v[some], a[some]
-    at = _feel(models, columns, q, v, a)
-    result = torch.zeros_like(q)
+    motion = motion.every(_STIFFNESS_EVERY)
+    at, acceleration = links.feel(motion), motion.qacc[..., links.columns]
+    result = torch.zeros_like(at.torque)
     for moved in _one_of_each_tree(problem):
-        shifted = q.clone()
-        shifted[..., moved] += _STEP
-        there = _feel(models, columns, shifted, v, a)
-        change = (there.torque - at.torque) - (there.inertia - at.inertia) * a
+        there = links.feel(motion.moved(links.shifts(motion, moved, _STEP)))
+        change = (there.torque - at.torque) - (there.inertia - at.inertia) * acceleration
         result[..., moved] = change[..., moved] / _STEP
     return result.repeat_interleave(_STIFFNESS_EVERY, dim=0)
 
@@ -309,7 +273,7 @@ def _change(
     effect: str,
     parameter: str,
     now: torch.Tensor,
-    motion: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    motion: Motion,
     whole: JointLoad,
 ) -> JointLoad:
     """What a unit of a parameter of an effect on the model changes of each joint's own feel.
@@ -324,7 +288,7 @@ def _change(
         values = now.clone()
         values[moved] = other[moved]
         robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
-        there = _feel(_models(rollout.env), robot.dof_columns.numpy(), *motion)
+        there = Links.of(rollout.env).feel(motion)
         for field in ("inertia", "torque", "load"):
             change = (getattr(there, field) - getattr(whole, field)) / (other - now)
             getattr(result, field)[..., moved] = change[..., moved]

@@ -75,7 +75,8 @@ def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:
         problem: The problem of the whole robot.
         path: A reference simulation on the same recordings.
     """
-    return _with_path(problem, path)
+    plain, cfg = problem.plain_cfg.of_driven_joints(), problem.env_cfg.of_driven_joints()
+    return _with_path(replace(problem, plain_cfg=plain, env_cfg=cfg), path)
 
 
 def _with_path(problem: Problem, path: ReferencePath) -> TwinProblem:

@@ -79,6 +79,9 @@ class PaceCfg:
     sample_params: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
     """The true parameters of simulated recordings, by name: a number, or a number per joint."""
 
+    start_params: Mapping[str, float | Mapping[str, float]] = field(default_factory=dict)
+    """Where a fit begins, by name: a number, or a number per joint; in the middle of the bounds without."""
+
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects identified beside the base parameters: ``"name"``, ``"name@joints"`` or ``"name@shared"``."""
 
@@ -114,6 +117,10 @@ class PaceCfg:
             raise ValueError(
                 f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
                 f"for each of the {len(self.joint_order)} joints in joint_order, then the delay."
+            )
+        if unknown := sorted(set(self.start_params) - {*PARAMETER_GROUPS, "delay"}):
+            raise ValueError(
+                f"start_params names {', '.join(unknown)}. Available: {', '.join(PARAMETER_GROUPS)}, delay."
             )
         low, high = self.friction_ratio_bounds
         if not 0 <= low < high <= 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -87,6 +88,19 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         self.sim2real.effects = tuple(cfgs)
         for drive in self.scene.robot.actuators.values():
             drive.effects = tuple(cfgs)
+
+    def of_driven_joints(self) -> PaceSim2realEnvCfg:
+        """The same, with nothing said of where joints without drives begin."""
+        robot, names = self.scene.robot, self.sim2real.joint_order
+        if not isinstance(robot.init_state.joint_pos, Mapping):
+            return self
+        own = {
+            pattern: value
+            for pattern, value in robot.init_state.joint_pos.items()
+            if any(re.fullmatch(pattern, name) for name in names)
+        }
+        robot = dataclasses.replace(robot, init_state=dataclasses.replace(robot.init_state, joint_pos=own))
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, robot=robot))
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceSim2realEnvCfg:
         """The same for some of the joints: the drives of the others, effects and terms of one's own are left out."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -112,6 +112,7 @@ def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             upper=tuple(bounds[i * n : (i + 1) * n, 1].tolist()),
             apply=apply[name],
             keys=joints,
+            start=_start(cfg, name, bounds[i * n : (i + 1) * n]),
             units=_units(UNITS[name], joints, cfg),
         )
         for i, name in enumerate(PARAMETER_GROUPS)
@@ -124,9 +125,19 @@ def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
         upper=(high,),
         apply=apply["delay"],
         keys=(GLOBAL,),
+        start=_start(cfg, "delay", bounds[-1:]),
         per_joint_copies=True,
     )
     return (*result, delay)
+
+
+def _start(cfg: PaceCfg, name: str, bounds: torch.Tensor) -> tuple[float, ...] | None:
+    """Where a base parameter begins, within its bounds (keys, 2); ``None``: in their middle."""
+    if name not in cfg.start_params:
+        return None
+    given = cfg.start_params[name]
+    values = [given[joint] for joint in cfg.joint_order] if isinstance(given, Mapping) else [given] * len(bounds)
+    return tuple(min(max(value, low), high) for value, (low, high) in zip(values, bounds.tolist(), strict=True))
 
 
 def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:

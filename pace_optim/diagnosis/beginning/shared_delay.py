@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, BeginningCfg, DiagnosisCfg
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+from pace_optim.single_joint_fits.base_fit import later_than_most
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE
@@ -35,7 +36,7 @@ def hold_late_joints(
     if not cfg.has("late_joints"):
         return base, []
     delay = base.physical[:, _DELAY]
-    late = later_than_most(delay, cfg=cfg.beginning)
+    late = later_than_most(delay, cfg=cfg.fitting)
     while bool(late.any()):
         held = _held(fits, twins, base, late, delay.median())
         with_one, with_own = (errors.mse for errors in fits.validation_errors(twins, [held, base]))
@@ -43,18 +44,6 @@ def hold_late_joints(
             return held, [_sentence(twins, delay, late)]
         late = only_late
     return base, []
-
-
-def later_than_most(delay: torch.Tensor, *, cfg: BeginningCfg = DEFAULT.beginning) -> torch.Tensor:
-    """Joints that are later than the delay that most joints have, (n,) bool; nobody knows it of one joint or two.
-
-    Args:
-        delay: Of each joint, (n,) [control steps].
-        cfg: From when on a joint is late.
-    """
-    behind = delay - delay.median()
-    scatter = behind.abs().median()
-    return (behind > max(cfg.late, cfg.scatters * float(scatter))) & (len(delay) > 2)
 
 
 def _held(fits: Fits, twins: TwinProblem, base: Fitted, joints: torch.Tensor, delay: torch.Tensor) -> Fitted:

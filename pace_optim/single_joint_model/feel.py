@@ -1,0 +1,138 @@
+"""What each joint feels along a motion of the whole robot: joints without drives follow through their constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from pace_envs import ManagerBasedEnv
+from pace_envs.closed_loops import ClosedLoops
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointLoad:
+    """What each joint feels in the interval after a control step: (T, R, n) each."""
+
+    inertia: torch.Tensor
+    """Rigid-body inertia, without armature [kg m²]."""
+    torque: torch.Tensor
+    """Torque of gravity, of springs, and of the other joints' motion [N m]."""
+    load: torch.Tensor
+    """The same without what the other joints' accelerations do: what a robot's drives are told of their load [N m]."""
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
+        """The same change of each."""
+        return JointLoad(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
+
+    def less(self, other: JointLoad, times: torch.Tensor) -> JointLoad:
+        """This less a multiple of another."""
+        return JointLoad(
+            inertia=self.inertia - times * other.inertia,
+            torque=self.torque - times * other.torque,
+            load=self.load - times * other.load,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """A motion of the whole robot in the intervals between control steps, passive joints too."""
+
+    qpos: torch.Tensor
+    """In the middle of each interval, (T, R, nq)."""
+    qvel: torch.Tensor
+    """There, (T, R, nv)."""
+    qacc: torch.Tensor
+    """In it, (T, R, nv)."""
+
+    @classmethod
+    def between(cls, qpos: torch.Tensor, qvel: torch.Tensor, dt: float) -> Motion:
+        """The motion between control steps, of positions (T, R, nq) and speeds (T, R, nv) at them.
+
+        Args:
+            qpos: Positions.
+            qvel: Speeds.
+            dt: Control step [s].
+        """
+        middle, speed = 0.5 * (qpos[:-1] + qpos[1:]), 0.5 * (qvel[:-1] + qvel[1:])
+        return cls(qpos=middle, qvel=speed, qacc=(qvel[1:] - qvel[:-1]) / dt)
+
+    def every(self, steps: int) -> Motion:
+        """One interval in so many."""
+        return Motion(qpos=self.qpos[::steps], qvel=self.qvel[::steps], qacc=self.qacc[::steps])
+
+    def moved(self, by: torch.Tensor) -> Motion:
+        """With other positions, by (T, R, nq)."""
+        return replace(self, qpos=self.qpos + by)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Links:
+    """The rigid bodies of a robot, one model for each recording's load, and the degrees of freedom that are driven."""
+
+    models: Sequence[mujoco.MjModel]
+    columns: np.ndarray
+    """The driven joints' degrees of freedom, (n,)."""
+    loops: ClosedLoops | None
+    """What passive joints follow."""
+
+    @classmethod
+    def of(cls, env: ManagerBasedEnv) -> Links:
+        """Of an environment as it is; without what drives have of their own, armature and viscous friction."""
+        robot = env.scene["robot"]
+        columns = robot.dof_columns.numpy()
+        env.sim.forward()
+        models = [env.sim.batch.get_model(r, None) for r in range(env.num_envs)]
+        for model in models:
+            model.dof_armature[columns] = model.dof_damping[columns] = 0.0
+        return cls(models=models, columns=columns, loops=robot.closed_loops)
+
+    def feel(self, motion: Motion) -> JointLoad:
+        """Inertia of each joint, and the torque that the rest of the robot leaves on it.
+
+        With the speeds of all degrees of freedom v = T v_d of those of the driven joints, bias b and passive torques s
+        (springs, the friction of joints without drives):
+
+            I_j = (T' M T)_jj,    f_j = I_j a_j - [T' (M a + b - s)]_j
+        """
+        shape = (*motion.qpos.shape[:2], len(self.columns))
+        inertia, torque, load = (np.empty(shape) for _ in range(3))
+        for r, model in enumerate(self.models):
+            data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+            for k in range(shape[0]):
+                data.qpos[:], data.qvel[:] = motion.qpos[k, r], motion.qvel[k, r]
+                mujoco.mj_fwdPosition(model, data)
+                mujoco.mj_fwdVelocity(model, data)
+                mujoco.mj_fullM(model, data, mass)
+                acceleration = motion.qacc[k, r].numpy()
+                missing = mass @ acceleration + data.qfrc_bias - data.qfrc_passive
+                load[k, r] = -data.qfrc_bias[self.columns]
+                if self.loops is None:
+                    inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]
+                else:
+                    follow = self.loops.following(data.qpos)[:, self.columns]
+                    inertia[k, r], missing = np.einsum("ij,ik,kj->j", follow, mass, follow), follow.T @ missing
+                torque[k, r] = inertia[k, r] * acceleration[self.columns] - missing
+        return JointLoad(
+            inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load)
+        )
+
+    def shifts(self, motion: Motion, joints: Sequence[int], by: float) -> torch.Tensor:
+        """What moves when some of the driven joints move, one of each tree, (T, R, nq)."""
+        result = torch.zeros_like(motion.qpos)
+        model = self.models[0]
+        places = model.jnt_qposadr[model.dof_jntid[self.columns[list(joints)]]]
+        if self.loops is None:
+            result[..., places] = by
+            return result
+        step, moved = np.zeros(model.nv), np.empty(model.nq)
+        for k in range(result.shape[0]):
+            for r in range(result.shape[1]):
+                moved[:] = motion.qpos[k, r]
+                step[:] = by * self.loops.following(moved)[:, self.columns[list(joints)]].sum(axis=1)
+                mujoco.mj_integratePos(model, moved, step, 1.0)
+                result[k, r] = torch.from_numpy(moved) - motion.qpos[k, r]
+        return result
