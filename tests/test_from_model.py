@@ -250,6 +250,15 @@ def test_missing_meshes_and_pictures_are_left_out_and_inertias_kept(tmp_path):
     env.close()
 
 
+def test_where_no_mass_is_left_the_missing_meshes_are_told(tmp_path):
+    only = '<mujoco><asset><mesh name="arm" file="gone.stl"/></asset><worldbody><body><joint name="j"/>'
+    only += (
+        '<geom type="mesh" mesh="arm"/></body></worldbody><actuator><position joint="j" kp="1"/></actuator></mujoco>'
+    )
+    with pytest.raises(ValueError, match=r"cannot compile .*mass.* 1 mesh files are missing \(gone.stl\).*Put them"):
+        cfg_of(tmp_path, only)
+
+
 def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, monkeypatch, capsys):
     (tmp_path / "robot.xml").write_text(ARM)
     output = tmp_path / "conf" / "my_arm.py"

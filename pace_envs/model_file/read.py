@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,8 +70,13 @@ def read_model_file(path: str | Path) -> ModelFile:
     return ModelFile(path=path, spec=spec, notes=tuple(notes), urdf=facts)
 
 
-def compile_model(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
+def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = ()) -> mujoco.MjModel:
     """Compile a model, whose file messages name.
+
+    Args:
+        spec: The model.
+        path: Its file.
+        notes: What was left out of it, which may be why it cannot be compiled.
 
     Raises:
         ValueError: If MuJoCo cannot, or a value is not a number.
@@ -78,7 +84,8 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path) -> mujoco.MjModel:
     try:
         model = spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile {path}: {error}") from None
+        needed = " Put them where the file looks for them." if notes else ""
+        raise ValueError(" ".join([f"MuJoCo cannot compile {path}: {error}", *notes]) + needed) from None
     values = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
     bad = [n for n, v in values.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f" and np.isnan(v).any()]
     if bad:
