@@ -85,7 +85,9 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = 
         model = spec.compile()
     except ValueError as error:
         needed = " Put them where the file looks for them." if notes else ""
-        raise ValueError(" ".join([f"MuJoCo cannot compile {path}: {error}", *notes]) + needed) from None
+        raise ValueError(
+            " ".join([f"MuJoCo cannot compile {path}: {error}{'.' * bool(notes)}", *notes]) + needed
+        ) from None
     values = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
     bad = [n for n, v in values.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f" and np.isnan(v).any()]
     if bad:
