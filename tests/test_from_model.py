@@ -253,7 +253,7 @@ def test_missing_meshes_and_pictures_are_left_out_and_inertias_kept(tmp_path):
 def test_where_no_mass_is_left_the_missing_meshes_are_told(tmp_path):
     only = '<mujoco><asset><mesh name="arm" file="gone.stl"/></asset><worldbody><body><joint name="j"/>'
     only += '<geom type="mesh" mesh="arm"/></body></worldbody></mujoco>'
-    with pytest.raises(ValueError, match=r"(?s)cannot compile .*mass.*missing \(gone.stl\).*Put what"):
+    with pytest.raises(ValueError, match=r"(?s)cannot compile .*mass.*missing \(gone.stl\).*Put them"):
         cfg_of(tmp_path, only)
 
 
