@@ -38,10 +38,10 @@ def fit_base(
     """
     fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
     names = [effect.name for effect in effects if effect.overrides("write_model")]
-    alone = problem.joints_stand_alone
-    twins, fitted = _fit_along(fits, problem, fitted, alone, names, say)
-    if alone and float(fitted.score.max()) > fits.cfg.away**2:
-        twins, fitted = _fit_along(fits, problem, fitted, False, names, say)
+    along = measured_path if problem.joints_stand_alone else reference_path
+    twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
+    if along is measured_path and float(fitted.score.max()) > fits.cfg.away**2:
+        twins, fitted = _fit_along(fits, problem, fitted, reference_path, names, say)
     armature = fitted.physical[:, BASE.index("armature")]
     return twins, fitted, twins.path.typical_effort(armature)
 
@@ -50,7 +50,7 @@ def _fit_along(
     fits: Fits,
     problem: Problem,
     fitted: Fitted,
-    alone: bool,
+    along: Callable[..., ReferencePath],
     model_effects: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[TwinProblem, Fitted]:
@@ -60,17 +60,15 @@ def _fit_along(
         fits: Fits models.
         problem: The whole robot.
         fitted: Where to begin.
-        alone: Whether the reference is the measured motion itself.
+        along: Makes the reference: ``measured_path`` or ``reference_path``.
         model_effects: Effects whose influence on the rigid bodies is wanted.
         say: Shows how far it is.
     """
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
-        vector = whole_vector(of, fitted.physical)
-        if alone:
-            return measured_path(of, vector, model_effects)
         late = later_than_most(fitted.physical[:, BASE.index("delay")], cfg=fits.cfg)
-        return reference_path(of, vector, model_effects, late=late)
+        more = {"late": late} if along is reference_path else {}
+        return along(of, whole_vector(of, fitted.physical), model_effects, **more)
 
     cfg = fits.cfg
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
