@@ -158,10 +158,15 @@ def _missing(found: Findings) -> str:
         )
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
-    parts = [f"{label} ({100 * s:.0f} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
+    parts = [f"{label} ({_percent(s)} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
     if max(found.shares.values()) >= found.outcome.cfg.verdict.most:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
+
+
+def _percent(share: float) -> str:
+    """A share in percent; one that is small beside another is not nothing."""
+    return f"{100 * share:.0f}" if share >= 0.01 else f"{100 * share:.1g}"
 
 
 def ladder(found: Findings) -> list[dict[str, Any]]:
