@@ -8,9 +8,9 @@ motions (CSV, with what the user believes beside it), at two gain sets where a g
 
 | case | what is wrong | numbers |
 |---|---|---|
-| weak_60, weak_35 | the motor gives a part of what it says | 0.60; 0.35, and it is asked for 9 N m at most |
-| kp_x1_6, kp_x0_4 | the proportional gain is a multiple of what was stated | 1.6, 0.4 |
-| kd_x0_15, kd_x4 | the derivative gain is | 0.15, 4 |
+| weak_60, weak_35, weak_60_8 | the motor gives a part of what it says | 0.60; 0.35, limit 9 N m; 0.60, limit 8 N m |
+| kp_x1_6, kp_x0_4, kp_x2_5 | the proportional gain is a multiple of what was stated | 1.6, 0.4, 2.5 |
+| kd_x0_15, kd_x4, kd_x0_3 | the derivative gain is | 0.15, 4, 0.3 |
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ CASES = {
     "kp_x0_4": Case(kp=(90.0, 150.0), kd=(1.2, 1.2), kp_factor=0.4),
     "kd_x0_15": Case(kp=(40.0, 40.0), kd=(6.0, 3.0), kd_factor=0.15),
     "kd_x4": Case(kp=(40.0, 60.0), kd=(0.3, 0.5), kd_factor=4.0),
+    "kp_x2_5": Case(kp=(20.0, 35.0), kd=(0.9, 0.9), kp_factor=2.5),
+    "kd_x0_3": Case(kp=(50.0, 50.0), kd=(3.0, 2.0), kd_factor=0.3),
+    "weak_60_8": Case(kp=(45.0, 70.0), kd=(1.2, 1.2), torque_factor=0.6, limit=8.0),
 }
 
 
@@ -105,9 +108,11 @@ def main() -> None:
     """Write all cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+    parser.add_argument("--seconds", type=float, default=12.0, help="length of each (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    args = parser.parse_args()
     for name in CASES:
-        print(*write(folder, name))
+        print(*write(args.folder, name, args.seconds, args.seed))
 
 
 if __name__ == "__main__":
