@@ -67,7 +67,7 @@ def _fit_along(
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
         late = later_than_most(fitted.physical[:, BASE.index("delay")], cfg=fits.cfg)
-        more = {"late": late} if along is reference_path else {}
+        more = {"late": late, "away": fits.cfg.away} if along is reference_path else {}
         return along(of, whole_vector(of, fitted.physical), model_effects, **more)
 
     cfg = fits.cfg

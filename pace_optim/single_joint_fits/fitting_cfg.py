@@ -43,8 +43,8 @@ class FittingCfg:
     moved: float = 0.02
     """Where a normalised parameter has moved further than this the reference is computed again."""
     away: float = 0.05
-    """A joint without neighbours is simulated along the measured motion unless it ends further from it than this (RMS)
-    [rad]: then gravity is not linear in between."""
+    """Joints are simulated along the measured motion unless they are further from it than this (RMS) [rad]: then
+    gravity is not linear in between."""
     near: float = 0.01
     """With effects its reference is renewed unless it is this near (RMS) [rad]."""
     late: float = 0.2

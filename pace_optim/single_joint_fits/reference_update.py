@@ -74,7 +74,7 @@ class ReferenceUpdate:
         problem = self.problem.with_effects(found_effects(now.model, self.problem.joint_names))
         changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
         held = ~now.model.free[:, BASE.index("delay")]
-        return reference_path(problem, self._values(problem, now), changing, late=held)
+        return reference_path(problem, self._values(problem, now), changing, late=held, away=self.fits.cfg.away)
 
     @staticmethod
     def _values(problem: Problem, now: Fitted) -> torch.Tensor:

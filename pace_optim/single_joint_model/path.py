@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -115,17 +116,20 @@ def reference_path(
     physical: torch.Tensor,
     model_effects: Sequence[str] = (),
     late: torch.Tensor | None = None,
+    away: float = math.inf,
 ) -> ReferencePath:
     """Simulate a candidate on all recordings, and compute what each joint feels on its way.
 
-    Where the robot was measured elsewhere, joints are taken there: what a joint's neighbours do to it is what they did,
-    not what the candidate lets them do.
+    Where the robot was measured elsewhere, joints that have neighbours are taken there: what a joint's neighbours do to
+    it is what they did, not what the candidate lets them do.
 
     Args:
         problem: The problem; its own effects count too.
         physical: The candidate's physical parameters, (size,).
         model_effects: Effects on the rigid-body model whose influence is wanted.
         late: Joints that are not taken there, (n,) bool: it may be their log that is late. ``None``: no joint.
+        away: Nor are those that are further from it than this, RMS over a recording [rad]: gravity is not linear in
+            between.
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
@@ -140,7 +144,10 @@ def reference_path(
     shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
     steps = len(shown)
     motion = torch.stack(positions[:steps]), torch.stack(speeds[:steps])
+    if problem.joints_stand_alone:
+        return _along(problem, values, model_effects, rollout, *motion)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
+    beside *= beside.square().mean(dim=0, keepdim=True).sqrt() <= away
     if late is not None:
         beside[..., late] = 0.0
     return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
