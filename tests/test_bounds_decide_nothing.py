@@ -59,6 +59,10 @@ def test_no_factor_of_what_was_stated_can_be_negative():
             assert parameter.widest()[0] > parameter.null - 1.0
 
 
+def test_a_stated_load_may_not_be_there_at_all():
+    assert PAYLOAD.parameters[0].widest()[0] == pytest.approx(-1.0, abs=0.01)
+
+
 def test_wide_bounds_travel_with_the_effect_s_name():
     cfg = EffectCfg.parse("payload@.*KFE@shared@wide")
     assert cfg.wide and cfg.shared and cfg.joint_names_expr == ".*KFE" and cfg.label == "payload@.*KFE@shared@wide"
