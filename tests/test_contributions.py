@@ -42,7 +42,7 @@ def findings(outcome, each):
     [
         ((9e-4, 2e-4), (0.964, 0.036), "Missing: stribeck_friction (96 %), quadratic_friction (4 %). With"),
         ((2e-4, 9e-4), (0.964, 0.036), "Missing: quadratic_friction (96 %), stribeck_friction (4 %). With"),
-        ((9e-4, 1.2e-4), (0.9945, 0.0055), "Missing: stribeck_friction (99 %), quadratic_friction (0.5 %). With"),
+        ((9e-4, 1.1e-4), (0.9974, 0.0026), "Missing: stribeck_friction (100 %), quadratic_friction (0.3 %). With"),
         ((0.5e-4, 2e-4), (1.0, 0.0), "Missing: quadratic_friction (100 %), stribeck_friction (0 %). With"),
     ],
 )

@@ -166,7 +166,8 @@ def _missing(found: Findings) -> str:
 
 def _percent(share: float) -> str:
     """A share in percent; one that is small beside another is not nothing."""
-    return f"{100 * share:.0f}" if share >= 0.01 else f"{100 * share:.1g}"
+    percent = 100 * share
+    return f"{percent:.0f}" if round(percent) else f"{percent:.1g}"
 
 
 def ladder(found: Findings) -> list[dict[str, Any]]:
