@@ -141,6 +141,17 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     )
 
 
+def test_a_curve_takes_the_place_of_several_effects(fitted, curves):
+    one, spring = ended(fitted, 0.9), get_effect("parallel_spring")
+    values = torch.tensor([[p.start for p in spring.parameters]], dtype=torch.float64)
+    two = Fitted.start(*one.final.model.extended(one.final.physical, spring, YES, values))
+    outcome = replace(one, final=two, unevenness=torch.tensor([[0.7], [0.8]], dtype=torch.float64))
+    taken = take_curves(outcome, replace(curves, instead=YES))
+    assert labels(taken.final.model, ["servo"]) == ["friction_over_position"]
+    assert taken.unevenness.tolist() == [[0.0]]
+    assert take_curves(outcome, replace(curves, instead=~YES)).unevenness.tolist() == [[0.7], [0.8]]
+
+
 def test_no_curve_is_fitted_near_the_floor(fitted):
     near = (fitted[2].mse.sqrt() / 2.5).double()
     assert fit_curves(Fits(), ended(fitted, 1.0), near) is None

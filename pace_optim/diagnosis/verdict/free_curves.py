@@ -106,8 +106,11 @@ def take_curves(outcome: Outcome, curves: Curves | None) -> Outcome:
     for j in curves.instead.nonzero()[:, 0].tolist():
         here, k = torch.arange(len(curves.instead)) == j, curves.best(j)
         final, errors = final.with_joints(here, curves.models[k]), errors.with_joints(here, curves.errors[k])
-    more = torch.zeros(len(final.model.effects) - len(outcome.unevenness), len(final.x), dtype=torch.float64)
-    return replace(outcome, unevenness=torch.cat([outcome.unevenness, more]), final=final, final_errors=errors)
+    known = dict(zip(outcome.final.model.effects, outcome.unevenness, strict=True))
+    unevenness = torch.zeros(final.model.has.shape, dtype=torch.float64)
+    for row, effect in zip(unevenness, final.model.effects, strict=True):  # of a curve it is not known
+        row += torch.where(curves.instead, 0.0, known.get(effect, 0.0))
+    return replace(outcome, unevenness=unevenness, final=final, final_errors=errors)
 
 
 def error_map(
