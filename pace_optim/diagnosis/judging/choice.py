@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
-from pace_optim.diagnosis.judging.candidate_results import Trial
+from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.comparison import within
 
 
@@ -17,18 +16,7 @@ def _near(trials: Sequence[Trial], ratio: float) -> list[Trial]:
     return [trial for trial in trials if within(trial.mse_after, trials[0].mse_after, ratio)]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Choice:
-    """What each joint takes."""
-
-    trials: list[list[Trial]]
-    """Of each joint, by their error."""
-    chosen: list[type[Effect] | None]
-    rivals: list[list[type[Effect]]]
-    """Of each joint, effects that do as well as the chosen one."""
-
-
-def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judging) -> Choice:
+def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judging) -> Round:
     """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest.
 
     Args:
@@ -47,7 +35,7 @@ def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judgi
             best = _simplest([trial for trial in close if wanted[trial.effect] == most], cfg.as_good)
             alike = [trial.effect for trial in close if within(trial.mse_after, best.mse_after, cfg.alike)]
             chosen[j], rivals[j] = best.effect, [effect for effect in alike if effect is not best.effect]
-    return Choice(trials=ordered, chosen=chosen, rivals=rivals)
+    return Round(trials=ordered, chosen=chosen, rivals=rivals)
 
 
 def _simplest(trials: Sequence[Trial], ratio: float) -> Trial:

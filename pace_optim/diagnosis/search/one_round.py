@@ -49,7 +49,7 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
             score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
             trial = Trial(effect=effect, joint=j, screen_score=score, values=values)
             trials[j].append(trial.judged(errors, after[effect], tried, first, cfg=cfg.judging))
-    choice = choose(trials, cfg=cfg.judging)
+    found = replace(choose(trials, cfg=cfg.judging), models=models)
     made = Decision.of(
         "add",
         range(len(trials)),
@@ -59,8 +59,8 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
         candidates=tried,
         first=first,
     )
-    search.log(replace(made, taken=[None if effect is None else effect.name for effect in choice.chosen]))
-    return Round(trials=choice.trials, chosen=choice.chosen, rivals=choice.rivals, models=models)
+    search.log(replace(made, taken=[None if effect is None else effect.name for effect in found.chosen]))
+    return found
 
 
 def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], list[Probe]]:
