@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
 from pace_optim.optimizers.convergence import Criterion, SearchState
 from pace_optim.optimizers.unit_box import into_unit_box
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # cma warns of optional packages at import
-    import cma
-    from cma.boundary_handler import BoundTransform
 
 _MAXSTD = 2.0 / 3.0
 """Largest standard deviation: pycma's own where it knows the bounds."""
@@ -61,27 +58,17 @@ class TreeStrategy:
         """
         self.entries = np.asarray(entries)
         self.criteria = tuple(criteria)
-        generator = np.random.default_rng(seed)
-        options = {
-            "maxstd": _MAXSTD,
-            "popsize": population_size,
-            "randn": lambda *shape: generator.standard_normal(shape),
-            "seed": np.nan,
-            "verbose": -9,
-            "tolfun": 1e-13,
-            "tolfunhist": 1e-14,
-            "tolx": 1e-10,
-            "maxiter": np.inf,
-        }
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            unbounded = BoundTransform([-1.0, 1.0]).inverse(list(start))
-            self._strategy = cma.CMAEvolutionStrategy(unbounded, sigma, options)
+        self._begin = partial(_pycma, list(start), sigma, population_size, np.random.default_rng(seed))
         self.best_x = np.array(start, dtype=float)
         self.best_score = np.inf
         self.best_scores: list[float] = []
         self.stop_reason: str | None = None
-        self._look()
+        self.mean, self.spread = self.best_x.copy(), np.full(len(self.best_x), min(sigma, _MAXSTD))
+
+    @cached_property
+    def _strategy(self) -> Any:
+        """From the first generation on: a fit that needs no search need not import pycma."""
+        return self._begin()
 
     def _look(self) -> None:
         """Keep what pycma knows of its distribution."""
@@ -128,3 +115,24 @@ class TreeStrategy:
         """Start over with the best, after what is simulated for a vector has changed."""
         self.best_score = np.inf
         self.stop_reason = None
+
+
+def _pycma(start: list[float], sigma: float, population_size: int, generator: np.random.Generator) -> Any:
+    """A strategy that is told of no bounds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns of optional packages at import
+        import cma
+        from cma.boundary_handler import BoundTransform
+
+        options = {
+            "maxstd": _MAXSTD,
+            "popsize": population_size,
+            "randn": lambda *shape: generator.standard_normal(shape),
+            "seed": np.nan,
+            "verbose": -9,
+            "tolfun": 1e-13,
+            "tolfunhist": 1e-14,
+            "tolx": 1e-10,
+            "maxiter": np.inf,
+        }
+        return cma.CMAEvolutionStrategy(BoundTransform([-1.0, 1.0]).inverse(start), sigma, options)
