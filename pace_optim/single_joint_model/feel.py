@@ -100,22 +100,22 @@ class Links:
         """
         shape = (*motion.qpos.shape[:2], len(self.columns))
         inertia, torque, load = (np.empty(shape) for _ in range(3))
+        qpos, qvel, qacc = (each.numpy() for each in (motion.qpos, motion.qvel, motion.qacc))
         for r, model in enumerate(self.models):
             data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
             for k in range(shape[0]):
-                data.qpos[:], data.qvel[:] = motion.qpos[k, r], motion.qvel[k, r]
+                data.qpos[:], data.qvel[:] = qpos[k, r], qvel[k, r]
                 mujoco.mj_fwdPosition(model, data)
                 mujoco.mj_fwdVelocity(model, data)
                 mujoco.mj_fullM(model, data, mass)
-                acceleration = motion.qacc[k, r].numpy()
-                missing = mass @ acceleration + data.qfrc_bias - data.qfrc_passive
+                missing = mass @ qacc[k, r] + data.qfrc_bias - data.qfrc_passive
                 load[k, r] = -data.qfrc_bias[self.columns]
                 if self.loops is None:
                     inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]
                 else:
                     follow = self.loops.following(data.qpos)[:, self.columns]
                     inertia[k, r], missing = np.einsum("ij,ik,kj->j", follow, mass, follow), follow.T @ missing
-                torque[k, r] = inertia[k, r] * acceleration[self.columns] - missing
+                torque[k, r] = inertia[k, r] * qacc[k, r, self.columns] - missing
         return JointLoad(
             inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load)
         )
