@@ -105,7 +105,7 @@ def _result(
         simulated_steps=run.steps + consistency.simulated_steps,
         wall_time_s=run.progress.elapsed,
         stop_reasons=[
-            f"stands still at {end.times:.3g} times the noise" if end.is_far and reason == "converged" else reason
+            f"stands still at {end.times:,.0f} times the noise" if end.is_far and reason == "converged" else reason
             for reason in outcome.stop_reasons
         ],
         undetermined=end.left_open,

@@ -148,7 +148,7 @@ class Optimization:
         if times is None or times < FAR_ABOVE_NOISE:
             self.processes.agree(None)
             return []
-        self.progress.say(f"{times:.3g} times the noise: looking for other starts (Ctrl-C keeps what is found)")
+        self.progress.say(f"{times:,.0f} times the noise: looking for other starts (Ctrl-C keeps what is found)")
         space = self.problem.space
         if self.optimizer is None:
             self.processes.agree(None)
