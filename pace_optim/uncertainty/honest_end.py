@@ -42,7 +42,7 @@ def far_end(times: float | None, rmse: float, optimizer: str, searched: bool) ->
     others = " Other starts ended no lower." if searched else ""
     search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
     return [
-        f"The error of {1e3 * rmse:.3g} mrad is {times:,.0f} times the measurement noise: physics is missing, a fact of "
-        f"the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
+        f"The error of {1e3 * rmse:.3g} mrad is {times:,.0f} times the measurement noise: physics is missing, a fact "
+        f"of the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
         f"{command('diagnose')} looks for what is missing."
     ]
