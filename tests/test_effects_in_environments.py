@@ -78,8 +78,8 @@ def test_a_payload_of_nothing_keeps_a_loaded_robot_bit_for_bit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (2, "rk4")])
-def test_the_extremes_of_all_bounds_stay_finite_for_20_s(calls, integrator):
+@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])  # at the control step, the longest there is
+def test_the_extremes_of_all_bounds_stay_finite_for_20_s(integrator):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
     cfgs, corners, bases = [], [], []
     for name in EFFECTS:  # side by side, each on its rows, with each base
@@ -90,7 +90,7 @@ def test_the_extremes_of_all_bounds_stay_finite_for_20_s(calls, integrator):
             bases += [base] * count
         cfgs.append(EffectCfg(effect=name, env_rows=slice(begin, len(corners))))
     of_rows = {key: torch.tensor([base[key] for base in bases], dtype=torch.float64) for key in TRUTH}
-    bench = Bench(cfgs, num_envs=len(corners), base=of_rows, calls=calls, integrator=integrator)
+    bench = Bench(cfgs, num_envs=len(corners), base=of_rows, integrator=integrator)
     (actuator,) = bench.robot.actuators.values()
     for effect in bench.effects.effects:
         for key in (p.name for p in effect.parameters):
