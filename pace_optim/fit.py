@@ -60,7 +60,7 @@ def fit(
         env_cfg, place = load_env_cfg(settings.task), None
     else:
         env_cfg, place = before.load_cfg(), before.record.folder
-    problem = load_for_fit(settings, env_cfg)
+    problem = load_for_fit(settings, env_cfg, told=before is not None)
     settings = with_absolute_paths(settings, env_cfg)
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
     digests, inputs = recording_digests(settings), input_digests(settings, record)
@@ -103,7 +103,7 @@ def resume(
     settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
     if device is not None:
         settings = replace(settings, device=device)
-    problem = load_for_fit(settings, before.load_cfg())
+    problem = load_for_fit(settings, before.load_cfg(), told=True)
     check_same_configuration(before, problem)
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     run.restore(checkpoint)

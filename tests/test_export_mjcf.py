@@ -15,6 +15,7 @@ from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceD
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model import cfg_from_model
 from pace_optim.export import export
+from pace_optim.export.mjcf import model_of
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import PlainDrive
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -162,6 +163,21 @@ def test_drives_of_a_model_file_run_as_they_did_there(tmp_path):
     model.dof_armature[:], model.dof_frictionloss[:] = fields["dof_armature"], fields["dof_frictionloss"]
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST and "implicitfast" in " ".join(notes)
     assert np.abs(replay(model, names, targets, targets[0]) - np.array(expected)).max() < 3e-6
+
+
+def test_a_model_whose_meshes_are_missing_is_written_without_them(tmp_path):
+    path = tmp_path / "arm.xml"
+    mesh = '<asset><mesh name="m" file="gone.stl"/><texture name="t" type="2d" file="gone.png"/></asset>'
+    path.write_text(
+        STIFF.replace("<worldbody>", mesh + "<worldbody>").replace(
+            "</body></body>", '<geom type="mesh" mesh="m"/></body></body>'
+        )
+    )
+    spec, notes = model_of(path)
+    assert spec.compile().ngeom == 0
+    assert notes == ["2 files of the model are missing (gone.stl, gone.png): left out."]
+    path.write_text(STIFF)
+    assert model_of(path)[1] == []
 
 
 STIFF = """

@@ -175,3 +175,17 @@ def test_a_limit_that_the_recording_contradicts_is_the_first_warning(tmp_path):
     rmse = {"train": {"all": 1e-3}, "validation": {"all": 1e-2}}
     warnings = fit_warnings(problem, physical(problem, TRUTH), uncertainty(problem), rmse)
     assert warnings[0] == told and len(warnings) > 1
+
+
+def test_an_effect_that_some_joints_have_leaves_the_cells_of_the_others_empty():
+    plain = make_result()
+    one, *others = plain.joint_names
+    label = "stribeck_friction.effort"
+    more = {"effects": [f"stribeck_friction@{one}"], "units": {**plain.units, label: "N m"}}
+    result = make_result(
+        parameters={**plain.parameters, label: {one: 1.5}}, std={**plain.std, label: {one: 0.1}}, **more
+    )
+    first, *rest = (
+        line for line in summary(result).splitlines() if line.split()[:1] in [[j] for j in plain.joint_names]
+    )
+    assert "1.5 ± 0.1" in first and len(rest) == len(others) and all(" - " in line for line in rest)

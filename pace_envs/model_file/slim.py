@@ -45,10 +45,20 @@ def leave_out_meshes(spec: mujoco.MjSpec, path: Path) -> list[str]:
     return notes
 
 
+def missing_files(spec: mujoco.MjSpec, path: Path) -> list[str]:
+    """Files that a model names and that are not there: meshes, skins, height fields, textures.
+
+    Args:
+        spec: The model.
+        path: Its file.
+    """
+    files = [element.file for element in [*spec.meshes, *_surfaces(spec)] if element.file]
+    return [file for file in [*files, *_cube_files(spec)] if not _exists(spec, path, file)]
+
+
 def leave_out_surfaces(spec: mujoco.MjSpec, path: Path) -> None:
     """Delete skins, height fields, textures and materials where one of their files is missing; colours stay."""
-    files = [element.file for element in [*spec.skins, *spec.hfields, *spec.textures] if element.file]
-    files += [file for texture in spec.textures for file in texture.cubefiles if file]
+    files = [*(element.file for element in _surfaces(spec) if element.file), *_cube_files(spec)]
     if all(_exists(spec, path, file) for file in files):
         return
     for element in [*spec.geoms, *spec.sites, *spec.tendons]:
@@ -57,6 +67,14 @@ def leave_out_surfaces(spec: mujoco.MjSpec, path: Path) -> None:
         spec.delete(geom)
     for element in [*spec.skins, *spec.materials, *spec.textures, *spec.hfields]:
         spec.delete(element)
+
+
+def _surfaces(spec: mujoco.MjSpec) -> list:
+    return [*spec.skins, *spec.hfields, *spec.textures]
+
+
+def _cube_files(spec: mujoco.MjSpec) -> list[str]:
+    return [file for texture in spec.textures for file in texture.cubefiles if file]
 
 
 def _exists(spec: mujoco.MjSpec, path: Path, file: str) -> bool:

@@ -6,6 +6,8 @@ import torch
 
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
+from pace_optim.run.result import FitResult
+from pace_optim.run.summary import errors_of
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
 
@@ -46,6 +48,9 @@ def main() -> None:
 def run_and_tell(settings: DiagnosisSettings) -> None:
     """Diagnose; print the verdict before the robot is fitted again, and the folder of the last run at the end."""
     diagnosis = diagnose(settings, on_verdict=_tell)
+    if len(diagnosis.runs) > 1:
+        before, after = (errors_of(FitResult.load(run), "all") for run in (diagnosis.runs[0], diagnosis.runs[-1]))
+        print(f"whole robot with {' and '.join(diagnosis.paying)}: {after} mrad (train / validation), before {before}")
     for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
         print(f"report: {Path(run) / 'report.html'}")
     print(f"run: {diagnosis.runs[-1]}")

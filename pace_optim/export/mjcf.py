@@ -15,7 +15,7 @@ from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
-from pace_envs.model_file import read_model_file
+from pace_envs.model_file import missing_files, read_model_file
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import GAIN_EFFECTS, effect_notes, is_undetermined, plain_drives
 
@@ -40,7 +40,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     use_identified(cfg, drives.path)
     env = ManagerBasedRLEnv(cfg)
     robot, model = env.scene["robot"], env.sim.model
-    spec = read_model_file(source).spec if source.suffix == ".urdf" else mujoco.MjSpec.from_file(str(source))
+    spec, left_out = model_of(source)
     fields = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "damping"}
     for name, column in zip(robot.joint_names, robot.dof_columns.tolist(), strict=True):
         joint = spec.joint(name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
@@ -68,8 +68,19 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         held += GAIN_EFFECTS
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
-    notes += effect_notes(drives, held)
+    notes += [*effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:
+    """The model of a file as it stands; without what is missing, which is noted."""
+    if source.suffix == ".urdf":
+        return read_model_file(source).spec, []
+    spec = mujoco.MjSpec.from_file(str(source))
+    if not (missing := missing_files(spec, source)):
+        return spec, []
+    named = ", ".join(Path(name).name for name in missing[:2]) + (", …" if len(missing) > 2 else "")
+    return read_model_file(source).spec, [f"{len(missing)} files of the model are missing ({named}): left out."]
 
 
 def _in_the_model(kind: type[Effect]) -> bool:

@@ -19,8 +19,13 @@ _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
 
 
-def load_for_fit(settings: FitSettings, env_cfg: Any) -> Problem:
+def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Problem:
     """Read everything, refuse what cannot be fitted, and try the simulation out.
+
+    Args:
+        settings: What to fit, and how.
+        env_cfg: The task's configuration.
+        told: Whether an earlier run has told how the recordings are understood.
 
     Raises:
         ValueError: If anything does not fit.
@@ -28,7 +33,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any) -> Problem:
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
-    problem = problem_of(settings, env_cfg)
+    problem = problem_of(settings, env_cfg, told)
     cmaes = problem.env_cfg.sim2real.cmaes
     chosen = {
         name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None

@@ -136,6 +136,7 @@ def load_problem(
     columns: str | Path | None = None,
     strict: bool = False,
     max_duration: float | None = None,
+    tell: Callable[[str], None] = tell_on_stderr,
 ) -> Problem:
     """Read and check everything that a fit needs.
 
@@ -155,6 +156,7 @@ def load_problem(
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
         max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
             as a fit can afford.
+        tell: Is told what was understood of logs, set aside, and cut.
 
     Raises:
         ValueError: If anything does not fit.
@@ -182,8 +184,8 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict)
-    held_out = read_all(validation, env, control_dt, columns=columns, strict=strict)
+    recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict, tell=tell)
+    held_out = read_all(validation, env, control_dt, columns=columns, strict=strict, tell=tell)
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
     told, bounds = lift_limits(plain, measured.recordings, unknown)
@@ -200,7 +202,7 @@ def load_problem(
         _raise_armature(each, least_armature(env, [*recordings, *held_out]))
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
-        [recordings, held_out], control_dt, _columns(space, trees), _evaluations(cfg), max_duration, tell_on_stderr
+        [recordings, held_out], control_dt, _columns(space, trees), _evaluations(cfg), max_duration, tell
     )
     refuse_open_loops(env, [*recordings, *held_out])
     problem = Problem(

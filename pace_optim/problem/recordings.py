@@ -19,6 +19,10 @@ def tell_on_stderr(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def tell_nobody(text: str) -> None:
+    """Told before, by the fit whose recordings are read again."""
+
+
 def read_all(
     paths: Sequence[str | Path],
     env: ManagerBasedEnv,

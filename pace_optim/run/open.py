@@ -13,6 +13,7 @@ from typing import Any
 from pace_actuators.effects import use_recorded_effects
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.problem import Problem, load_problem
+from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.run.settings import FitSettings
 
 
@@ -94,7 +95,8 @@ class Run:
             own = {"data": [str(path) for path in data], "validation": []}
             settings = replace(settings, **own, columns=columns, strict=strict)  # type: ignore[arg-type]
         try:
-            problem = problem_of(replace(settings, physics_dt=physics_dt or settings.physics_dt), self.load_cfg())
+            settings = replace(settings, physics_dt=physics_dt or settings.physics_dt)
+            problem = problem_of(settings, self.load_cfg(), told=not data)
         except ValueError as error:
             if data or str(self.folder) in str(error):
                 raise
@@ -123,12 +125,13 @@ def open_problem(
     )
 
 
-def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
+def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
     """The problem that settings pose: the one place where they become one.
 
     Args:
         settings: Of a fit; its task and effects are known.
         env_cfg: The task's configuration, if it has been loaded.
+        told: Whether it has been told how their recordings are understood.
     """
     return load_problem(
         settings.task,
@@ -143,6 +146,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None) -> Problem:
         columns=settings.columns,
         strict=settings.strict,
         max_duration=settings.max_duration,
+        tell=tell_nobody if told else tell_on_stderr,
     )
 
 

@@ -22,7 +22,7 @@ def summary(result: FitResult) -> str:
             if name == "delay":
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
-    error = f"error, all joints: {_errors(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
+    error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(whole(error))
     lines.append(
         f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s; "
@@ -43,11 +43,13 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     lines = ["  ".join(["joint".ljust(width), *columns, unit_for("train / validation [mrad]", joint_type).rjust(26)])]
     for joint in joints:
         cells = [_value(result, name, joint).rjust(26) for name in names]
-        lines.append("  ".join([joint.ljust(width), *cells, _errors(result, joint).rjust(26)]))
+        lines.append("  ".join([joint.ljust(width), *cells, errors_of(result, joint).rjust(26)]))
     return [*lines, ""]
 
 
 def _value(result: FitResult, name: str, key: str) -> str:
+    if key not in result.parameters[name]:  # an effect that other joints have
+        return "-"
     std = result.std[name][key]
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
@@ -55,6 +57,7 @@ def _value(result: FitResult, name: str, key: str) -> str:
     return f"{result.parameters[name][key]:.5g}{error}{mark}"
 
 
-def _errors(result: FitResult, key: str) -> str:
+def errors_of(result: FitResult, key: str) -> str:
+    """RMSE of a joint, or of ``"all"``, in training and validation [mrad or mm], as "0.12 / 0.15"."""
     parts = [result.rmse[which].get(key) for which in ("train", "validation")]
     return " / ".join("-" if part is None else f"{1e3 * part:.4g}" for part in parts)
