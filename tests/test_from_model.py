@@ -67,8 +67,9 @@ def made(cfg):
 def test_drives_are_those_of_the_actuators_in_the_joints_own_coordinates(tmp_path):
     drive = drive_of(cfg := cfg_of(tmp_path, ARM))
     assert cfg.sim2real.joint_order == ("arm/shoulder", "elbow (left)", "rail")
-    assert drive.stiffness == [120, 40, 0]  # kp G²
-    assert drive.damping == [6, 4, 0]
+    assert drive.stiffness[:2] == [120, 40]  # kp G²
+    assert drive.damping[:2] == [6, 4]
+    assert cfg.sim2real.assumed_gains == ("rail",)  # whose motor says nothing of them
     assert drive.effort_limit == [60, 9, 50]  # forcerange, actuatorfrcrange, gear x ctrlrange
 
 
@@ -207,11 +208,14 @@ def test_a_urdfs_limit_that_is_no_number_is_told_with_its_joint(tmp_path, key, t
         cfg_of(tmp_path, urdf, "robot.urdf")
 
 
-def test_the_loop_around_motors_is_somebody_elses(tmp_path):
+def test_the_gains_around_motors_are_somebody_elses(tmp_path):
     actuators = "".join(f'<motor joint="{name}"/>' for name in ("arm/shoulder", "elbow (left)", "rail"))
     motors = re.sub("<actuator>.*</actuator>", f"<actuator>{actuators}</actuator>", ARM, flags=re.DOTALL)
     cfg = cfg_of(tmp_path, motors)
-    assert drive_of(cfg).stiffness == [0.0, 0.0, 0.0] and not drive_of(cfg).implicit and cfg.sim.integrator == "rk4"
+    assert cfg.sim2real.assumed_gains == cfg.sim2real.joint_order
+    assert min(drive_of(cfg).stiffness) > 0.0 and min(drive_of(cfg).damping) > 0.0
+    assert any(note.startswith("gains: kp = effort limit") for note in cfg.sim2real.notes)
+    assert not drive_of(cfg).implicit and cfg.sim.integrator == "rk4"
 
 
 def test_ranges_that_seem_to_be_radians_read_as_degrees_are_noted(tmp_path):
@@ -267,11 +271,12 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
     written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml")
     assert written.sim2real.joint_order == own.sim2real.joint_order
+    assert written.sim2real.assumed_gains == own.sim2real.assumed_gains == ("rail",)
     torch.testing.assert_close(written.sim2real.bounds_params, own.sim2real.bounds_params, rtol=1e-4, atol=1e-9)
     starts = [ParameterSpace.of(sim2real).start for sim2real in (written.sim2real, own.sim2real)]
     torch.testing.assert_close(*starts, rtol=1e-4, atol=1e-9)
     for field in ("stiffness", "damping", "effort_limit", "implicit", "control_decimation"):
-        assert getattr(drive_of(written), field) == getattr(drive_of(own), field)
+        assert getattr(drive_of(written), field) == pytest.approx(getattr(drive_of(own), field), rel=1e-4)
     assert (written.sim.dt, written.decimation, written.sim.gravity) == (own.sim.dt, own.decimation, own.sim.gravity)
     env = made(written)
     assert env.scene["robot"].data.default_joint_pos[0].tolist() == [-0.7, 0.4, 0.02]

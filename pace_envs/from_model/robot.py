@@ -17,7 +17,15 @@ from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
-from pace_envs.from_model.scaling import base_bounds, gains, motion, runs_continuously, sample_values, start_values
+from pace_envs.from_model.scaling import (
+    base_bounds,
+    gains,
+    has_gains,
+    motion,
+    runs_continuously,
+    sample_values,
+    start_values,
+)
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -128,6 +136,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
             sample_params={**samples, "delay": 2.0},
             start_params={group: dict(zip(names, [at[group] for at in starts], strict=True)) for group in starts[0]},
             slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
+            assumed_gains=tuple(joint.name for joint in joints if not has_gains(joint)),
             notes=robot.notes,
         ),
     )
@@ -191,7 +200,7 @@ def _gravity(model: mujoco.MjModel) -> tuple[float, float, float]:
 
 def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) -> list[str]:
     notes = [f"home posture: {f'keyframe {key}' if key else 'all joints at 0, or in the middle of a range without it'}"]
-    if any(joint.drive is None for joint in joints):
+    if not all(has_gains(joint) for joint in joints):
         notes.append(
             f"gains: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least {defaults.NATURAL_FREQUENCY:g} Hz "
             f"with the joint's inertia; kd for a damping ratio of {defaults.DAMPING_RATIO:g}; state the real ones in "

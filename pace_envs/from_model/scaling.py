@@ -32,16 +32,19 @@ def unit_length(joint: JointFacts) -> float:
     return defaults.SLIDE_LENGTH if joint.is_slide else 1.0
 
 
+def has_gains(joint: JointFacts) -> bool:
+    """Whether the file says by which gains the joint is held: a motor, or no actuator at all, says nothing of them."""
+    return joint.drive is not None and joint.drive.kind != "effort"
+
+
 def gains(joint: JointFacts) -> tuple[float, float]:
     """Stiffness kp [N m/rad] and damping kd [N m s/rad]: the file's, or the named defaults."""
-    if joint.drive is not None:
+    if joint.drive is not None and has_gains(joint):
         return joint.drive.stiffness, joint.drive.damping
     inertia, length = joint.inertia + joint.armature, unit_length(joint)
     natural = (2 * math.pi * defaults.NATURAL_FREQUENCY) ** 2 * inertia
     stiffness = max(joint.effort / (defaults.ERROR_AT_LIMIT * length), natural)
     damping = 2 * defaults.DAMPING_RATIO * math.sqrt(stiffness * inertia)
-    if joint.command == "effort":
-        return 0.0, 0.0
     return (0.0 if joint.command == "velocity" else stiffness), damping
 
 
@@ -51,7 +54,7 @@ def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel) -> bo
     Loops are held at the control rate, as in PACE, where the file has no gains (no actuators, or motors), or gains with
     a damping that is stable there and that the file's own integrator treats explicitly too.
     """
-    if any(joint.drive is None or joint.drive.kind == "effort" for joint in joints):
+    if not all(has_gains(joint) for joint in joints):
         return False
     implicit = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     if int(model.opt.integrator) in implicit or not any(gains(joint)[1] for joint in joints):

@@ -86,7 +86,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
             start_params={{  # of a fit: a tenth of the upper bounds
                 group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
                 for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
-            }},
+            }},{assumed}
         ),
     )
 
@@ -139,9 +139,15 @@ def configuration_text(model: str | Path, output: str | Path) -> tuple[str, str,
         dt=cfg.sim.dt,
         integrator=cfg.sim.integrator,
         gravity=tuple(cfg.sim.gravity),
+        assumed=_assumed(sim2real.assumed_gains),
         sample={key: value if key == "delay" else _short(value) for key, value in sim2real.sample_params.items()},
     )
     return text, task, cfg
+
+
+def _assumed(names: tuple[str, ...]) -> str:
+    """A line on gains that nobody has stated."""
+    return f"\n            assumed_gains={names!r},  # without those whose gains you state above" if names else ""
 
 
 def _of(values: object, i: int) -> float:

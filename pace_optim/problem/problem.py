@@ -16,6 +16,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.measured_effort import MeasuredDrives, read_drives
+from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
 from pace_optim.problem.drive_steps import check_loops, least_armature, of_joints, set_control_step, set_drive_step
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
@@ -186,6 +187,7 @@ def load_problem(
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
     recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict, tell=tell)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict, tell=tell)
+    recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
     told, bounds = lift_limits(plain, measured.recordings, unknown)
@@ -216,7 +218,7 @@ def load_problem(
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
-        contradictions=_contradictions(env, [*recordings, *held_out]),
+        contradictions=(*told_of_gains(env, told, unknown), *_contradictions(env, [*recordings, *held_out])),
         passive_joints=env.scene["robot"].has_passive_joints,
     )
     env.close()

@@ -106,6 +106,9 @@ class PaceCfg:
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
 
+    assumed_gains: tuple[str, ...] = ()
+    """Joints whose gains nobody has stated: those of their drives are assumed."""
+
     notes: tuple[str, ...] = ()
     """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
 
