@@ -7,16 +7,15 @@ from pathlib import Path
 
 import pytest
 from diagnoses import errors_of
-from test_search_moves import NEIGHBOUR, STANDS_IN, searched, together
+from test_search_moves import STANDS_IN, searched
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 from decisions import read_cases, save_cases, table
 
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, RULES, DiagnosisCfg
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
 from pace_optim.diagnosis.judging.rules import decide, decided
-from pace_optim.diagnosis.search.moves import MOVES
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "single_joint_fits")]
@@ -38,12 +37,11 @@ def test_decisions_of_whole_diagnoses_come_out_as_they_did(case):
 
 def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
     log: list[Decision] = []
-    for joints in ((STANDS_IN,), (NEIGHBOUR, together(1, 2), together(1, 2))):
-        searched(*joints, log=log.append)
+    searched(STANDS_IN, log=log.append)
     path = tmp_path / "decisions.jsonl"
     path.write_bytes(as_lines(log))
     read = read_decisions(path.read_text(encoding="utf-8"))
-    assert {decision.rule for decision in read} == {"look_ahead", "add_to_group"}
+    assert {decision.rule for decision in read} == {"look_ahead"}
     for decision in read:
         assert [bool(name) for name in decided(decision)] == [bool(name) for name in decision.taken]
 
@@ -58,10 +56,10 @@ def test_saved_cases_are_read_as_they_were(tmp_path):
 
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
     log: list[Decision] = []
-    searched(NEIGHBOUR, together(1, 2), together(1, 2), log=log.append)
-    lenient = replace(DEFAULT, judging=replace(DEFAULT.judging, next_effect=1e9))
-    rows = table({"one": log, "two": log}, lenient).splitlines()
-    assert rows[2] == "| add_to_group | 2 | 2 | 2 of 2 | 2 |"
+    decide("pool", [0], errors_of(1e-3), {"torque_gain": errors_of(1.01e-3)}, cfg=DEFAULT, log=log.append)
+    strict = replace(DEFAULT, judging=replace(DEFAULT.judging, as_good=1.0))
+    rows = table({"one": log, "two": log}, strict).splitlines()
+    assert rows[2] == "| pool | 2 | 2 | 2 of 2 | 2 |"
 
 
 def test_another_comparison_decides_otherwise():
@@ -74,7 +72,6 @@ def test_another_comparison_decides_otherwise():
 
 
 def test_every_rule_can_be_switched_off_and_no_other():
-    assert {*MOVES} - {"add"} <= set(RULES)
     assert not DiagnosisCfg(off=("pool",)).has("pool") and DiagnosisCfg().has("pool")
     with pytest.raises(ValueError, match=r"no rule 'pol'.*pool"):
         DiagnosisCfg(off=("pol",))

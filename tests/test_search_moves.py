@@ -250,46 +250,6 @@ def test_near_the_floor_nothing_is_sought_a_second_time():
     assert found(NEIGHBOUR, hidden) == ([{"joint_elasticity"}, set()], 1)
 
 
-def together(*joints, effect=ELASTICITY):
-    """A table by which an effect helps only where all of some joints have it."""
-    helps = {**constant(1.7), **mrad({(effect,): 0.1})}
-    return lambda everyone: helps if all(effect in everyone[j] for j in joints) else constant(1.7)
-
-
-def test_joints_that_hide_the_same_from_each_other_are_given_it_at_once():
-    outcome, world = searched(NEIGHBOUR, together(1, 2), together(1, 2))
-    assert world.effects_of(outcome.final) == [[ELASTICITY]] * 3
-    for j in (1, 2):  # what is told of them is what it brought with all others
-        best = outcome.rounds[-1].trials[j][0]
-        assert best.effect is ELASTICITY and best.significant and best.mse_before > 100 * best.mse_after
-
-
-def test_only_joints_that_gain_keep_what_they_were_given_with_others():
-    effects, _ = found(NEIGHBOUR, together(1, 2), together(1, 2), constant(1.7))
-    assert effects == [{"joint_elasticity"}] * 3 + [set()]
-
-
-def test_what_brought_other_joints_most_is_given_first():
-    little = mrad({(): 1.0, (MOUNT,): 0.99, (ELASTICITY,): 0.99, (GAIN,): 0.99, (SPRING,): 0.8})
-    said = []
-    wants_gain = {**constant(39.0), **mrad({(GAIN,): 0.1})}
-    searched(little, wants_gain, together(2, 3, effect=GAIN), together(2, 3, effect=GAIN), say=said.append)
-    assert next(text for text in said if "at once" in text).startswith("trying torque_gain")
-
-
-def test_a_joint_that_only_its_neighbours_kept_from_the_floor_keeps_nothing():
-    def fine_beside_the_others(everyone):
-        return constant(0.1 if all(ELASTICITY in everyone[j] for j in (1, 2)) else 1.7)
-
-    effects, _ = found(NEIGHBOUR, together(1, 2), together(1, 2), fine_beside_the_others)
-    assert effects == [{"joint_elasticity"}] * 3 + [set()]
-
-
-def test_joints_are_not_given_what_no_other_joint_has():
-    effects, _ = found(NEIGHBOUR, together(1, 2, effect=SPRING), together(1, 2, effect=SPRING))
-    assert effects == [{"joint_elasticity"}, set(), set()]
-
-
 @pytest.mark.parametrize(
     ("effect", "score", "jacobian", "fitted"),
     [

@@ -85,7 +85,6 @@ class VerdictCfg:
 
 
 RULES = (
-    "add_to_group",
     "look_ahead",
     "replace",
     "pool",

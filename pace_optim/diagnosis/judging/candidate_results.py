@@ -71,14 +71,6 @@ class Round:
         chosen[joint], every[joint] = new, others if old is None or not tie else [*others, old]
         return replace(self, chosen=chosen, rivals=every)
 
-    def with_trials(self, judged: Mapping[int, Trial]) -> Round:
-        """The same with a joint's trial of an effect in place of what it was, best first."""
-        trials = [list(each) for each in self.trials]
-        for j, trial in judged.items():
-            others = [t for t in trials[j] if t.effect is not trial.effect]
-            trials[j] = sorted([trial, *others], key=lambda t: t.mse_after)
-        return replace(self, trials=trials)
-
     def among_all(self, joints: torch.Tensor, now: Fitted) -> Round:
         """A round of some joints, (n,) bool, as one of all, whose model is known: nothing was tried on the others."""
         n, places = len(joints), joints.nonzero()[:, 0].tolist()

@@ -84,14 +84,6 @@ def _trim(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if better else None for better in (after.mse < decision.before.mse).tolist()]
 
 
-def _together(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """An effect on several joints, held against them without it."""
-    ((name, after),), tried = decision.after.items(), decision.facts["candidates"]
-    every = range(len(decision.joints))
-    pays = [judge(decision.before, after, place, tried, first=False, cfg=cfg.judging).significant for place in every]
-    return [name if yes else None for yes in pays]
-
-
 def _look_ahead(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """The next best effect, where it leads further than the best one."""
     facts = decision.facts
@@ -128,6 +120,5 @@ _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "look_ahead": _look_ahead,
     "pool": _pool,
     "trim": _trim,
-    "add_to_group": _together,
     "curves": _curves,
 }

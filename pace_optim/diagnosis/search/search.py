@@ -8,7 +8,8 @@ import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.size_consistency import unevenness
-from pace_optim.diagnosis.search.moves import MOVES, Step
+from pace_optim.diagnosis.search.grow import grown
+from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -32,8 +33,8 @@ def add_effects(
     errors = search.fits.validation_errors(problem, [base])[0]
     branch = Branch(problem=problem, now=base, errors=errors)
     found = search.tried(branch)
-    while found is not None and (step := _first_step(search, branch, found)) is not None:
-        branch, found = step
+    while found is not None and any(effect is not None for effect in found.chosen):
+        branch, found = added(search, branch, found)
     return Outcome(
         problem=branch.problem,
         base=base,
@@ -46,9 +47,10 @@ def add_effects(
     )
 
 
-def _first_step(search: Search, branch: Branch, found: Round) -> Step | None:
-    """The first move that leads somewhere."""
-    for name, move in MOVES.items():
-        if search.cfg.has(name) and (step := move(search, branch, found)) is not None:
-            return step
-    return None
+def added(search: Search, branch: Branch, found: Round) -> tuple[Branch, Round | None]:
+    """The branch with each joint's best effect, or the next best where that leads further; and what could come next."""
+    end = grown(search, branch, found)
+    ahead = search.tried(end)
+    if branch.rounds or ahead is None or not search.cfg.has("look_ahead"):
+        return end, ahead
+    return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)

@@ -34,11 +34,6 @@ class Branch:
         problem, now = self.problem.on_joints(joints), self.now.on_joints(joints)
         return Branch(problem=problem, now=now, errors=self.errors.on_joints(joints))
 
-    def squared_fall_with(self, effect: type[Effect]) -> float:
-        """By how much an effect lowered the squared error of the joints that chose it [rad²]."""
-        trials = [t for this in self.rounds for own in this.trials for t in own if this.chosen[t.joint] is effect]
-        return sum(trial.mse_before - trial.mse_after for trial in trials if trial.effect is effect)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
