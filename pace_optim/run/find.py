@@ -52,8 +52,8 @@ def find_mean(run: Path, mean_name: str) -> Path:
         return path
     if not means:
         raise ValueError(
-            f"{run} has no saved means: its search ended before the first was due, or there was none. "
-            "Leave --mean_name out to see the best parameters."
+            f"There is no {mean_name!r} in {run}, nor another saved mean: its search ended before the first was due, "
+            "or there was none. Leave --mean_name out to see the best parameters."
         )
     raise ValueError(f"There is no {mean_name!r} in {run}. {_available('Means', means, mean_name)}")
 
