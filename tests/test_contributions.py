@@ -9,6 +9,7 @@ from diagnoses import FakeFits, errors_of, joint_alone, with_effects
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.search.search import _without_vanished
 from pace_optim.diagnosis.telling.findings import Findings, summary_of
 from pace_optim.diagnosis.verdict.contributions import contributions
 from pace_optim.single_joint_fits.fits import Fits
@@ -65,6 +66,16 @@ def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, without, exp
     assert contributions(Fits(), SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {
         GAIN: 1.0
     }
+
+
+def test_an_effect_that_has_ended_where_it_vanishes_is_none(bench):
+    base = JointModel.base(bench.problem)
+    both = [(QUADRATIC, [True], [0.2]), (STRIBECK, [True], [0.0, 0.1])]
+    now = with_effects(base, bench.truth_values, *both)
+    assert now.model.vanished(now.x).tolist() == [[False], [True]]
+    assert labels(_without_vanished(now).model, ["servo"]) == ["quadratic_friction"]
+    alone = with_effects(base, bench.truth_values, both[1])
+    assert _without_vanished(alone) is alone  # what lowered the error is told
 
 
 def test_no_name_is_claimed_where_none_dominates(bench):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -35,13 +36,14 @@ def add_effects(
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
+    final = _without_vanished(branch.now)
     return Outcome(
         problem=branch.problem,
         base=base,
         base_errors=errors,
-        final=branch.now,
+        final=final,
         final_errors=branch.errors,
-        unevenness=size_consistency(branch.now),
+        unevenness=size_consistency(final),
         rounds=[*branch.rounds, *([] if found is None else [found])],
         cfg=cfg,
     )
@@ -54,3 +56,9 @@ def added(search: Search, branch: Branch, found: Round) -> tuple[Branch, Round |
     if branch.rounds or ahead is None or not search.cfg.has("look_ahead"):
         return end, ahead
     return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)
+
+
+def _without_vanished(now: Fitted) -> Fitted:
+    """The model without effects that have ended where they vanish: what paid there is another end of the base model."""
+    left = now.model.has & ~now.model.vanished(now.x)
+    return replace(now, model=replace(now.model, has=left)) if bool(left.any()) else now
