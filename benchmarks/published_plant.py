@@ -77,22 +77,23 @@ class Plant:
         mujoco.mj_fullM(self.model, data, full)
         return np.diag(full)[self.dofs]
 
+    def transmission(self, i: int) -> tuple[int, float]:
+        """The joint that an actuator moves, of a tendon the first, and its length per radian."""
+        model = self.model
+        joint, ratio = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0])
+        if int(model.actuator_trntype[i]) == mujoco.mjtTrn.mjTRN_TENDON:
+            first = int(model.tendon_adr[joint])
+            wraps = range(first, first + int(model.tendon_num[joint]))
+            joint, ratio = int(model.wrap_objid[first]), ratio * float(sum(model.wrap_prm[w] for w in wraps))
+        return joint, ratio  # a tendon's joints follow one to one
+
     def actuators_of(self) -> list[tuple[int, float, float, float]]:
         """Of each driven joint its actuator, the length per radian, kp and kd at the joint."""
         model, result = self.model, []
+        moved = [self.transmission(i) for i in range(model.nu)]
         for dof in self.dofs:
-            joint = int(model.dof_jntid[dof])
-            for i in range(model.nu):
-                target = int(model.actuator_trnid[i, 0])
-                if int(model.actuator_trntype[i]) == mujoco.mjtTrn.mjTRN_TENDON:
-                    first = int(model.tendon_adr[target])
-                    wraps = range(first, first + int(model.tendon_num[target]))
-                    moves = int(model.wrap_objid[first]) == joint
-                    ratio = float(sum(model.wrap_prm[w] for w in wraps))  # its joints follow one to one
-                else:
-                    moves, ratio = target == joint, 1.0
-                if moves:
-                    ratio *= float(model.actuator_gear[i, 0])
+            for i, (joint, ratio) in enumerate(moved):
+                if joint == int(model.dof_jntid[dof]):
                     gains = -model.actuator_biasprm[i, 1:3] * ratio**2
                     result.append((i, ratio, float(gains[0]), float(gains[1])))
                     break
@@ -105,15 +106,14 @@ def effort_limits(plant: Plant) -> np.ndarray:
     joints = model.dof_jntid[plant.dofs]
     limits = np.where(model.jnt_actfrclimited[joints], model.jnt_actfrcrange[joints, 1], np.inf)
     for i in range(model.nu):
-        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
         most = np.inf
         if model.actuator_ctrllimited[i] and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
             most = model.actuator_gainprm[i, 0] * model.actuator_ctrlrange[i, 1]
         if model.actuator_forcelimited[i]:
             most = min(most, model.actuator_forcerange[i, 1])
+        first, ratio = plant.transmission(i)
         if np.isfinite(most):
-            limits[joints == model.actuator_trnid[i, 0]] = most * abs(model.actuator_gear[i, 0])
+            limits[joints == first] = most * abs(ratio)
     return limits
 
 
