@@ -54,32 +54,28 @@ def screen(
         effects: What is tried.
         effort: Typical torque of each joint, (n,) [N m].
         cfg: How it is cross-validated.
+
+    Raises:
+        ValueError: If the model was fitted without its Jacobian.
     """
-    each = fits.shared_out(lambda own: _screened(fits, problem, now, own, effort, cfg), effects, effects)
-    return [probe for probes in each for probe in probes]
-
-
-def _screened(
-    fits: Fits,
-    problem: TwinProblem,
-    now: Fitted,
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
-    cfg: CandidatesCfg,
-) -> list[list[Probe]]:
-    """:func:`screen` in one process; the probes of each effect."""
-    if now.error is None:
+    error = now.error
+    if error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
-    probes, changes, where = simulated_probes(fits, problem, now, effects, effort)
-    steps = where.any(dim=1).nonzero()[:, 0][:: fits.cfg.stride]
-    fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg), -1)
-    scores, sizes = _explained(now.error, now.free_jacobian, changes, fold, cfg.folds)
-    result: dict[type[Effect], list[Probe]] = {effect: [] for effect in effects}
-    for (effect, own), score, size in zip(probes, scores, sizes, strict=True):
-        allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
-        probe = Probe(effect=effect, values=own, score=torch.where(allowed, score, 0.0), size=size)
-        result[effect].append(probe)
-    return list(result.values())
+
+    def look_at(own: Sequence[type[Effect]]) -> list[list[Probe]]:
+        probes, changes, where = simulated_probes(fits, problem, now, own, effort)
+        steps = where.any(dim=1).nonzero()[:, 0][:: fits.cfg.stride]
+        fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg), -1)
+        scores, sizes = _explained(error, now.free_jacobian, changes, fold, cfg.folds)
+        result: dict[type[Effect], list[Probe]] = {effect: [] for effect in own}
+        for (effect, values), score, size in zip(probes, scores, sizes, strict=True):
+            allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
+            probe = Probe(effect=effect, values=values, score=torch.where(allowed, score, 0.0), size=size)
+            result[effect].append(probe)
+        return list(result.values())
+
+    each = fits.shared_out(look_at, effects, effects)
+    return [probe for probes in each for probe in probes]
 
 
 def absorbed_effects(
