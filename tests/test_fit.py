@@ -12,10 +12,13 @@ import torch
 from problems import BENCH, TRUTH, chirp, record
 
 import pace_optim.fit as fit_module
+from pace_envs import load_env_cfg
 from pace_optim.fit import fit, resume
 from pace_optim.identification import optimization
+from pace_optim.identification.beginning import load_for_fit
 from pace_optim.identification.optimization import Optimization
 from pace_optim.recording import Drive, Load, load_recording, save_recording
+from pace_optim.run.folder import RunFolder
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
@@ -391,3 +394,23 @@ def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, mo
     fit(settings, ProgressLine(told))
     first, checked, _ = told.getvalue().partition("That was the fit; what follows checks it.")
     assert "error, all joints" in first and "armature" in first and checked
+
+
+def test_a_descent_begins_at_the_longest_step_that_the_drives_allow(tmp_path, monkeypatch):
+    (tmp_path / "stiff.xml").write_text(
+        '<mujoco model="stiff"><compiler angle="radian"/><worldbody><body>'
+        '<joint name="j" axis="0 1 0" range="-2 2"/>'
+        '<inertial pos="0 0.02 -0.08" mass="0.5" diaginertia="2e-3 2e-3 1e-3"/></body></worldbody>'
+        '<actuator><position joint="j" kp="160" kv="20" forcerange="-60 60"/></actuator></mujoco>'
+    )
+    steps = []
+    monkeypatch.setattr(optimization, "refine", lambda *args: steps.extend((args[0], args[-1])) or list(args[2]))
+    recording = dataclasses.replace(record(), joint_names=("j",), drive=Drive(), load=Load())
+    data = [str(save_recording(tmp_path / "r.npz", recording))]
+    settings = FitSettings(task=str(tmp_path / "stiff.xml"), data=data, log_dir=str(tmp_path))
+    run = Optimization(
+        settings, load_for_fit(settings, load_env_cfg(settings.task)), RunFolder(tmp_path), ProgressLine()
+    )
+    run._refine([])
+    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in steps)
+    assert fine < coarse == 0.0025
