@@ -42,7 +42,7 @@ def run_all(jobs: list[Job], results: Path, workers: int, limit: int | None = No
         for i, line in enumerate(pool.imap_unordered(run_job, left), start=1):
             file.write(json.dumps(line) + "\n")
             file.flush()
-            told = line.get("error") or f"{line.get('verdict', 'fitted')} {' + '.join(line.get('added', []))}"
+            told = line.get("error") or f"{line.get('verdict', 'not diagnosed')} {' + '.join(line.get('added', []))}"
             print(f"{i}/{len(left)} {time.perf_counter() - start:6.0f} s  {line['case']}: {told[:160]}", flush=True)
 
 
@@ -58,6 +58,13 @@ def main() -> None:
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
     parser.add_argument("--off", nargs="+", default=[], metavar="RULE", help="rules to switch off")
     parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
+    parser.add_argument(
+        "--ratio",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="diagnose only where effect / background is within",
+    )
     parser.add_argument("--device", default="cpu", help="where single joints are simulated: cpu or cuda:0")
     parser.add_argument("--limit", type=int, metavar="N", help="only N of the cases that are left")
     parser.add_argument("--folder", type=Path, default=Path("logs/hidden_effects"), help="recordings, runs, results")
@@ -75,6 +82,7 @@ def main() -> None:
                 physics_dt=args.physics_dt,
                 max_effects=args.max_effects,
                 off=tuple(args.off),
+                ratio=tuple(args.ratio) if args.ratio else None,
                 device=args.device,
             )
         except ValueError as error:

@@ -58,6 +58,8 @@ class Job:
     """Rules of the diagnosis that are switched off."""
     device: str = "cpu"
     """Where single joints are simulated."""
+    ratio: tuple[float, float] | None = None
+    """Beside a background: only cases whose effect makes so many times its error are diagnosed; ``None``: all."""
 
     @property
     def fits(self) -> Fits:
@@ -115,6 +117,9 @@ def run_job(job: Job) -> dict[str, Any]:
 
 def run_case(job: Job) -> dict[str, Any]:
     """Make the recordings, diagnose, and fit the model that has the true effects and no others."""
+    alone = {part: _base_error(job, part) for part in ("effects", "background")} if job.case.background else None
+    if job.ratio and alone and not job.ratio[0] <= alone["effects"] / max(alone["background"], 1e-9) <= job.ratio[1]:
+        return {"alone": alone}
     start = time.perf_counter()
     problem, truth = _load(job, job.case)
     made = time.perf_counter()
@@ -143,7 +148,6 @@ def run_case(job: Job) -> dict[str, Any]:
         else:
             with_truth = _rms(outcome.final_errors)
     fitted = time.perf_counter()
-    alone = {part: _base_error(job, part) for part in ("effects", "background")} if job.case.background else None
     return {
         "size": truth["size"],
         "noise": job.case.noise,
