@@ -14,6 +14,7 @@ from recordings import says
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording
 from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, understood, write_map
+from pace_optim.robot_logs.words import meaning
 from pace_optim.terminal.cli import run_cli
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the readers of logs are not installed")
@@ -405,6 +406,36 @@ def test_each_fault_of_a_map_has_its_message(tmp_path, change, words):
         load_recordings(path, ROBOT, read_map(tmp_path / "map.toml"))
 
 
+def test_axes_called_by_a_letter_and_a_slide_in_millimetres_are_told_apart(tmp_path):
+    axes = Robot(joint_names=("A1 shoulder", "A2 elbow", "A3 z"))
+    header = ["stamp_ns", "ref/A1", "ref/A2", "ref/A3_mm", "enc/A1_deg", "enc/A2_deg", "enc/A3_mm", "iq/A1", "iq/A2"]
+    columns = [STAMPS, *HELD.T, 1e3 * HELD[:, 0], *(POS * 180 / np.pi).T, 1e3 * POS[:, 0], *POS.T]
+    [found] = load_recordings(rows(header, columns, tmp_path / "scara.csv"), axes)
+    np.testing.assert_allclose(found.dof_pos, np.column_stack([POS, POS[:, 0]]), atol=1e-6)
+    np.testing.assert_allclose(found.des_dof_pos[:, 2], found.des_dof_pos[:, 0], atol=1e-6)
+    [bare] = load_recordings(
+        rows(["time", "A1_act", "A1_set"], [STAMPS / 1e9, POS[:, 0], HELD[:, 0]], tmp_path / "bare.csv"),
+        Robot(joint_names=("A1",)),
+    )
+    np.testing.assert_allclose(bare.dof_pos[:, 0], POS[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "joint"),
+    [
+        ("slide_vel_m_s", "m/s", ("slide",)),
+        ("speed mm/s", "mm/s", ()),
+        ("M1_pos", "", ("m", "1")),
+        ("tau_N_m_j1", "N m", ("j", "1")),
+        ("motor_current_A_2", "A", ("motor", "2")),
+        ("q_s1 [cm]", "cm", ("s", "1")),
+    ],
+)
+def test_a_letter_is_a_unit_only_where_it_stands_as_one(name, unit, joint):
+    said = meaning(name)
+    assert (said.unit, said.joint) == (unit, joint)
+
+
 def test_time_that_may_be_seconds_or_milliseconds_is_not_guessed(tmp_path):
     path = rows(["t", "hip pos", "hip cmd pos"], [np.arange(COUNT), POS[:, 0], HELD[:, 0]], tmp_path / "leg.csv")
     with pytest.raises(ValueError, match=says("steps by 1", "1 Hz, too slow", 'unit = "ms"')):
@@ -417,6 +448,12 @@ def test_what_names_say_nothing_about_is_said_all_at_once(tmp_path, monkeypatch)
     with pytest.raises(ValueError, match=says("positions", "commands", "The log holds")) as error:
         load_recordings(path, ROBOT)
     assert "\x1b" not in str(error.value)
+    template = (tmp_path / "leg_map.toml").read_text()  # nothing was guessed: what is wanted of each joint is shown
+    assert template.count('# dof_pos = {from = "COLUMN"') == template.count("# des_dof_pos = ") == 2
+    (tmp_path / "leg_map.toml").write_text(
+        template.replace("# dof_pos", "dof_pos").replace("# des_dof_pos", "des_dof_pos").replace("COLUMN", "b")
+    )
+    assert read_map(tmp_path / "leg_map.toml").joints.keys() == set(ROBOT.joint_names)
     (tmp_path / "leg.csv").write_text("time,,b\n0,1,2\n")
     with pytest.raises(ValueError, match=says("column 2 has no name")):
         load_recordings(path, ROBOT)

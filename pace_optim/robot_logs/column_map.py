@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import file_at, write_atomically
-from pace_optim.recording.keys import FACTS, JOINT_SERIES, did_you_mean, listed
+from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean, listed
 
 from .words import CURRENTS, TIME_UNITS, UNITS
 
@@ -164,7 +164,14 @@ def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
                 or (key == "factor" and source.unit in CURRENTS)
             ]
             lines.append(f"{series} = {{{', '.join(entry)}}}")
+        lines += [f'# {series} = {{from = "COLUMN", unit = "rad"}}' for series in _left_open(sources)]
     return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _left_open(sources: Mapping[str, Source]) -> list[str]:
+    """What a joint of a recording needs and has no channel for."""
+    position = [] if "dof_pos" in sources else ["dof_pos"]
+    return position + ([] if any(series in sources for series in COMMAND_SERIES) else ["des_dof_pos"])
 
 
 def _value(value: Any) -> str:

@@ -232,7 +232,7 @@ def _check_map(path: Path, columns: ColumnMap, names: Sequence[str]) -> None:
 
 def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: ColumnMap, notes: Sequence[str]) -> str:
     """The message, and a map to correct beside it."""
-    found = any(columns.joints.values())
+    columns = columns if columns.joints else replace(columns, joints={"JOINT": {}})
     target = _free(Path(f"{log.name.replace(' ', '_')}_map.toml"))
     known = [f"{key}: {len(channel.time)} values at {channel.rate:.4g} Hz" for key, channel in log.channels.items()]
     head = (
@@ -243,10 +243,8 @@ def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: Colu
         *known,
     )
     try:
-        if found:
-            write_map(target, columns, head)
+        write_map(target, columns, head)
         where = f"What was guessed is in {target}: complete it and give it with --columns {target}."
-        where = where if found else "Write a column map, and give it with --columns."
     except OSError:
         where = "Give a column map with --columns:\n" + map_text(columns)
     return printable(

@@ -10,9 +10,12 @@ import numpy as np
 POSITION, VELOCITY, EFFORT = "dof_pos", "dof_vel", "dof_effort"
 
 UNITS: dict[str, dict[str, float]] = {
-    POSITION: {"rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "turn": 2 * np.pi, "m": 1.0, "mm": 1e-3},
+    POSITION: {
+        "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "turn": 2 * np.pi, "m": 1.0, "cm": 1e-2, "mm": 1e-3,
+    },
     VELOCITY: {
-        "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "m/s": 1.0, "mm/s": 1e-3,
+        "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "m/s": 1.0, "cm/s": 1e-2,
+        "mm/s": 1e-3,
     },
     EFFORT: {"N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3},
 }  # fmt: skip
@@ -31,7 +34,8 @@ _MEASURED = {
 }  # fmt: skip
 _NO_QUANTITY = {
     "state", "states", "action", "actions", "cmd", "command", "commands", "commanded", "des", "desired", "target",
-    "goal", "ref", "reference", "setpoint", "actual", "measured", "meas", "present", "feedback",
+    "goal", "ref", "reference", "setpoint", "sp", "set", "actual", "act", "measured", "meas", "present", "feedback",
+    "fb", "encoder", "enc",
 }  # fmt: skip
 """Words that are said of positions where no quantity is."""
 _POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular"}
@@ -51,6 +55,9 @@ _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"m?rad(ians?)?[ _]?(/|per)[ _]?s(ec)?|rad_s\b", VELOCITY, "rad/s"),
     (r"\brpm\b", VELOCITY, "rpm"),
     (r"(rev|turns?)[ _]?(/|per)[ _]?s(ec)?|rps\b", VELOCITY, "turn/s"),
+    (r"\bmm[ _]?(/|per)[ _]?s(ec)?\b|mm_s\b", VELOCITY, "mm/s"),
+    (r"\bcm[ _]?(/|per)[ _]?s(ec)?\b|cm_s\b", VELOCITY, "cm/s"),
+    (r"\bm[ _]?(/|per)[ _]?s(ec)?\b|[ _]m_s\b", VELOCITY, "m/s"),
     (r"\bmn[ _.·*]?m\b", EFFORT, "mN m"),
     (r"\bn[ _.·*]?m\b", EFFORT, "N m"),
     (r"\bma\b|milliamps?", EFFORT, "mA"),
@@ -59,11 +66,15 @@ _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"\bdeg(rees?)?\b|°", POSITION, "deg"),
     (r"\brad(ians?)?\b", POSITION, "rad"),
     (r"\b(turns?|revs?|revolutions?)\b", POSITION, "turn"),
+    (r"\bmm\b", POSITION, "mm"),
+    (r"\bcm\b", POSITION, "cm"),
+    (r"[\[( ]m[\]) ]|[ _]m$", POSITION, "m"),
 )
 _UNIT_WORDS = {
-    "deg", "degree", "degrees", "rad", "radian", "radians", "rpm", "nm", "mnm", "n", "m", "s", "ms", "us", "ns",
-    "a", "ma", "turn", "turns", "rev", "dps", "per", "sec", "mrad", "rps",
+    "deg", "degree", "degrees", "rad", "radian", "radians", "rpm", "nm", "mnm", "ms", "us", "ns", "ma", "turn",
+    "turns", "rev", "dps", "per", "sec", "mrad", "rps", "mm", "cm",
 }  # fmt: skip
+"""Not the letters n, m, s and a, which name joints (A1): they are units only where a pattern above says so."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +108,8 @@ def meaning(name: str, table: str = "") -> Meaning:
         name: The column's name.
         table: What names the topic or file, in which a command may be told.
     """
+    unit, of_unit, without_unit = _unit(name)
     own, around = words(name), words(table)
-    unit, of_unit = _unit(name)
     said = set(own)
     current = (
         bool(said & _AMPERES)
@@ -121,7 +132,7 @@ def meaning(name: str, table: str = "") -> Meaning:
     if quantity == EFFORT and said & {"ff", "feedforward"}:
         commanded = True
     spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(around)
-    joint = tuple(word for word in own if word not in spoken)
+    joint = tuple(word for word in words(without_unit) if word not in spoken)
     if not unit and current and quantity == EFFORT:
         unit = "A"
     return Meaning(quantity=quantity, commanded=commanded, unit=unit if of_unit in ("", quantity) else "", joint=joint)
@@ -129,7 +140,7 @@ def meaning(name: str, table: str = "") -> Meaning:
 
 def is_time(name: str) -> bool:
     """Whether a column is called as time is."""
-    own = set(words(name)) - _UNIT_WORDS
+    own = set(words(name)) - _UNIT_WORDS - {"s"}
     return bool(own & _TIMES) and not own - _TIMES - {"header", "ros", "log", "unix", "epoch", "since", "start", "utc"}
 
 
@@ -150,11 +161,11 @@ def _of_table(said: set[str], around: set[str]) -> str:
     return POSITION if every & _NO_QUANTITY else ""
 
 
-def _unit(name: str) -> tuple[str, str]:
-    """Unit and the quantity that it is of."""
-    text = re.sub(r"[_.]", " ", name.lower()) + " "
+def _unit(name: str) -> tuple[str, str, str]:
+    """Unit, the quantity that it is of, and the name without it."""
+    text = re.sub(r"[_.]", " ", name.lower())
     for source in (name.lower(), text):
         for pattern, quantity, unit in _UNIT_PATTERNS:
-            if re.search(pattern, source.strip() if pattern.endswith("$") else source):
-                return unit, quantity
-    return "", ""
+            if found := re.search(pattern, source):
+                return unit, quantity, f"{name[: found.start()]} {name[found.end() :]}"
+    return "", "", name
