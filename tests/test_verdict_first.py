@@ -104,6 +104,18 @@ def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():
     assert np.sqrt(sandwich(columns, error).diagonal()) == pytest.approx(np.sqrt(expected.diagonal()), rel=0.1)
 
 
+def test_what_only_a_sum_shows_is_known_by_its_bounds_alone():
+    """An encoder bias and the phase of a ripple on a joint that gravity does not load: had error bars of 200 N m."""
+    generator = np.random.default_rng(0)
+    first, second = generator.normal(size=(2, 4000, 1))
+    error = 0.1 * generator.normal(size=(4000, 1))
+    covariance = sandwich(np.stack([first, first, second]), error, prior=1 / 3)
+    apart = sandwich(np.stack([first, second]), error)
+    assert covariance[0, 0] == pytest.approx(1 / 6, rel=0.01)  # half of what both were free by
+    assert covariance[:2, :2].sum() == pytest.approx(apart[0, 0], rel=0.01)  # while their sum is known
+    assert covariance[2, 2] == pytest.approx(apart[1, 1], rel=0.01)
+
+
 def test_likes_are_the_rivals_of_what_the_model_has_in_the_end():
     other = get_effect("payload")
     round_ = SimpleNamespace(chosen=[GAIN, None], rivals=[[other], []], models={GAIN: None, other: None})

@@ -18,6 +18,10 @@ NO_INFLUENCE = 1e-6
 """A parameter whose whole range moves the joints by less than this (RMS) has no influence [rad]."""
 WEAK_STD = 0.05
 """A direction known no better than this part of the bound range cannot be told apart."""
+SEEN = 1e-12
+"""A direction of JᵀJ, scaled to a unit diagonal, with less than this moves nothing but rounding errors."""
+_NOTHING_KNOWN = 1e6
+"""Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
 
 
@@ -95,7 +99,7 @@ def uncertainty_of(
         h = hessian[np.ix_(free, free)]
         scale = 1 / np.sqrt(h.diagonal())
         values, vectors = _eigen(h * scale[:, None] * scale)
-        kept = values > 1e-12
+        kept = values > SEEN
         inverse = (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
         covariance = inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
         normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
@@ -180,23 +184,33 @@ def autocovariance(error: np.ndarray) -> np.ndarray:
     return (full[: length + 1] * taper)[: max(1, length)]
 
 
-def sandwich(columns: np.ndarray, error: np.ndarray, ridge: float = 0.0) -> np.ndarray:
+def sandwich(columns: np.ndarray, error: np.ndarray, prior: float = np.inf) -> np.ndarray:
     """The covariance C = H⁻¹ (Jᵀ Σ J) H⁻¹ of the parameters of one joint, (P, P).
+
+    A combination of parameters that does not move the joint is known by the prior alone, the others by both:
+    (C⁻¹ + 1/p)⁻¹ = p - p² (C + p)⁻¹ with the prior's variance p.
 
     Args:
         columns: J, zero where a sample does not count, (P, K, R).
         error: (K, R).
-        ridge: Added to H, as a part of its diagonal.
+        prior: Variance of each parameter before the recording; infinite: nothing is known.
     """
     flat = columns.reshape(len(columns), -1)
     scale = 1 / np.maximum(np.linalg.norm(flat, axis=1), 1e-300)
     flat, columns = flat * scale[:, None], columns * scale[:, None, None]
-    hessian = flat @ flat.T + ridge * np.eye(len(flat))
-    middle = np.zeros_like(hessian)
+    values, vectors = _eigen(flat @ flat.T)
+    seen = values > SEEN
+    middle = np.zeros((len(flat), len(flat)))
     for r in range(error.shape[1]):
         middle += columns[..., r] @ _filtered(columns[..., r], autocovariance(error[:, r])).T
-    inverse = np.linalg.inv(hessian)
-    return inverse @ middle @ inverse * scale[:, None] * scale
+    inverse = (vectors[seen].T / values[seen]) @ vectors[seen] * scale[:, None]
+    covariance = inverse @ middle @ inverse.T
+    if not np.isfinite(prior):
+        return covariance
+    unseen, _ = np.linalg.qr(vectors[~seen].T * scale[:, None])
+    covariance += prior * _NOTHING_KNOWN * unseen @ unseen.T
+    every = np.eye(len(flat))
+    return prior * every - prior**2 * np.linalg.inv(covariance + prior * every)
 
 
 def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
