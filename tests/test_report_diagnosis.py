@@ -84,3 +84,10 @@ def test_it_is_drawn_without_a_complaint(tmp_path, verdict):
         )
     finally:
         browser.close()
+
+
+def test_a_command_can_be_copied_where_joints_have_spaces_and_there_are_several(tmp_path):
+    """`fit.py … --effects torque_ripple@A1 shoulder|A2` is two effects and a pipe."""
+    folder = write_run(tmp_path / "run")
+    write_json(folder / "diagnosis.json", make_diagnosis() | {"added": ["torque_ripple@A1 shoulder|A2"], "paying": []})
+    assert "--effects 'torque_ripple@A1 shoulder|A2'" in page_of(folder).text

@@ -2,6 +2,7 @@
 
 import argparse
 import io
+import shlex
 from pathlib import Path
 
 import matplotlib
@@ -102,6 +103,6 @@ def existing(path: Path) -> Path:
     if not path.exists():
         raise ValueError(
             f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {path.parent}"
+            f"scripts/fit.py --resume {shlex.quote(str(path.parent))}"
         )
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -120,7 +121,7 @@ def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, pr
     try:
         _, path = fit(settings, progress, before=run, on_start=keep, assess_interrupted=False)
     except KeyboardInterrupt:
-        how = f": {command('fit')} --resume {begun[0]} goes on with it" if begun else ""
+        how = f": {command('fit')} --resume {shlex.quote(str(begun[0]))} goes on with it" if begun else ""
         progress.close()
         progress.say(f"the fit of the whole robot was broken off{how}; the diagnosis above stands")
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -119,12 +120,13 @@ def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
 
 def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
     choice = told[0].choice
+    task = shlex.quote(problem.task)
     pairs = ", nor ".join(_named(each.pair, problem) for each in told)
     apart = _range([1e3 * each.apart for each in told], "{:.2g}")
     times = _range([each.times for each in told], "{:.0f}")
     return (
         f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
-        f"mrad, {times} times the noise. {command('data_collection')} --task {problem.task} {choice.arguments} "
+        f"mrad, {times} times the noise. {command('data_collection')} --task {task} {choice.arguments} "
         "--command_only --export_command next.csv"
     )
 
@@ -208,7 +210,7 @@ def _other_load(problem: Problem, like: Recording, joint: int, cfg: MenuCfg) -> 
     added = {**like.load.added_mass, body.name: like.load.added_mass.get(body.name, 0.0) + mass}
     yield (
         f", {mass:g} kg fixed to {body.name}",
-        f" --added_mass {body.name}={mass:g}",
+        f" --added_mass {shlex.quote(body.name)}={mass:g}",
         _loaded(like, added_mass=added),
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -244,7 +245,7 @@ def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: Colu
     )
     try:
         write_map(target, columns, head)
-        where = f"What was guessed is in {target}: complete it and give it with --columns {target}."
+        where = f"What was guessed is in {target}: complete it and give it with --columns {shlex.quote(str(target))}."
     except OSError:
         where = "Give a column map with --columns:\n" + map_text(columns)
     return printable(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from pathlib import Path
 
 _MOST_NAMED = 8
@@ -23,7 +24,9 @@ def find_run(log_dir: str | Path, robot_name: str, folder_name: str | None = Non
     log_dir = Path(log_dir)
     robots = sorted(path.name for path in log_dir.iterdir() if _runs(path)) if log_dir.is_dir() else []
     if not robots:
-        raise ValueError(f"There is no run under {log_dir}. Fit first: scripts/fit.py --task … --log_dir {log_dir}")
+        raise ValueError(
+            f"There is no run under {log_dir}. Fit first: scripts/fit.py --task … --log_dir {shlex.quote(str(log_dir))}"
+        )
     if robot_name not in robots:
         raise ValueError(
             f"There is no run of {robot_name!r} under {log_dir}. {_available('Robots', robots, robot_name)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -123,7 +124,7 @@ class RunFolder:
             robot=problem.env_cfg.sim2real.robot_name,
             task=problem.task,
             started=datetime.now().strftime("%Y-%m-%d %H:%M"),
-            folder=self.path,
+            folder=shlex.quote(str(self.path)),
             **{verb: command(verb) for verb in ("fit", "compare", "diagnose", "replay")},
         )
         write_atomically(self.path / "README.txt", lambda file: file.write(text.encode()))

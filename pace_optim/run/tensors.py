@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
         raise ValueError(
             f"{folder} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {folder}"
+            f"scripts/fit.py --resume {shlex.quote(str(folder))}"
         )
     content = _dict(read_tensors(path, _ANEW), path, ("joint_names", "recordings"))
     names, recordings = content["joint_names"], content["recordings"]

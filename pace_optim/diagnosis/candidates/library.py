@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from pace_actuators.effects import Effect, available_effects, get_effect
@@ -25,7 +26,7 @@ def candidate_effects(
     if curves:
         raise ValueError(
             f"{curves[0]} is a curve of any form: a diagnosis holds it against the effects that it finds without being "
-            f"told to. Leave it out, or fit it: scripts/fit.py --effects {curves[0]}."
+            f"told to. Leave it out, or fit it: scripts/fit.py --effects {shlex.quote(curves[0])}."
         )
     every = [] if only else [get_effect(name) for name in available_effects()]
     every = [effect for effect in every if switched_off or not effect.acts_while_off]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ class Diagnosis:
             ValueError: If it is missing or of another version.
         """
         path = Path(folder) / FILE
-        cure = f"Run scripts/diagnose.py {folder} first." if not path.exists() else "Diagnose again."
+        cure = f"Run scripts/diagnose.py {shlex.quote(str(folder))} first." if not path.exists() else "Diagnose again."
         content = read_json(path, cure)
         if not isinstance(content, dict) or content.get("version") != VERSION:
             raise ValueError(f"{path} is no diagnosis of version {VERSION}. {cure}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -59,12 +60,12 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
     return html(
         '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
         "fit with it.</p>{% elif effects %}<p>{{ why }}: <code>{{ command }} … --effects "
-        "{{ effects | join(' ') }}</code></p>{% endif %}{{ more }}</div>",
+        "{{ effects }}</code></p>{% endif %}{{ more }}</div>",
         css=css,
         heading=heading,
         summary=content["summary"],
         has_it=bool(effects) and set(effects) == set(had),
-        effects=effects,
+        effects=shlex.join(effects),
         why="Add it" if content["added"] else "Until it is known, this lowers the error",
         command=command("fit"),
         more=more,
