@@ -1,6 +1,7 @@
 """Runs compared from the command line: what is written, what is printed, and what is refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pace_optim.fit as fit_module
 from pace_actuators.files import write_tensors
 from pace_optim.comparison import compare, comparison_text
 from pace_optim.fit import fit
-from pace_optim.recording import Load, save_recording
+from pace_optim.recording import Load, load_recording, save_recording
 from pace_optim.report import write_report
 from pace_optim.report.sections.failure import _worst_place
 from pace_optim.run.open import Run
@@ -90,6 +91,17 @@ def test_repetitions_are_told_by_command_drive_and_load(bench):
     assert [r["repetitions"] for r in recordings] == [["again"], ["first"], []]
     sources = [r["noise_source"] for r in written(run)["joints"]["servo"]["recordings"]]
     assert sources == ["repetitions", "repetitions", "recording"]
+
+
+def test_repetitions_that_differ_by_more_than_noise_are_no_proof_of_a_good_model(bench, tmp_path):
+    """Their difference is the noise then, and the model was told to be as good as any."""
+    run, files = bench
+    changed = load_recording(files["again"])
+    changed = replace(changed, name="worn", dof_pos=changed.dof_pos + 2e-3 * np.sin(changed.time)[:, None])
+    save_recording(tmp_path / "worn.npz", changed)
+    content = compare([run], data=[files["first"], str(tmp_path / "worn.npz")])
+    note = next(note for note in content["notes"] if "have the same commands" in note)
+    assert note.startswith("first, worn have") and "servo moved differently by" in note and "No one model" in note
 
 
 def test_where_it_sits_is_there_for_each_recording(bench):

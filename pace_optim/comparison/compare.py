@@ -11,18 +11,23 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import write_together
+from pace_optim.recording.keys import listed
+from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
+from pace_optim.report.number_text import angle_unit
 from pace_optim.report.trajectory_errors import held_out_spans
 from pace_optim.run.open import run_folder
 
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder
 from .places import AT_THE_FLOOR, NEGLIGIBLE, worst_places
-from .tracks import RunTracks, load_tracks
+from .tracks import RunTracks, Track, load_tracks
 
 VERSION = 1
 FILE = "comparison.json"
 _DIGITS = 5
+_UNREPEATABLE = 3.0
+"""Repetitions that differ by this many times the noise that each shows by itself are not of the same robot."""
 
 
 def compare(
@@ -103,8 +108,28 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
             for track in run.tracks
         ],
         "joints": {joint: one.content for joint, one in zip(joints, compared, strict=True)},
-        "notes": list(run.notes),
+        "notes": [*run.notes, *_unrepeatable(joints, compared, run.tracks)],
     }
+
+
+def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tracks: Sequence[Track]) -> list[str]:
+    """Where recordings of the same commands differ by far more than their noise, which no one model explains."""
+    worst: dict[int, tuple[float, str]] = {}
+    for j, (name, one) in enumerate(zip(joints, compared, strict=True)):
+        for track, own in zip(tracks, one.content["recordings"], strict=True):
+            if own["noise_source"] != "repetitions":
+                continue
+            alone = noise_floor(track.measured[:, j], track.dt).sigma
+            times = own["noise_floor"] / max(alone, NEGLIGIBLE)
+            if times > _UNREPEATABLE and times > worst.get(track.group, (0.0, ""))[0]:
+                factor, unit = angle_unit([own["noise_floor"]])
+                apart = f"{factor * own['noise_floor']:.3g} {unit}, {times:.0f} times what is noise of each"
+                worst[track.group] = times, f"{name} moved differently by {apart}"
+    return [
+        f"{listed([t.name for t in tracks if t.group == group])} have the same commands, and {said}. No one model "
+        "explains them all, and the noise here is their difference: compare them one by one, or look for what changed."
+        for group, (_, said) in sorted(worst.items())
+    ]
 
 
 def _summary(compared: Sequence[JointComparison]) -> str:
