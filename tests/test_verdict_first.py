@@ -1,5 +1,6 @@
 """The verdict comes first: on the terminal, in the report, and how large what was found is."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,6 +95,29 @@ def test_sizes_and_error_bars_are_those_of_least_squares():
     (size,) = sizes(Fits(), outcome, ("servo",))
     assert size["effect"] == "torque_gain" and size["joint"] == "servo" and not size["at_bound"]
     assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
+
+
+def test_a_value_that_joints_share_has_the_error_bar_of_them_all():
+    robot = joint_alone()
+    base, both = JointModel.base(robot.problem), torch.tensor([True, True])
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    base = replace(base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1))
+    model, physical = base.extended(robot.truth_values.repeat(2, 1), GAIN, both, torch.ones(2, 1).double())
+    generator = torch.Generator().manual_seed(0)
+    one = torch.randn(model.size, 400, 1, 1, generator=generator).repeat(1, 1, 1, 2)
+    error = 1e-4 * torch.randn(400, 1, 1, generator=generator).repeat(1, 1, 2)
+    alone = replace(Fitted.start(model, physical), jacobian=one, error=error)
+    shared = replace(alone, model=replace(model, shared=frozenset({GAIN})), jacobian=None)
+
+    class Fits:
+        def looked_at(self, problem, models):
+            return [replace(each, jacobian=one, error=error) for each in models]
+
+    stds = [
+        [size["std"] for size in sizes(Fits(), SimpleNamespace(problem=None, final=final), ("hip", "knee"))]
+        for final in (alone, shared)
+    ]
+    assert stds[0][0] == stds[0][1] > 0 and stds[1] == pytest.approx([stds[0][0] / np.sqrt(2)] * 2)
 
 
 def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():

@@ -27,18 +27,21 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
 
     Returns:
         ``{"effect", "parameter", "joint", "value", "std", "unit", "factor", "at_bound"}`` each. ``std`` is ``None``
-        where a value is held or at a bound; ``factor`` says what was stated is multiplied by, if it is that.
+        where a value is held or at a bound, and that of all joints together where they share one; ``factor`` says what
+        was stated is multiplied by, if it is that.
     """
     now = outcome.final
     found = now.model.has & ~curves_in(now.model)
     if not bool(found.any()):
         return []
-    if now.jacobian is None or now.error is None:
+    if now.jacobian is None or now.error is None or now.model.shared:  # a common value was held while it was fitted
         now = fits.looked_at(outcome.problem, [now])[0]
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x)
     result = []
     for effect, has, held_back in zip(now.model.effects, found, stuck, strict=True):
         columns = now.model.columns(effect)
+        if effect in now.model.shared:
+            std[has, columns] = std[has, columns].pow(-2).sum(dim=0).pow(-0.5)
         for j in has.nonzero()[:, 0].tolist():
             own = zip(effect.parameters, now.physical[j, columns].tolist(), std[j, columns].tolist(), strict=True)
             result += [
