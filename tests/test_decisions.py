@@ -25,8 +25,8 @@ PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}
 """Numbers of arithmetic and units: halves, squares, tenths, percent, milli."""
 GUARDS = {"_RIDGE", "_PRIOR", "_LEAST", "_MOST", "_POINTS"}
 """Of the linear algebra, and of a grid over which a maximum is taken: none decides anything."""
-TELLING = {"_EFFECTS"}
-"""How much is printed."""
+TELLING = {"_EFFECTS", "_LEAST_TOLD"}
+"""How much is printed, and how exactly."""
 
 
 @pytest.mark.parametrize("case", CASES)

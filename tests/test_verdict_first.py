@@ -14,6 +14,7 @@ from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.telling.findings import percent_text
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
@@ -47,6 +48,14 @@ SIZE = {
 )
 def test_a_size_is_told_with_its_error_bar_and_as_a_factor_where_it_is_one(changes, text):
     assert size_text(SIZE | changes) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.876, "88"), (0.0042, "0.4"), (7e-7, "below 0.1"), (0.0, "below 0.1"), (-0.02, "-2")]
+)
+def test_a_share_is_told_as_a_person_reads_it(share, text):
+    """It said 7e-05 %."""
+    assert percent_text(share) == text
 
 
 def test_what_multiplies_what_was_stated_is_a_factor():

@@ -25,6 +25,9 @@ from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.fits import Fits
 
+_LEAST_TOLD = 0.1
+"""Smaller shares are said to be below this [%]."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
@@ -158,15 +161,17 @@ def _missing(found: Findings) -> str:
         )
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
-    parts = [f"{label} ({_percent(s)} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
+    parts = [f"{label} ({percent_text(s)} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
     if max(found.shares.values()) >= found.outcome.cfg.verdict.most:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
 
 
-def _percent(share: float) -> str:
+def percent_text(share: float) -> str:
     """A share in percent; one that is small beside another is not nothing."""
     percent = 100 * share
+    if abs(percent) < _LEAST_TOLD:
+        return f"below {_LEAST_TOLD}"
     return f"{percent:.0f}" if round(percent) else f"{percent:.1g}"
 
 
