@@ -141,6 +141,15 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     )
 
 
+@pytest.mark.parametrize(("left", "instead"), [(0.6, True), (0.4, False)])
+def test_effects_that_explain_less_than_half_do_not_keep_a_curve_away(fitted, curves, monkeypatch, left, instead):
+    """The verdict takes them out again: the joint ended with neither, on a robot of which other joints were known."""
+    outcome, (_, _, base) = ended(fitted, left), fitted
+    after = [replace(base, square=(0.35 if k == curves.best(0) else 0.9) * base.square) for k in range(len(CURVES))]
+    monkeypatch.setattr(Fits, "on_joints", lambda *_: ([outcome.base, *curves.models], [base, *after]))
+    assert fit_curves(Fits(), outcome, FLOOR).instead.tolist() == [instead]
+
+
 def test_a_curve_takes_the_place_of_several_effects(fitted, curves):
     one, spring = ended(fitted, 0.9), get_effect("parallel_spring")
     values = torch.tensor([[p.start for p in spring.parameters]], dtype=torch.float64)

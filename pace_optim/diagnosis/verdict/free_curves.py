@@ -54,8 +54,9 @@ def fit_curves(
     """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
-    one variable that leaves less than half of what all effects found leave says that those are not it. Joints with an
-    effect that the whole robot shares are left out.
+    one variable that leaves less than half of what all effects found leave says that those are not it. Effects that
+    explain less than half themselves are not it in any case, and a curve is held against the base model there. Joints
+    with an effect that the whole robot shares are left out.
 
     Args:
         fits: Fits models.
@@ -72,8 +73,8 @@ def fit_curves(
         return None
     say("fitting curves of any form in place of effects")
     ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
-    known = (get_effect(name) for name in available_effects())
-    effects = [each for each in known if issubclass(each, FreeForm) and each.variable in ranges]
+    every = (get_effect(name) for name in available_effects())
+    effects = [each for each in every if issubclass(each, FreeForm) and each.variable in ranges]
     without = Fitted.start(outcome.base.model, outcome.base.physical)
     starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
     models, errors = fits.on_joints(outcome.problem, starts, joints, outcome.base_errors)
@@ -82,10 +83,10 @@ def fit_curves(
     best = explained.argmax(dim=0)
     _, left = above_floor(outcome, floor)
     tried, cfg, instead = len(effects) * int(joints.sum()), outcome.cfg, torch.zeros_like(joints)
+    first = ~model.has.any(dim=0) | (left > (1 - cfg.verdict.most) * above[0])
     for j in joints.nonzero()[:, 0].tolist():
-        k, has_effects = int(best[j]), bool(model.has[:, j].any())
-        now = outcome.final_errors if has_effects else errors[0]
-        facts: dict[str, Any] = {"candidates": tried, "first": not has_effects, "base": float(errors[0].mse[j])}
+        k, now = int(best[j]), errors[0] if bool(first[j]) else outcome.final_errors
+        facts: dict[str, Any] = {"candidates": tried, "first": bool(first[j]), "base": float(errors[0].mse[j])}
         facts |= {"floor": float(floor[j]), "left": float(left[j])}
         instead[j] = bool(decide("curves", [j], now, {effects[k].name: errors[1 + k]}, cfg=cfg, log=log, **facts))
     return Curves(
