@@ -71,7 +71,7 @@ class HostKernels:
         self._functions[source](*map(as_argument, arguments))
 
     def pays(self, source: str, steps: int) -> bool:
-        """Whether a source is compiled before so many control steps: it was before, or as many have gone without it.
+        """Whether a source is compiled before so many control steps: it was before, or they are many with those before.
 
         Args:
             source: The source.
@@ -80,7 +80,7 @@ class HostKernels:
         if source in self._functions or self._path_of(source).exists():
             return True
         self._waited[source] = self._waited.get(source, 0) + steps
-        return self._waited[source] - steps >= _PATIENCE
+        return self._waited[source] >= _PATIENCE
 
     def address_of(self, source: str) -> int:
         """Where the function of a compiled one is."""

@@ -25,12 +25,14 @@ ARGUMENTS = {
     "memory": "double* memory",
     "bias": "double* bias",
     "out": "double* out",
+    "state": "double* state",
 }
 """What ``simulate`` is told, eight bytes each: MuJoCo's step; environments and recordings; the control steps from
 ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to
 which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and
-the forces of gravity and motion of each environment; what is shown (rows, environments, joints). Then the leaves of
-each drive, each with the memory of its delays behind it."""
+the forces of gravity and motion of each environment; what is shown (rows, environments, joints), and unless it is 0
+MuJoCo's positions and speeds there (rows, environments, nq + nv). Then the leaves of each drive, each with the memory
+of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + BEGIN
@@ -70,6 +72,7 @@ def robot_source(
     parts, names = len(programs[0].written), [drive.name for drive in drives]
     loop = []
     for part in range(parts):
+        loop += ["keep(m, d, robot, k, a);"] if part == 0 else []
         loop += [f"{name}_{part}(x, robot, m, d, k, a);" for name in names]
         loop += ["if (k == a->end) break;"] if part == 0 else []
         loop += ["a->step(m, d);"] if part + 1 < parts else []
@@ -83,6 +86,12 @@ typedef struct {{
   {arguments};
   const double* leaves[{len(names)}];
 }} Arguments;
+static void keep(const mjModel* m, const mjData* d, long long robot, long long k, const Arguments* a) {{
+  if (!a->state || a->slot[k] < 0) return;
+  double* kept = a->state + (a->slot[k] * a->robots + robot) * (m->nq + m->nv);
+  memcpy(kept, d->qpos, m->nq * sizeof(double));
+  memcpy(kept + m->nq, d->qvel, m->nv * sizeof(double));
+}}
 {functions}
 extern "C" void simulate(const mjModel* model, mjData* d, int robot, void* arguments) {{
   mjModel* m = (mjModel*)model;

@@ -134,23 +134,42 @@ class Rollout:
         shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
         return torch.stack([position.clone() for k, position in shown if k in wanted])
 
-    def _in_one_go(self, at: torch.Tensor) -> torch.Tensor:
-        """Simulated positions at control steps, (len(at), num_envs, n) [rad]."""
+    def motion(self, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Simulate that many control steps, as :meth:`simulated` does.
+
+        Returns:
+            Sensed positions at each, (steps, num_envs, n) [rad], and there MuJoCo's positions, (steps, num_envs, nq),
+            and speeds, (steps, num_envs, nv).
+        """
+        sim, sizes = self.env.sim, [self.env.sim.qpos.shape[1], self.env.sim.qvel.shape[1]]
+        state = torch.empty(steps, self.env.num_envs, sum(sizes), dtype=sim.dtype, device=sim.device)
+        positions, speeds = state.split(sizes, dim=-1)
+        return self._in_one_go(torch.arange(steps), state), positions, speeds
+
+    def _in_one_go(self, at: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+        """Simulated positions at control steps, (len(at), num_envs, n) [rad]; ``state`` gets MuJoCo's there."""
         last, robot = int(at[-1]), self.robot
+
+        def note(row: int) -> None:
+            result[row] = robot.sensed_joint_pos()
+            if state is not None:
+                state[row] = torch.cat([self.env.sim.qpos, self.env.sim.qvel], dim=1)
+
         shape = len(at), self.env.num_envs, robot.num_joints
         result = torch.empty(shape, dtype=self.env.dtype, device=self.env.device)
         begin = int(at[0] == 0)
         if begin:
-            result[0] = robot.sensed_joint_pos()
+            note(0)
         if last > 0:
             self.advance(0)
-            compiled = self._compiled.positions(at[begin:])
+            compiled = self._compiled.positions(at[begin:], None if state is None else state[begin:])
             if compiled is None:
                 row = {k: i for i, k in enumerate(at.tolist())}
                 for k in range(1, last + 1):
-                    shown = robot.sensed_joint_pos()
                     if k in row:
-                        result[row[k]] = shown
+                        note(row[k])
+                    else:
+                        robot.sensed_joint_pos()  # brings the motor to the present
                     if k < last:
                         self.advance(k)
             else:

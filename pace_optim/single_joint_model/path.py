@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -133,17 +133,15 @@ def reference_path(
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
-    sim, positions, speeds = rollout.env.sim, [], []
+    moved: list[torch.Tensor] = []
 
-    def noted(steps: int) -> Iterator[torch.Tensor]:
-        for shown in rollout.simulated(steps):
-            positions.append(sim.qpos.clone())
-            speeds.append(sim.qvel.clone())
-            yield shown
+    def noted(steps: int) -> Iterable[torch.Tensor]:
+        shown, *moved[:] = rollout.motion(steps)
+        return shown
 
     shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
-    steps = len(shown)
-    motion = torch.stack(positions[:steps]), torch.stack(speeds[:steps])
+    positions, speeds = (each[: len(shown)].clone() for each in moved)
+    motion = positions, speeds
     if problem.joints_stand_alone:
         return _along(problem, values, model_effects, rollout, *motion)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
