@@ -21,10 +21,13 @@ from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
 from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fits import Fits, fits_on
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE
 from pace_optim.single_joint_model import reference_path, twin_problem
+
+FITS = fits_on("cpu", DiagnosisCfg().fitting)
+"""As a diagnosis has them: compiled, where there is a compiler."""
 
 
 def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:

@@ -2,13 +2,12 @@
 
 import pytest
 import torch
-from diagnoses import joint_alone
+from diagnoses import FITS, joint_alone
 
 from pace_actuators.effects import EffectCfg, EffectParameter, available_effects, get_effect
 from pace_envs import load_env_cfg
 from pace_envs.tasks.pace.parameters import effect_parameters
 from pace_optim.diagnosis.search.one_round import beyond_bounds, with_likes
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.labels import labels
 from pace_optim.single_joint_fits.model import JointModel
@@ -79,7 +78,7 @@ def test_a_fit_that_a_bound_holds_back_goes_on_beyond_it():
 
     def refit(starts):
         calls.append(starts)
-        return Fits().coarse_to_fine(robot.twins, starts)
+        return FITS.coarse_to_fine(robot.twins, starts)
 
     start = Fitted.start(model, values, tried=OFFSET)
     (fitted,) = beyond_bounds([start], refit, lambda _: None)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import FakeFits, errors_of, joint_alone, with_effects
+from diagnoses import FITS, FakeFits, errors_of, joint_alone, with_effects
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
@@ -12,7 +12,6 @@ from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.search.search import _without_vanished
 from pace_optim.diagnosis.telling.findings import Findings, summary_of
 from pace_optim.diagnosis.verdict.contributions import contributions
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.labels import labels
 from pace_optim.single_joint_fits.model import JointModel
 
@@ -63,9 +62,7 @@ def test_what_is_due_to_an_effect_is_what_is_lost_without_it(bench, without, exp
     assert list(each.values()) == pytest.approx(expected, abs=1e-3)
     found = findings(outcome, each)
     assert summary_of(found, bench.problem).startswith(said)
-    assert contributions(Fits(), SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {
-        GAIN: 1.0
-    }
+    assert contributions(FITS, SimpleNamespace(final=with_effects(base, values, (GAIN, [True], [0.8])))) == {GAIN: 1.0}
 
 
 def test_an_effect_that_has_ended_where_it_vanishes_is_none(bench):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import joint_alone
+from diagnoses import FITS, joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
@@ -24,7 +24,6 @@ from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot, _merged
 from pace_optim.single_joint_model import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
-FITS = Fits()
 
 
 def descent(start, rough=False):
@@ -277,7 +276,7 @@ def test_a_model_that_is_done_is_simulated_no_further_and_changes_nothing_beside
 
     def side_by_side(problem, slots, training):
         batches.append(len(slots))
-        return SideBySide(problem, slots, training=training)
+        return FITS.batch(problem, slots, training=training)
 
     together = Fits(batch=side_by_side).side_by_side(bench.twins, starts, 4)
     assert batches == [2, 1]

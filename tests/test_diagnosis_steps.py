@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnoses import errors_of, joint_alone, make_search, make_trial, outcome_of, with_effects
+from diagnoses import FITS, errors_of, joint_alone, make_search, make_trial, outcome_of, with_effects
 from problems import DT
 
 from pace_actuators.effects import get_effect
@@ -20,7 +20,6 @@ from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 from pace_optim.experiment_design import telling_apart
 from pace_optim.experiment_design.telling_apart import MenuCfg, distances, menu, next_experiments
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.labels import labels
 from pace_optim.single_joint_fits.model import BASE, JointModel
@@ -138,12 +137,12 @@ def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monk
 
 def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
     start, coarse = Fitted.start(JointModel.base(bench.problem), bench.truth_values), bench.twins.with_physics_dt(DT)
-    fitted, effort = Fits().side_by_side(bench.twins, [start], 2, True)[0], torch.tensor([5.0], dtype=torch.float64)
+    fitted, effort = FITS.side_by_side(bench.twins, [start], 2, True)[0], torch.tensor([5.0], dtype=torch.float64)
     effects = [get_effect(name) for name in ("stribeck_friction", "measurement_delay", "com_offset")]
-    found = absorbed_effects(Fits(), coarse, fitted, effects, effort, DEFAULT.candidates)
+    found = absorbed_effects(FITS, coarse, fitted, effects, effort, DEFAULT.candidates)
     assert [effect.name for effect in found] == ["measurement_delay", "com_offset"]
     fitted.jacobian.normal_()  # as rough as a narrow step sees joints that stick
-    rough = absorbed_effects(Fits(), coarse, fitted, effects, effort, DEFAULT.candidates)
+    rough = absorbed_effects(FITS, coarse, fitted, effects, effort, DEFAULT.candidates)
     assert [effect.name for effect in rough] == ["measurement_delay", "com_offset"]
 
 

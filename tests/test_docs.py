@@ -40,10 +40,11 @@ def type_in(page: Path, home: Path, start: Path) -> str:
             (home / f"block_{i}.py").write_text(text, encoding="utf-8")
             script.append(f"python - < {home / f'block_{i}.py'}")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    kernels = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")  # each takes a compiler seconds
     run = subprocess.run(
         ["bash", "-c", "\n".join(script)],
         cwd=start,
-        env={**os.environ, "HOME": str(home), "PATH": path, "PYTHONUTF8": "1"},
+        env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": kernels, "PATH": path, "PYTHONUTF8": "1"},
         capture_output=True,
         text=True,
         timeout=280,

@@ -85,6 +85,22 @@ def no_report(monkeypatch):
     monkeypatch.setattr(fit_module, "write_report", lambda folder: None)
 
 
+@pytest.fixture(scope="module")
+def whole(recordings, tmp_path_factory):
+    """Fits that nobody interrupts, each made once; their folders are not changed."""
+    made = {}
+
+    def of(data, **options):
+        key = (data, *sorted(options.items()))
+        if key not in made:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(fit_module, "write_report", lambda folder: None)
+                made[key] = run(tmp_path_factory.mktemp("whole"), recordings[data], **options)
+        return made[key]
+
+    return of
+
+
 def range_error(result):
     return max(
         abs(value - TRUTH[name]) / RANGES[name] for name, keys in result.parameters.items() for value in keys.values()
@@ -208,8 +224,8 @@ def test_two_runs_in_the_same_second_have_folders_of_their_own(recordings, tmp_p
     assert len(folders) == 2
 
 
-def test_results_are_read_without_pickle(recordings, tmp_path, no_report, monkeypatch):
-    _, folder = run(tmp_path, recordings["clean"], optimizer="least_squares")
+def test_results_are_read_without_pickle(whole, monkeypatch):
+    _, folder = whole("clean", optimizer="least_squares")
 
     def refuse(*args, **kwargs):
         raise AssertionError("pickle was used")
@@ -272,18 +288,18 @@ def same_result(resumed, whole):
     ],
 )
 def test_an_interrupted_fit_ends_cleanly_and_resumes_to_the_same_result(
-    optimizer, method, count, recordings, tmp_path, no_report, monkeypatch
+    optimizer, method, count, whole, recordings, tmp_path, no_report, monkeypatch
 ):
     options = {"optimizer": optimizer, "max_iteration": 20, "save_optimization_process": True}
-    data = recordings["wrong" if optimizer == "hybrid" else "noisy"]  # the wrong one takes more iterations
-    whole, whole_folder = run(tmp_path, data, **options)
+    data = "wrong" if optimizer == "hybrid" else "noisy"  # the wrong one takes more iterations
+    expected, whole_folder = whole(data, **options)
     with monkeypatch.context() as patch:
         interrupt_after(patch, method, count)
-        half, folder = run(tmp_path, data, **options)
+        half, folder = run(tmp_path, recordings[data], **options)
     assert half.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
     resumed, again = resume(folder, progress=Silent())
-    assert again == folder and same_result(resumed, whole)
-    assert json.loads((folder / "result.json").read_text())["stop_reasons"] == whole.stop_reasons
+    assert again == folder and same_result(resumed, expected)
+    assert json.loads((folder / "result.json").read_text())["stop_reasons"] == expected.stop_reasons
     if optimizer == "cmaes":
         one, other = (torch.load(f / "progress.pt", weights_only=True) for f in (folder, whole_folder))
         assert torch.equal(one["params"], other["params"]) and torch.equal(one["scores"], other["scores"])

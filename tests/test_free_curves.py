@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import hidden_run
+from diagnoses import FITS, hidden_run
 from problems import BENCH, CALM
 
 from pace_actuators.effects import available_effects, get_effect
@@ -75,8 +75,8 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def fitted(run):
     """Its base model, and what that leaves."""
-    twins, base, _ = fit_base(Fits(), run.problem, run.problem.space.to_physical(run.problem.space.start))
-    return twins, base, Fits().validation_errors(twins, [base])[0]
+    twins, base, _ = fit_base(FITS, run.problem, run.problem.space.to_physical(run.problem.space.start))
+    return twins, base, FITS.validation_errors(twins, [base])[0]
 
 
 def ended(fitted, part, effect="quadratic_friction"):
@@ -98,7 +98,7 @@ def ended(fitted, part, effect="quadratic_friction"):
 
 @pytest.fixture(scope="module")
 def curves(fitted):
-    return fit_curves(Fits(), ended(fitted, 1.0), FLOOR)
+    return fit_curves(FITS, ended(fitted, 1.0), FLOOR)
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
@@ -122,7 +122,7 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
         outcome = replace(outcome, final_errors=replace(best, square=times * best.square))
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
     monkeypatch.setattr(Fits, "on_joints", lambda *_: fits)
-    found = fit_curves(Fits(), outcome, FLOOR)
+    found = fit_curves(FITS, outcome, FLOOR)
     assert found.instead.tolist() == [instead]
     outcome = take_curves(outcome, found)
     if not instead:
@@ -136,7 +136,7 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
     at_floor = replace(outcome, final_errors=replace(outcome.final_errors, square=0.0 * outcome.final_errors.square))
     assert verdict(at_floor, FLOOR)[0] == "unknown"
     # what it says of its errors is what its model leaves
-    assert Fits().validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
+    assert FITS.validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
         outcome.final_errors.mse.tolist(), rel=1e-3
     )
 
@@ -147,7 +147,7 @@ def test_effects_that_explain_less_than_half_do_not_keep_a_curve_away(fitted, cu
     outcome, (_, _, base) = ended(fitted, left), fitted
     after = [replace(base, square=(0.35 if k == curves.best(0) else 0.9) * base.square) for k in range(len(CURVES))]
     monkeypatch.setattr(Fits, "on_joints", lambda *_: ([outcome.base, *curves.models], [base, *after]))
-    assert fit_curves(Fits(), outcome, FLOOR).instead.tolist() == [instead]
+    assert fit_curves(FITS, outcome, FLOOR).instead.tolist() == [instead]
 
 
 def test_a_curve_takes_the_place_of_several_effects(fitted, curves):
@@ -163,11 +163,11 @@ def test_a_curve_takes_the_place_of_several_effects(fitted, curves):
 
 def test_no_curve_is_fitted_near_the_floor(fitted):
     near = (fitted[2].mse.sqrt() / 2.5).double()
-    assert fit_curves(Fits(), ended(fitted, 1.0), near) is None
+    assert fit_curves(FITS, ended(fitted, 1.0), near) is None
 
 
 def test_a_joint_keeps_what_the_whole_robot_shares(fitted):
-    assert fit_curves(Fits(), ended(fitted, 0.9, "clock_skew"), FLOOR) is None
+    assert fit_curves(FITS, ended(fitted, 0.9, "clock_skew"), FLOOR) is None
 
 
 def errors_of(*rmse):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from diagnoses import FITS
 from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import get_effect
@@ -14,7 +15,6 @@ from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.single_joint_fits.base_fit import fit_base, later_than_most
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.model import BASE
 
 LATE_LOG = get_effect("measurement_delay")
@@ -35,7 +35,7 @@ def logged_late(recording):
 def legs():
     """A motion of a robot's legs, as it was."""
     cfg = env_cfg(ANYMAL)
-    set_physics_dt(cfg, DT / 10)
+    set_physics_dt(cfg, DT / 5)
     target = legs_chirp(cfg, 4.5)
     target = np.concatenate([np.repeat(target[:1], 20, axis=0), target])
     return [record(factor * target, TRUTH, cfg=cfg, noise=1e-4, seed=i) for i, factor in enumerate((1.0, 0.7))]
@@ -45,7 +45,7 @@ def fitted(legs, change=lambda recording: recording):
     train, validation = legs
     problem = make_problem(change(train), cfg=env_cfg(ANYMAL), validation=[change(validation)])
     problem = problem.with_physics_dt(DT / 2)
-    return problem, *fit_base(Fits(), problem, physical(problem, TRUTH))
+    return problem, *fit_base(FITS, problem, physical(problem, TRUTH))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_a_joint_is_late_beside_a_delay_that_most_joints_have(delay, late):
 
 def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     problem, twins, base, effort = fitted(legs, logged_late)
-    held, (sentence,) = hold_late_joints(Fits(), twins, base)
+    held, (sentence,) = hold_late_joints(FITS, twins, base)
     late = torch.tensor([name in LATE for name in problem.joint_names])
     delay = held.model.to_physical(held.x)[:, BASE.index("delay")]
     assert delay.tolist() == pytest.approx([TRUTH["delay"]] * len(late), abs=0.1)
@@ -82,13 +82,13 @@ def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     assert [float(ms) for ms in said.groups()] == pytest.approx([5.0, 5.0, 5.0], abs=0.5)
     assert bool((held.score[late] > 20 * base.score[late]).all())
     assert torch.allclose(held.score[~late], base.score[~late], rtol=1e-3)
-    absorbed = absorbed_effects(Fits(), twins, held, [LATE_LOG], effort, DEFAULT.candidates)
+    absorbed = absorbed_effects(FITS, twins, held, [LATE_LOG], effort, DEFAULT.candidates)
     assert torch.equal(absorbed[LATE_LOG], ~late)
 
 
 def test_where_no_joint_is_late_the_base_model_stays_as_it_is(punctual):
     twins, base = punctual
-    assert hold_late_joints(Fits(), twins, base) == (base, [])
+    assert hold_late_joints(FITS, twins, base) == (base, [])
 
 
 def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypatch):
@@ -97,4 +97,4 @@ def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypat
     monkeypatch.setattr(
         "pace_optim.diagnosis.beginning.shared_delay.later_than_most", lambda delay, cfg: torch.arange(len(delay)) == 4
     )
-    assert hold_late_joints(Fits(), twins, base) == (base, [])
+    assert hold_late_joints(FITS, twins, base) == (base, [])

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import joint_alone
+from diagnoses import FITS, joint_alone
 from problems import DT
 
 from pace_optim.recording import windows
@@ -45,8 +45,8 @@ def off(bench, fitted):
 
 
 def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
-    with_all = Fits().over_wide_steps(bench.swinging, away(bench))
-    trimmed = Fits().trimmed(bench.swinging, with_all, ALL)
+    with_all = FITS.over_wide_steps(bench.swinging, away(bench))
+    trimmed = FITS.trimmed(bench.swinging, with_all, ALL)
     assert off(bench, with_all) > 0.05
     assert off(bench, trimmed) < 0.02
 
@@ -54,10 +54,10 @@ def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
 def test_windows_that_do_not_count_are_as_if_they_were_not_there(bench):
     kept = torch.ones(10, 1, dtype=torch.bool)
     kept[-1] = False
-    without = Fits().over_wide_steps(bench.swinging, away(bench), kept)
+    without = FITS.over_wide_steps(bench.swinging, away(bench), kept)
     train = bench.swinging.dataset.train.clone()
     train[bench.place] = False
-    expected = Fits().over_wide_steps(
+    expected = FITS.over_wide_steps(
         replace(bench.swinging, dataset=replace(bench.swinging.dataset, train=train)), away(bench)
     )
     assert torch.allclose(without.x, expected.x, atol=1e-6)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import joint_alone, make_diagnosis, outcome_of
+from diagnoses import FITS, joint_alone, make_diagnosis, outcome_of
 from run_folders import write_run
 from test_report import page_of
 
@@ -19,7 +19,6 @@ from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.report.sizes import size_text
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import JointModel
 from pace_optim.uncertainty.uncertainty import sandwich
@@ -99,9 +98,9 @@ def test_sizes_and_error_bars_are_those_of_least_squares():
     robot = joint_alone()
     model, none = JointModel.base(robot.problem), torch.zeros(1, 1, dtype=torch.float64)
     extended, values = model.extended(robot.truth_values, GAIN, torch.tensor([True]), none + GAIN.parameters[0].null)
-    now = Fits().side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
+    now = FITS.side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
     outcome = SimpleNamespace(problem=robot.twins, final=now, cfg=DEFAULT)
-    (size,) = sizes(Fits(), outcome, ("servo",))
+    (size,) = sizes(FITS, outcome, ("servo",))
     assert size["effect"] == "torque_gain" and size["joint"] == "servo" and not size["at_bound"]
     assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
 
