@@ -15,7 +15,7 @@ from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.single_joint_fits import base_fit
 from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.descent import JointDescent
+from pace_optim.single_joint_fits.descent import TRIALS, JointDescent
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE, JointModel, start_values, whole_values
@@ -309,6 +309,27 @@ def test_a_descent_ends_when_every_joint_has_once_come_to_its_end(bench):
     gains = [[small, 0.5], [small, 0.5], [0.5, small], [0.5, small], [0.5, 0.5]]  # the first joint gains again later
     way, asked = gaining(two, bench.truth_values.repeat(2, 1), gains)
     assert way.finished and asked == 5
+
+
+def test_a_neighbour_moves_another_entry_of_each_joint(bench):
+    """As many rows as the joint with most free entries needs, whatever effects the others have."""
+    one = JointModel.base(bench.problem)
+    two = replace(
+        one, has=torch.zeros(0, 2, dtype=torch.bool), lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1)
+    )
+    two = two.with_effect(GAIN, torch.tensor([True, False])).with_effect(STRIBECK, torch.tensor([False, True]))
+    size, most = two.size, len(BASE) + len(STRIBECK.parameters)
+    assert size == most + 1 == two.most_free + 1
+    start = Fitted(model=two, x=torch.full((2, size), 0.1).double(), score=torch.full((2,), torch.inf).double())
+    columns = torch.randn(50, size, 2, generator=torch.Generator().manual_seed(0)).double()
+    way = JointDescent(start, torch.full((2,), 50.0), True, False, DEFAULT.fitting)
+    rows = way.ask()
+    assert len(rows) == most + len(TRIALS)
+    moved = (rows[1 : 1 + most] != way.x).sum(dim=0)
+    assert torch.equal(moved, two.free.long())  # each once
+    way.tell(rows, torch.einsum("rjp,kpj->rkj", rows, columns)[:, :, None])
+    found = way.result().jacobian[:, :, 0]
+    assert torch.allclose(found, (columns * two.free.T).transpose(0, 1), atol=1e-9)
 
 
 def test_a_model_goes_on_that_is_near_the_best_on_any_joint():

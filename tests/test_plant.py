@@ -129,7 +129,8 @@ def test_a_link_swings_on_behind_a_motor_that_sticks():
 def test_a_finer_step_changes_the_motion_by_less_than_the_noise(name):
     effects = {} if name is None else {name: draw_effect(name, ROBOT, np.random.default_rng(1))}
     truth = Truth(base=BASE, effects=effects)
-    usual, fine = (positions(truth, cfg=PlantCfg(noise=0.0, step=step)) for step in (PlantCfg().step, 5e-5))
+    runs = [run_of(chirp(1.5))]
+    usual, fine = (positions(truth, runs, PlantCfg(noise=0.0, step=step)) for step in (PlantCfg().step, 5e-5))
     assert motion_change(usual, fine) < (1e-4 if name == "backlash" else 3e-5)
 
 
@@ -200,15 +201,22 @@ def _replay(dataset, space, x, ratio, delay_mode):
 # --- effects
 
 
+CHIRP = [run_of(chirp(amplitude=0.8), session_start=30.0)]
+COARSE = PlantCfg(noise=0.0, step=5e-4)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Without effects."""
+    return positions(Truth(base=BASE), CHIRP, COARSE)
+
+
 @pytest.mark.parametrize("name", sorted(EFFECTS))
-def test_every_effect_changes_the_motion_and_its_null_does_not(name):
-    runs = [run_of(chirp(amplitude=0.8), session_start=30.0)]
-    cfg = PlantCfg(noise=0.0, step=5e-4)
-    plain = positions(Truth(base=BASE), runs, cfg)
+def test_every_effect_changes_the_motion_and_its_null_does_not(name, plain):
     drawn = draw_effect(name, ROBOT, np.random.default_rng(0))
-    assert motion_change(positions(Truth(base=BASE, effects={name: drawn}), runs, cfg), plain) > 3e-5
+    assert motion_change(positions(Truth(base=BASE, effects={name: drawn}), CHIRP, COARSE), plain) > 3e-5
     nothing = {parameter: {} for parameter in EFFECTS[name].draws}
-    assert motion_change(positions(Truth(base=BASE, effects={name: nothing}), runs, cfg), plain) < 1e-9
+    assert motion_change(positions(Truth(base=BASE, effects={name: nothing}), CHIRP, COARSE), plain) < 1e-9
 
 
 def test_the_library_has_every_effect_of_the_list_and_outside_it_there_are_at_least_four():

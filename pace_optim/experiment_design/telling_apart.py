@@ -91,12 +91,13 @@ def next_experiments(
     cfg = cfg or MenuCfg()
     if not pairs or problem.env_cfg.sim2real.excitation is None:
         return [f"These recordings cannot tell {_named(pair, problem)}. {pair.hint}".rstrip() for pair in pairs]
-    menus = [list(menu(problem, pair.joints[0], cfg)) for pair in pairs]
-    apart = distances(problem, pairs, [[choice.recording for choice in choices] for choices in menus])
+    menus = {joint: list(menu(problem, joint, cfg)) for joint in dict.fromkeys(pair.joints[0] for pair in pairs)}
+    recordings = {joint: [choice.recording for choice in choices] for joint, choices in menus.items()}
+    apart = distances(problem, pairs, [recordings[pair.joints[0]] for pair in pairs])
     predictions = [
         Prediction(pair=pair, choice=choice, apart=each, times=each / float(noise[pair.joints].mean()))
-        for pair, choices, own in zip(pairs, menus, apart, strict=True)
-        for choice, each in zip(choices, own.tolist(), strict=True)
+        for pair, own in zip(pairs, apart, strict=True)
+        for choice, each in zip(menus[pair.joints[0]], own.tolist(), strict=True)
     ]
     clear = [each for each in predictions if each.times >= cfg.clear]
     result, left = [], list(pairs)
@@ -169,15 +170,17 @@ def distances(
 
     Args:
         problem: The whole robot.
-        pairs: Pairs of models.
+        pairs: Pairs of models; a model of several pairs is simulated once on the same recordings.
         recordings: What each pair is simulated on.
     """
-    datasets = [make_dataset(own, train_fraction=1) for own in recordings]
-    items = [(model, data) for pair, data in zip(pairs, datasets, strict=True) for model in pair.models]
-    errors = parallel_map(lambda own: [_predicted(problem, model, data) for model, data in own], items)
+    of_pairs = [[(model, id(own)) for model in pair.models] for pair, own in zip(pairs, recordings, strict=True)]
+    items = list(dict.fromkeys(item for pair in of_pairs for item in pair))
+    datasets = {id(own): make_dataset(own, train_fraction=1) for own in recordings}
+    found = parallel_map(lambda some: [_predicted(problem, model, datasets[own]) for model, own in some], items)
+    errors = dict(zip(items, found, strict=True))
     return [
-        (errors[2 * i] - errors[2 * i + 1])[..., pair.joints].square().mean(dim=(0, 2)).sqrt()
-        for i, pair in enumerate(pairs)
+        (errors[one] - errors[other])[..., pair.joints].square().mean(dim=(0, 2)).sqrt()
+        for pair, (one, other) in zip(pairs, of_pairs, strict=True)
     ]
 
 

@@ -20,7 +20,11 @@ TRIALS = DAMPING_TRIALS[:-1]
 
 
 class JointDescent:
-    """One model's descent: rows are the favoured step, its P neighbours for the next Jacobian, and the other trials."""
+    """One model's descent: rows are the favoured step, its neighbours for the next Jacobian, and the other trials.
+
+    In a neighbour every joint has another one of its free entries moved, so that there are as many as a joint has, and
+    not as many as all joints have together.
+    """
 
     def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool, cfg: FittingCfg):
         """Begin at the model's x.
@@ -34,18 +38,19 @@ class JointDescent:
         """
         self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
-        n, size = start.x.shape
+        n = len(start.x)
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
         self._damping = torch.full((n,), FIRST_DAMPING, dtype=torch.float64)
-        self._hessian = torch.zeros(n, size, size, dtype=torch.float64)
-        self._gradient = torch.zeros(n, size, dtype=torch.float64)
+        self._free = [own.nonzero()[:, 0] for own in start.model.free]
+        most = start.model.most_free
+        self._hessian = torch.zeros(n, most, most, dtype=torch.float64)
+        self._gradient = torch.zeros(n, most, dtype=torch.float64)
         self._known = torch.zeros(n, dtype=torch.bool)
         self._still = torch.zeros(n, dtype=torch.long)
         self._converged = torch.zeros(n, dtype=torch.bool)
         self._widths = torch.tensor([*(cfg.wide if rough else ()), cfg.narrow], dtype=torch.float64)
         self._width = torch.zeros(n, dtype=torch.long)
-        self._free = start.model.free
         self._jacobian: torch.Tensor | None = None
         self._error: torch.Tensor | None = None
         self._scores: list[float] = []
@@ -56,8 +61,7 @@ class JointDescent:
         return bool(self._converged.all())
 
     def ask(self) -> torch.Tensor:
-        """Normalised rows, (P + trials, n, P)."""
-        size = self.x.shape[1]
+        """Normalised rows, (neighbours + trials, n, P)."""
         trials = self.x.repeat(len(TRIALS), 1, 1)
         for j in self._known.nonzero()[:, 0].tolist():
             at, linear = self._linear_model(j)
@@ -65,9 +69,9 @@ class JointDescent:
         favoured = trials[0]
         width = self._widths[self._width][:, None]
         self._step = torch.where(favoured > 0, -width, width)
-        neighbours = favoured.repeat(size, 1, 1)
-        for p in range(size):
-            neighbours[p, :, p] += self._step[:, p]
+        neighbours = favoured.repeat(self._gradient.shape[1], 1, 1)
+        for j, at in enumerate(self._free):
+            neighbours[torch.arange(len(at)), j, at] += self._step[j, at]
         return rows_of(trials, neighbours)
 
     def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
@@ -97,19 +101,32 @@ class JointDescent:
         self._width += narrower
         self._damping = torch.where(narrower, FIRST_DAMPING, self._damping)
         if bool(at_favoured.any()):
-            difference = error[1 : 1 + size] - error[:1]
-            columns = difference / self._step.T[:, None, None, :].to(error.device, torch.float32)
+            columns = error[1 : 1 + self._gradient.shape[1]] - error[:1]
+            columns /= self._steps()[:, None, None, :].to(error.device, torch.float32)
             hessian = torch.einsum("pkrj,skrj->jps", columns, columns).cpu().double() / self._samples[:, None, None]
             gradient = torch.einsum("pkrj,krj->jp", columns, error[0]).cpu().double() / self._samples[:, None]
             self._hessian = torch.where(at_favoured[:, None, None], hessian, self._hessian)
             self._gradient = torch.where(at_favoured[:, None], gradient, self._gradient)
             self._converged |= at_favoured & ~narrower & self._at_the_bottom()
             if self._keep:
-                mask = at_favoured.to(error.device, torch.float32)
-                old_j = torch.zeros_like(columns) if self._jacobian is None else self._jacobian
-                old_e = torch.zeros_like(error[0]) if self._error is None else self._error
-                self._jacobian = columns * mask + old_j * (1 - mask)
-                self._error = error[0] * mask + old_e * (1 - mask)
+                self._keep_derivatives(columns, error[0], at_favoured)
+
+    def _steps(self) -> torch.Tensor:
+        """By how much each joint is moved in each neighbour, (neighbours, n); 1 where it is not."""
+        result = torch.ones(self._gradient.T.shape, dtype=torch.float64)
+        for j, at in enumerate(self._free):
+            result[: len(at), j] = self._step[j, at]
+        return result
+
+    def _keep_derivatives(self, columns: torch.Tensor, error: torch.Tensor, joints: torch.Tensor) -> None:
+        """Keep the errors of some joints, (n,) bool, and their derivatives by the entries that are free."""
+        if self._jacobian is None or self._error is None:
+            self._jacobian = torch.zeros(self.x.shape[1], *error.shape, dtype=error.dtype, device=error.device)
+            self._error = torch.zeros_like(error)
+        for j in joints.nonzero()[:, 0].tolist():
+            at = self._free[j]
+            self._jacobian[at.to(error.device), ..., j] = columns[: len(at), ..., j]
+            self._error[..., j] = error[..., j]
 
     def _at_the_bottom(self) -> torch.Tensor:
         """Joints whose linear model, of the narrowest derivatives, promises next to nothing, (n,) bool."""
@@ -123,8 +140,9 @@ class JointDescent:
 
     def _linear_model(self, joint: int) -> tuple[torch.Tensor, LinearModel]:
         """Free entries of a joint, and the linear model of its score by them."""
-        at = self._free[joint].nonzero()[:, 0]
-        return at, LinearModel(self._hessian[joint][at[:, None], at], self._gradient[joint][at])
+        at = self._free[joint]
+        own = slice(len(at))
+        return at, LinearModel(self._hessian[joint, own, own], self._gradient[joint, own])
 
     def result(self) -> Fitted:
         """Where it ended."""

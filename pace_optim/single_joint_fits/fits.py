@@ -200,7 +200,7 @@ class Fits:
 
     def _batch_of(self, problem: TwinProblem, fits: Sequence[Fitted] | Sequence[JointDescent]) -> SideBySide:
         """What simulates one iteration of each."""
-        slots = [Slot(model=each.model, rows=each.model.size + len(TRIALS)) for each in fits]
+        slots = [Slot(model=each.model, rows=each.model.most_free + len(TRIALS)) for each in fits]
         return self.batch(problem, slots, training=True)
 
     def _near(self, models: Sequence[Fitted]) -> list[bool]:

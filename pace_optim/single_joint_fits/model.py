@@ -71,6 +71,11 @@ class JointModel:
         return result
 
     @property
+    def most_free(self) -> int:
+        """How many entries can be fitted on the joint that has most of them."""
+        return int(self.free.sum(dim=1).max())
+
+    @property
     def names_of_joints(self) -> list[list[str]]:
         """The effects of each joint, by name."""
         return [

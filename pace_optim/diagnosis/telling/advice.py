@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
@@ -49,6 +50,7 @@ def advise(
 def rivals(joint_names: Sequence[str], outcome: Outcome) -> list[Rivals]:
     """Effects that the recordings cannot tell apart, as models of the whole robot."""
 
+    @cache
     def with_it(fitted: Fitted) -> RobotModel:
         model, values = fitted.model, whole_values(fitted.model, fitted.x, joint_names)
         return RobotModel(effects=found_effects(model, joint_names), values=values)
