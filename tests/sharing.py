@@ -9,7 +9,7 @@ import torch
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import load_problem
-from pace_optim.problem.processes import join
+from pace_optim.problem.processes import Processes, join
 from pace_optim.terminal.cli import run_cli
 
 GENERATIONS = 3
@@ -19,7 +19,12 @@ def main() -> None:
     """Search, and print all scores and where it is; the rank named by LOSE ends without a word after a generation."""
     torch.set_num_threads(1)
     processes, _ = join("cpu")
-    problem = load_problem(sys.argv[1] if len(sys.argv) > 1 else "Pace-TestBench-v0")
+    print(searched(sys.argv[1] if len(sys.argv) > 1 else "Pace-TestBench-v0", processes))
+
+
+def searched(task: str, processes: Processes) -> list:
+    """All scores, where the search is and its best scores."""
+    problem = load_problem(task)
     evaluator = problem.training_evaluator()
     where = evaluator.dataset.beginning(0.1)
     optimizer = CMAESOptimizer(
@@ -35,7 +40,7 @@ def main() -> None:
     evaluator.dataset = replace(evaluator.dataset, train=where)
     search(optimizer, evaluator.rollout(optimizer.num_shown), after_generation)
     where_it_is = [each.tolist() for each in (optimizer.best, optimizer.mean, optimizer.spread)]
-    print([[scores.tolist() for scores in optimizer.history], where_it_is, optimizer.best_scores])
+    return [[scores.tolist() for scores in optimizer.history], where_it_is, optimizer.best_scores]
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-TRIALS = 200
-"""They take some 41 s of a processor, a folder to damage and all imports included."""
+TRIALS = 120
+"""They take some 25 s of a processor, a folder to damage and all imports included."""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="trials are forked processes")

@@ -3,13 +3,12 @@
 import dataclasses
 import json
 import math
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 
 import pytest
 import torch
+from command_lines import run_script
 from problems import BENCH, chirp, make_problem, record
 from torque_sequence import DT, GAINS, JOINTS, write_result
 
@@ -327,13 +326,7 @@ def test_a_training_keeps_its_drives(result, tmp_path):
     assert read.identified == str(run / "identified.json") and read.randomize_identified == 1.0
     cfg = load_cfg(read)
     assert cfg.scene.robot.actuators["legs"].delay_s == pytest.approx(3.4 * DT) and cfg.sim.dt == DT
-    played = subprocess.run(
-        [sys.executable, "scripts/play.py", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.1"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    played = run_script("play", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.1", cwd=ROOT)
     assert played.returncode == 0 and "identified drives: physics and drives run at 2.5 ms" in played.stdout
 
 
@@ -373,7 +366,7 @@ def anymal_run(tmp_path_factory):
     """A fit of a noisy recording with a hidden effect: its error is that of the noise and of what is missing."""
     folder = tmp_path_factory.mktemp("anymal")
     words = ["--task", "Pace-AnymalD-v0", "--duration", "3", "--noise", "0.0005", "--output", str(folder / "r.npz")]
-    subprocess.run([sys.executable, "scripts/data_collection.py", *words], cwd=ROOT, check=True, capture_output=True)
+    assert run_script("data_collection", *words, cwd=ROOT).returncode == 0
     settings = FitSettings(
         task="Pace-AnymalD-v0", data=[str(folder / "r.npz")], optimizer="least_squares", log_dir=str(folder)
     )
@@ -403,8 +396,7 @@ def test_the_replay_shows_what_another_step_or_drive_costs(anymal_run):
 
 @pytest.mark.slow
 def test_the_command_line_replays(anymal_run):
-    words = [sys.executable, "scripts/play.py", "--replay", str(anymal_run), "--task", WALK]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = run_script("play", "--replay", anymal_run, "--task", WALK, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()[2:-2]] == list(JOINTS)
 

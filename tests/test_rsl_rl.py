@@ -6,12 +6,14 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from command_lines import run_script
 from PIL import Image
 from rsl_rl.env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -208,21 +210,28 @@ def test_the_curriculum_goes_on_where_it_stopped_and_a_judge_has_none(run, tmp_p
     assert env.unwrapped.command_manager.get_term("base_velocity").scale == 1.0
 
 
+def _drawing(*command: str) -> subprocess.CompletedProcess[str]:
+    """In a process of its own: without OpenGL, MuJoCo ends the process."""
+    environ = {"MUJOCO_GL": "egl", **os.environ}
+    return subprocess.run([sys.executable, *command], capture_output=True, text=True, env=environ)
+
+
+@cache
+def _without_opengl() -> str:
+    """Why nothing can be drawn here; empty if it can."""
+    draws = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    done = _drawing("-c", draws)
+    return done.stderr.strip().splitlines()[-1] if done.returncode else ""
+
+
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
 def test_a_policy_is_played_and_filmed_without_a_screen(run, tmp_path, suffix):
     film = tmp_path / f"walk.{suffix}"
-    drawing = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
+    if why_not := _without_opengl():
+        pytest.skip(f"no OpenGL here: {why_not}")
     options = ["--checkpoint", str(run), "--num_envs", "2", "--seconds", "0.4", "--video", str(film)]
     script = Path(__file__).parent.parent / "scripts" / "play.py"
-    # in processes of their own: without OpenGL, MuJoCo ends the process
-    can, done = (
-        subprocess.run(
-            [sys.executable, *command], capture_output=True, text=True, env={"MUJOCO_GL": "egl", **os.environ}
-        )
-        for command in (["-c", drawing], [str(script), *options])
-    )
-    if can.returncode != 0:
-        pytest.skip(f"no OpenGL here: {can.stderr.strip().splitlines()[-1]}")
+    done = _drawing(str(script), *options)
     if done.returncode == 2 and "ffmpeg" in done.stderr:
         pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr
@@ -292,14 +301,14 @@ def test_a_film_needs_a_known_ending_and_pictures(tmp_path):
 @pytest.mark.slow
 def test_the_command_lines_train_and_play(tmp_path):
     def call(*words):
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        done = run_script(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         return done.stdout.splitlines()
 
-    lines = call(ROOT / "scripts/train.py", "--task", TASKS[1], "--num_envs", "8", "--max_iterations", "1")
+    lines = call("train", "--task", TASKS[1], "--num_envs", "8", "--max_iterations", "1")
     run = lines[-1].removeprefix("run: ")
     lines = call(
-        *(ROOT / "scripts/play.py", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.2"),
+        *("play", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.2"),
         *("--command", "0.5", "0", "0", "--export", "out"),
     )
     assert lines[0].startswith("velocity error") and (tmp_path / "out" / "policy.onnx").is_file()

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from problems import BENCH, record
+from problems import ANYMAL, BENCH, record
+from sharing import searched
 
 from pace_optim.fit import fit
 from pace_optim.problem.processes import Processes
@@ -71,17 +72,18 @@ def _texts(processes: list[subprocess.Popen[str]]) -> list[str]:
 @pytest.mark.slow
 def test_two_processes_score_what_one_scores():
     """Exactly: each candidate is simulated by one process."""
-    processes = [*_start(1, SEARCH), *_start(2, SEARCH)]
-    texts = _texts(processes)
-    alone, first, second = (ast.literal_eval(text.strip().splitlines()[-1]) for text in texts)
+    processes = _start(2, SEARCH)
+    alone = searched(BENCH, Processes())
+    first, second = (ast.literal_eval(text.strip().splitlines()[-1]) for text in _texts(processes))
     assert alone == first == second
 
 
 @pytest.mark.slow
 def test_processes_that_share_four_strategies_search_as_one_does_with_all():
     """Each does the arithmetic of its own legs' strategies; of four, three processes have two, one and one."""
-    texts = _texts([*_start(1, SEARCH, "Pace-AnymalD-v0"), *_start(3, SEARCH, "Pace-AnymalD-v0")])
-    alone, *shared = (ast.literal_eval(text.strip().splitlines()[-1]) for text in texts)
+    processes = _start(3, SEARCH, ANYMAL)
+    alone = searched(ANYMAL, Processes())
+    shared = [ast.literal_eval(text.strip().splitlines()[-1]) for text in _texts(processes)]
     assert len(alone[0][0][0]) == 4 and shared == [alone] * 3
 
 

@@ -28,7 +28,7 @@ EFFECTS = {
 def bench():
     """A long and a short recording, the latter with measured speeds and half as many samples, and one to validate."""
     fine = env_cfg()
-    set_physics_dt(fine, DT / 10)
+    set_physics_dt(fine, DT / 4)
     long, short, other = (record(chirp(t, amplitude=0.4), CALM, cfg=fine) for t in (DURATION, 3.2, 1.0))
     speed = torch.as_tensor(short.dof_pos)[:, 0].diff(prepend=torch.zeros(1, dtype=torch.float64)) / DT
     half = slice(None, None, 2)

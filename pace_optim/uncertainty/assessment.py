@@ -26,23 +26,39 @@ class Assessment:
     residuals: Residuals
     """On all samples, m = 1."""
     jacobian: Jacobian
-    """On the training samples."""
+    """On the training samples of the recordings that are trained on."""
 
 
 def assess(problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor) -> Assessment:
     """Error bars at x from the training samples, and x's residuals on all samples."""
     data, probes = problem.dataset, make_probes(x, colouring, problem.trees, problem.joint_names)
     every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
-    train = data.train[every.step]
+    recordings = data.trained()
+    train = data.train[every.step][:, recordings]
     steps = train.any(dim=1)
-    trained = Residuals(
-        error=every.error[:, steps] * train[steps][None, :, :, None], where=train[steps], step=every.step[steps]
-    )
+    error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
+    trained = Residuals(error=error, where=train[steps], step=every.step[steps])
     initial = probes.initial(trained.error)
     there = jacobian(trained, probes.step, colouring)
     uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints)
     residuals = Residuals(error=every.error[:1], where=every.where, step=every.step)
     return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there)
+
+
+def assess_known(
+    problem: Problem, evaluator: Evaluator, trained: Evaluator, there: Jacobian, x: torch.Tensor
+) -> Assessment:
+    """The same where the derivatives at x are known.
+
+    Args:
+        problem: What was fitted.
+        evaluator: Simulates all recordings.
+        trained: Simulates those that are trained on.
+        there: Residuals and derivatives at x, on the training samples of these.
+        x: Normalised, (size,).
+    """
+    residuals = evaluator.residuals(problem.space.to_physical(x)[None], problem.dataset.sampled)
+    return Assessment(uncertainty=error_bars(problem, trained, there, x), residuals=residuals, jacobian=there)
 
 
 def error_bars(problem: Problem, evaluator: Evaluator, there: Jacobian, x: torch.Tensor) -> Uncertainty:

@@ -75,7 +75,7 @@ def check_consistency(
     for r in range(len(trained)):
         report(f"fitting {problem.dataset.recordings[r].name} alone")
         alone = replace(problem, dataset=problem.dataset.select([r]))
-        fits.append(_fit_from(alone, x, None if there is None else _of_recording(there, trained[r])))
+        fits.append(_fit_from(alone, x, None if there is None else _of_recording(there, r)))
     names = tuple(recording.name for recording in problem.dataset.recordings)
     values = torch.stack([problem.space.to_physical(fit.x) for fit in fits]).numpy()
     std = np.stack([fit.uncertainty.std for fit in fits])
