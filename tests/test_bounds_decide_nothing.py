@@ -55,11 +55,11 @@ def test_no_factor_of_what_was_stated_can_be_negative():
     for effect in ALL:
         if effect.scales:
             (parameter,) = effect.parameters
-            assert parameter.widest()[0] > parameter.null - 1.0
+            assert parameter.widest()[0] >= parameter.null - 1.0
 
 
 def test_a_stated_load_may_not_be_there_at_all():
-    assert PAYLOAD.parameters[0].widest()[0] == pytest.approx(-1.0, abs=0.01)
+    assert PAYLOAD.parameters[0].widest()[0] == -1.0
 
 
 def test_wide_bounds_travel_with_the_effect_s_name():

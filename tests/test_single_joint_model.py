@@ -97,6 +97,20 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     assert float((without - robot).abs().max()) > 2e-3  # the payload shows
 
 
+def test_a_weight_that_is_not_there_pulls_nowhere():
+    """Also where the joint is far from the reference along which gravity is linear."""
+    recording = record(chirp(1.5), CALM, cfg=env_cfg())
+    whole = make_problem(recording).with_effects(["payload"])
+    plain = whole.with_effects(())
+    elsewhere = plain.space.from_dict({**CALM, "viscous_friction": 20.0})
+    path = reference_path(plain, elsewhere, ["payload"])
+    truth = whole.space.from_dict({**CALM, "payload.ratio": -1.0})
+    twins = twin_problem(whole, path).with_physics_dt(0.0005)
+    robot = moved_by(whole.with_physics_dt(0.0005), truth)
+    assert float((path.position - robot).abs().max()) > 0.2
+    assert float((moved_by(twins, truth) - robot).abs().max()) < 1e-3  # 8e-3 where its pull back stayed
+
+
 def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_be():
     """A knee that is said to have a thirtieth of its friction moves wrongly, and its thigh would with it."""
     cfg, fine = env_cfg(ANYMAL), env_cfg(ANYMAL)

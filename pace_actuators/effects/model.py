@@ -31,7 +31,7 @@ class Payload(Effect):
     name = "payload"
     stage = "model"
     parameters = (
-        EffectParameter(name="ratio", unit="1", lower=-0.6, upper=1.0, null=0.0, start=0.02, possible=(-0.999, 9.0)),
+        EffectParameter(name="ratio", unit="1", lower=-0.6, upper=1.0, null=0.0, start=0.02, possible=(-1.0, 9.0)),
     )
     equation = "mass and inertia of the link times (1 + m)"
     looks = "sag and inertia off together"

@@ -38,6 +38,18 @@ class JointLoad:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class LoadChange(JointLoad):
+    """What a unit of an effect's parameter changes of what is felt."""
+
+    stiffness: torch.Tensor
+    """Of the derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
+
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> LoadChange:
+        """The same change of each."""
+        return replace(self, **vars(super().map(change)), stiffness=change(self.stiffness))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """A motion of the whole robot in the intervals between control steps, passive joints too."""
 

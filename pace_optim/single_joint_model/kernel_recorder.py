@@ -146,6 +146,6 @@ class _Change:
 
     def __init__(self, recorder: Places, name: str):
         """Of a name."""
-        self.inertia, self.torque, self.load = (
-            _Series(recorder, f"{name}.{part}") for part in ("inertia", "torque", "load")
+        self.inertia, self.torque, self.load, self.stiffness = (
+            _Series(recorder, f"{name}.{part}") for part in ("inertia", "torque", "load", "stiffness")
         )

@@ -14,7 +14,7 @@ import torch
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
-from pace_optim.single_joint_model.feel import JointLoad, Links, Motion
+from pace_optim.single_joint_model.feel import JointLoad, Links, LoadChange, Motion
 from pace_optim.single_joint_model.measured_motion import at_every_step, beside_simulation
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class ReferencePath:
     feel: JointLoad
     stiffness: torch.Tensor
     """Derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
-    model_effects: dict[tuple[str, str], JointLoad]
+    model_effects: dict[tuple[str, str], LoadChange]
     """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
     columns: torch.Tensor
     """The joints' degrees of freedom in the model, (n,)."""
@@ -218,13 +218,17 @@ def _along(
     motion = Motion.between(positions, speeds, problem.control_dt)
     links = Links.of(rollout.env)
     whole = feel = links.feel(motion)
-    stiffness = _stiffness(links, problem, motion)
+    whole_stiffness = torch.zeros_like(whole.torque)
+    for moved in _one_of_each_tree(problem):
+        whole_stiffness[..., moved] = _stiffness(links, motion, moved)
+    stiffness = whole_stiffness
     changes = {}
     for name in model_effects:
         for parameter in get_effect(name).parameters:
             now = torch.tensor(list(values[f"{name}.{parameter.name}"].values()), dtype=torch.float64)
-            change = _change(problem, rollout, name, parameter.name, now, motion, whole)
+            change = _change(problem, rollout, name, parameter.name, now, motion, whole, whole_stiffness)
             feel = feel.less(change, now)  # each twin has its own part of the effect itself; its neighbours' stays
+            stiffness = stiffness - now * change.stiffness
             changes[name, parameter.name] = change
     rollout.env.close()
     return ReferencePath(
@@ -253,16 +257,12 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _stiffness(links: Links, problem: Problem, motion: Motion) -> torch.Tensor:
-    """Derivative of f_j - M_j a_j by the joint's own position, the i-th joint of each tree at once."""
-    motion = motion.every(_STIFFNESS_EVERY)
-    at, acceleration = links.feel(motion), motion.qacc[..., links.columns]
-    result = torch.zeros_like(at.torque)
-    for moved in _one_of_each_tree(problem):
-        there = links.feel(motion.moved(links.shifts(motion, moved, _STEP)))
-        change = (there.torque - at.torque) - (there.inertia - at.inertia) * acceleration
-        result[..., moved] = change[..., moved] / _STEP
-    return result.repeat_interleave(_STIFFNESS_EVERY, dim=0)
+def _stiffness(links: Links, motion: Motion, joints: Sequence[int]) -> torch.Tensor:
+    """Derivative of f_j - M_j a_j by the joint's own position of joints of which none moves another, (T, R, joints)."""
+    steps, motion = len(motion.qpos), motion.every(_STIFFNESS_EVERY)
+    at, there = links.feel(motion), links.feel(motion.moved(links.shifts(motion, joints, _STEP)))
+    change = (there.torque - at.torque) - (there.inertia - at.inertia) * motion.qacc[..., links.columns]
+    return (change[..., joints] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
 
 
 def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:
@@ -280,7 +280,8 @@ def _change(
     now: torch.Tensor,
     motion: Motion,
     whole: JointLoad,
-) -> JointLoad:
+    stiffness: torch.Tensor,
+) -> LoadChange:
     """What a unit of a parameter of an effect on the model changes of each joint's own feel.
 
     Measured between what the joint has, ``now`` (n,), and null, or where it has null, a probe.
@@ -288,14 +289,16 @@ def _change(
     robot = rollout.robot
     probe = torch.full_like(now, probe_points(get_effect(effect))[0][parameter])
     other = torch.where(now == 0, probe, 0.0)
-    result = whole.map(torch.zeros_like)
+    fields = {"inertia": whole.inertia, "torque": whole.torque, "load": whole.load, "stiffness": stiffness}
+    changes = {field: torch.zeros_like(value) for field, value in fields.items()}
     for moved in _one_of_each_tree(problem):
         values = now.clone()
         values[moved] = other[moved]
         robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
-        there = Links.of(rollout.env).feel(motion)
-        for field in ("inertia", "torque", "load"):
-            change = (getattr(there, field) - getattr(whole, field)) / (other - now)
-            getattr(result, field)[..., moved] = change[..., moved]
+        links = Links.of(rollout.env)
+        there = vars(links.feel(motion)) | {"stiffness": torch.zeros_like(stiffness)}
+        there["stiffness"][..., moved] = _stiffness(links, motion, moved)
+        for field, value in fields.items():
+            changes[field][..., moved] = ((there[field] - value) / (other - now))[..., moved]
     robot.write_effect_parameter_to_sim(effect, parameter, now.expand(robot.num_envs, -1))
-    return result
+    return LoadChange(**changes)

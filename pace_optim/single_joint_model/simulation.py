@@ -96,7 +96,7 @@ class TwinSimulation(Simulation):
         load = self._load[part][k]
         for key, values in self._model_values.items():
             load = load + values.view(self._shape) * self.path.model_effects[key].load[k]
-        load = torch.addcmul(load, self._stiffness[k], self._joints(self.qpos) - self._begin[part][k])
+        load = torch.addcmul(load, self._pull(k), self._joints(self.qpos) - self._begin[part][k])
         if self._as_in_model:
             return load.neg_().view(self.qvel.shape)
         result = torch.zeros_like(self.qvel)
@@ -136,7 +136,7 @@ class TwinSimulation(Simulation):
         h, (k, part) = self.cfg.dt, self._interval()
         q, v = self._joints(self.qpos), self._joints(self.qvel)
         inertia, torque = self._feel(k)
-        stiffness = self._stiffness[k]
+        stiffness = self._pull(k)
         damping = self._joints(self.expand("dof_damping"))
         resisting = (inertia + self._joints(self.expand("dof_armature"))).add_(damping, alpha=0.5 * h)
         if self._is_implicit:
@@ -158,7 +158,7 @@ class TwinSimulation(Simulation):
         if self._felt is None or self._felt[0] != k:
             rows = (self.num_envs // self._shape[1], -1, -1)
             inertia = self._feel(k)[0].expand(rows).reshape(self.num_envs, -1)
-            stiffness = self._stiffness[k].expand(rows).reshape(self.num_envs, -1)
+            stiffness = self._pull(k).expand(rows).reshape(self.num_envs, -1)
             self._felt = k, inertia, stiffness.neg()
         _, inertia, pull = self._felt
         if not torch.equal(columns, self._columns):
@@ -205,6 +205,13 @@ class TwinSimulation(Simulation):
             inertia = inertia + values.view(self._shape) * change.inertia[k]
             torque = torque + values.view(self._shape) * change.torque[k]
         return inertia, torque
+
+    def _pull(self, k: int) -> torch.Tensor:
+        """Derivative of the torque by the position in an interval, (candidates or 1, recordings, n)."""
+        stiffness = self._stiffness[k]
+        for key, values in self._model_values.items():
+            stiffness = stiffness + values.view(self._shape) * self.path.model_effects[key].stiffness[k]
+        return stiffness
 
     def _place(self, columns: torch.Tensor) -> torch.Tensor:
         """Where degrees of freedom are among the joints', (len(columns),)."""
