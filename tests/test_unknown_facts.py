@@ -8,9 +8,10 @@ import pytest
 from bench_recordings import Bench, chirp, record
 
 from pace_actuators import PaceDCMotorCfg
+from pace_optim.diagnosis.diagnose import _as_found
 from pace_optim.fit import fit
 from pace_optim.problem.problem import load_problem
-from pace_optim.problem.unknown_facts import started_from
+from pace_optim.problem.unknown_facts import started_from, with_identified
 from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 
@@ -116,6 +117,25 @@ def test_a_refit_of_a_diagnosis_starts_unknown_facts_where_the_run_had_them():
     found = {"friction": {"j": 0.2}, "torque_gain.gain": {"j": 0.5}, "torque_limit.effort": {"j": 7.0}}
     assert started_from(found, run, ["stiffness", "effort_limit"]) == {**found, "proportional_gain.gain": {"j": 2.0}}
     assert started_from(found, run, []) == found
+    more = started_from({"proportional_gain.gain": {"j": 1.1}}, run, ["stiffness"])
+    assert more["proportional_gain.gain"]["j"] == pytest.approx(2.2)  # of the gain that the run had
+
+
+def test_a_diagnosis_begins_with_the_gains_that_were_found(run):
+    """The base model is as good with them as the fit was; with the stated ones it is not."""
+    result, folder = run
+    stated = open_problem(folder, effects=())
+    found = _as_found(stated, result)
+    for before, now in zip(stated.dataset.recordings, found.dataset.recordings, strict=True):
+        gain = result.parameters["proportional_gain.gain"]["servo"]
+        assert now.drive.stiffness[0] == pytest.approx(gain * before.drive.stiffness[0])
+    values = stated.space.from_dict({name: result.parameters[name] for name in stated.space.slices})[None]
+    wrong, right = (float(p.training_evaluator().residuals(values).score.sqrt()) for p in (stated, found))
+    assert right == pytest.approx(result.rmse["train"]["all"], rel=0.02) and wrong > 10 * right
+    some = with_identified(
+        stated.plain_cfg, stated.dataset.recordings, stated.unknown, result.parameters, ["derivative_gain.gain/servo"]
+    )
+    assert some[0].drive.damping[0] == stated.dataset.recordings[0].drive.damping[0]  # not determined: as stated
 
 
 def test_an_effect_that_is_named_too_is_there_once(soft):

@@ -18,7 +18,7 @@ from pace_optim.diagnosis.telling.findings import Findings, told
 from pace_optim.diagnosis.telling.result import FILE, Diagnosis
 from pace_optim.fit import fit
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.unknown_facts import started_from
+from pace_optim.problem.unknown_facts import started_from, with_identified
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
@@ -53,7 +53,7 @@ def diagnose(
     candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
     fits = fits_on(settings.device, settings.cfg.fitting)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
-    problem = run.problem(physics_dt=physics_dt, effects=())
+    problem = _as_found(run.problem(physics_dt=physics_dt, effects=()), result)
     base = {name: result.parameters[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)
     candidates = candidate_effects(settings.effects, only=settings.only, switched_off=off)
@@ -80,6 +80,14 @@ def diagnose(
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
         _save(diagnosis, decisions)
     return diagnosis
+
+
+def _as_found(problem: Problem, result: FitResult) -> Problem:
+    """The problem with gains and limits that nobody knew as the run found them."""
+    told = with_identified(
+        problem.plain_cfg, problem.dataset.recordings, problem.unknown, result.parameters, result.undetermined
+    )
+    return replace(problem, dataset=replace(problem.dataset, recordings=tuple(told)))
 
 
 def _save(diagnosis: Diagnosis, decisions: Sequence[Decision]) -> None:

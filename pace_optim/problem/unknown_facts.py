@@ -10,7 +10,7 @@ import numpy as np
 
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
-from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
 from pace_optim.recording import Recording
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 
@@ -20,6 +20,8 @@ LIMITS = {
     "velocity_limit": "torque_speed_limit.velocity",
 }
 """Limit -> the parameter that is it."""
+GAINS = {"stiffness": "proportional_gain.gain", "damping": "derivative_gain.gain"}
+"""Gain -> the parameter that is a factor of it."""
 _OF_THE_REACHED = 0.7
 """Part of the torque that is asked where a search for a limit of it starts."""
 _FACTOR = 10.0
@@ -46,10 +48,18 @@ def with_unknown(effects: Sequence[EffectCfg | str], facts: Iterable[str]) -> li
 def started_from(
     values: Mapping[str, Mapping[str, float]], before: Mapping[str, Mapping[str, float]], facts: Iterable[str]
 ) -> dict[str, dict[str, float]]:
-    """Parameters to start a fit from that also seeks unknown facts: where they lack those, as they were before."""
+    """Parameters to start a fit from that also seeks unknown facts: where they lack those, as they were before.
+
+    A factor of a gain that was found since is one of the gain that was found before.
+    """
+    facts = list(facts)
     effects = {UNKNOWN_FACTS[fact] for fact in facts}
     own = {name: dict(entries) for name, entries in before.items() if name.split(".")[0] in effects}
-    return own | {name: dict(entries) for name, entries in values.items()}
+    result = own | {name: dict(entries) for name, entries in values.items()}
+    for label in {GAINS[fact] for fact in facts if fact in GAINS} & set(values):
+        first = before.get(label, {})
+        result[label] = {key: value * first.get(key, 1.0) for key, value in values[label].items()}
+    return result
 
 
 def lift_limits(
@@ -87,6 +97,43 @@ def lift_limits(
         infinite = np.full(len(joints), np.inf)
         recordings = [replace(r, drive=replace(r.drive, **{fact: infinite})) for r in recordings]
     return list(recordings), bounds
+
+
+def with_identified(
+    cfg: PaceSim2realEnvCfg,
+    recordings: Sequence[Recording],
+    facts: Iterable[str],
+    parameters: Mapping[str, Mapping[str, float]],
+    undetermined: Iterable[str],
+) -> list[Recording]:
+    """Recordings that state what a fit found of facts that were unknown, where they determine it.
+
+    Args:
+        cfg: The environment, whose facts hold where a recording states none.
+        recordings: The recordings.
+        facts: What was unknown.
+        parameters: What was found.
+        undetermined: Labels of what the recordings leave open.
+    """
+    facts, left_open, joints = list(facts), set(undetermined), list(cfg.sim2real.joint_order)
+    found: dict[str, dict[str, float]] = identified_limits(facts, parameters, left_open)
+    factors = {fact: parameters.get(label, {}) for fact, label in GAINS.items() if fact in facts}
+    for fact, by_joint in factors.items():
+        label = GAINS[fact]
+        found[fact] = {j: v for j, v in by_joint.items() if f"{label}/{j}" not in left_open}
+
+    def stated(recording: Recording) -> Recording:
+        changes = {}
+        for fact, values in found.items():
+            now = _stated(cfg, [recording], fact, joints)
+            for j, joint in enumerate(joints):
+                value = values.get(joint, values.get(GLOBAL))
+                if value is not None:
+                    now[j] = value * now[j] if fact in GAINS else value
+            changes[fact] = now
+        return replace(recording, drive=replace(recording.drive, **changes))
+
+    return [stated(recording) for recording in recordings]
 
 
 def identified_limits(

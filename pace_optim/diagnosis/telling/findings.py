@@ -24,6 +24,7 @@ from pace_optim.diagnosis.verdict.verdict import likes, ranking
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.terminal.choices import UNKNOWN_FACTS
 
 _LEAST_TOLD = 0.1
 """Smaller shares are said to be below this [%]."""
@@ -98,9 +99,16 @@ def told(
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     """What the run has, and why it tells another error of the same model, where it does."""
     if run.effects:
-        return [
-            f"The run has {', '.join(run.effects)}: the search started from the base model, and looked for it again."
-        ]
+        unknown = {UNKNOWN_FACTS[fact] for fact in problem.unknown}
+        others = [effect for effect in run.effects if effect.split("@")[0] not in unknown]
+        said = []
+        if unknown:
+            said.append(f"The search began with {', '.join(problem.unknown)} as the run found it.")
+        if others:
+            said.append(
+                f"The run has {', '.join(others)}: the search started from the base model, and looked for it again."
+            )
+        return said
     own, here = run.rmse["validation"].get("all"), float(found.outcome.base_errors.mse.mean().sqrt())
     if own is None or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
         return []
