@@ -73,19 +73,25 @@ def registered_by(task: str) -> str | None:
     return None if module.partition(".")[0] == "pace_envs" else module
 
 
-def load_env_cfg(task: str) -> Any:
+def load_env_cfg(task: str, control_dt: float | None = None) -> Any:
     """A fresh configuration of an environment; nothing is imported to find it.
 
     Args:
         task: Its registered name, also after ``module:`` or ``path/to/file.py:``; or a model file.
+        control_dt: Time between two commands [s], of a model file; ``None``: 2.5 ms.
 
     Raises:
-        ValueError: If there is no such environment.
+        ValueError: If there is no such environment, or it states its control step itself.
     """
     if is_model_file(task):
         from pace_envs.from_model import cfg_from_model  # its configuration is one of this package
 
-        return cfg_from_model(task)
+        return cfg_from_model(task) if control_dt is None else cfg_from_model(task, control_dt)
+    if control_dt is not None:
+        raise ValueError(
+            f"control_dt is {control_dt:g} s, which only a model file (.xml, .urdf) needs to be told: {task} has a "
+            "control step of its own. Leave --control_dt out, or change sim.dt and decimation in its configuration."
+        )
     module, _, task = task.rpartition(":")
     if task not in registered_tasks():
         if module:

@@ -22,7 +22,7 @@ from pace_actuators.trusted_code import trust
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.registration import load_env_cfg, registered_by
 
-_ENVIRONMENT = ("task", "module", "folder", "code", "files")
+_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt")
 
 
 def use_task(text: str) -> str:
@@ -68,6 +68,9 @@ class EnvironmentRecord:
     files: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each file that the model consists of."""
 
+    control_dt: float | None = None
+    """Time between two commands [s] of a model file, which does not say it."""
+
     @classmethod
     def of(cls, task: str, cfg: Any, effects: Iterable[str] = (), folder: str | None = None) -> EnvironmentRecord:
         """The record of a task that is known.
@@ -88,6 +91,7 @@ class EnvironmentRecord:
             folder=folder or str(Path.cwd()),
             code=code,
             files={str(file): file_digest(file) for file in files},
+            control_dt=cfg.sim.dt * cfg.decimation if is_model_file(task) else None,
         )
 
     @classmethod
@@ -100,7 +104,13 @@ class EnvironmentRecord:
         if not content:
             return cls(task=task)
         values = {key: content[key] for key in _ENVIRONMENT if key in content}
-        for key, kind in (("task", str), ("module", str | None), ("folder", str), ("files", Mapping)):
+        for key, kind in (
+            ("task", str),
+            ("module", str | None),
+            ("folder", str),
+            ("files", Mapping),
+            ("control_dt", float | None),
+        ):
             if key in values and not isinstance(values[key], kind):
                 raise TypeError(f"environment.{key} is {values[key]!r}")
         checked_record(content)
@@ -136,7 +146,7 @@ class EnvironmentRecord:
         """A fresh configuration of the environment; relative paths begin where the run was started."""
         known = self.use(where, task)
         try:
-            cfg = load_env_cfg(known)
+            cfg = load_env_cfg(known, self.control_dt if is_model_file(known) else None)
         except ValueError as error:  # what the record says, unless the user names another
             raise ValueError(str(error) if task is not None else f"{where}: {error}") from None
         path = Path(cfg.scene.robot.mjcf_path)

@@ -57,7 +57,7 @@ def fit(
         ValueError: If anything does not fit; nothing has been written then.
     """
     if before is None:
-        env_cfg, place = load_env_cfg(settings.task), None
+        env_cfg, place = load_env_cfg(settings.task, settings.control_dt), None
     else:
         env_cfg, place = before.load_cfg(), before.record.folder
     problem = load_for_fit(settings, env_cfg, told=before is not None)
@@ -128,7 +128,8 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     settings, history, line_generation = start
     settings = replace(settings, device=device)
     problem = load_for_fit(
-        settings, load_env_cfg(settings.task) if path is None else Run.open(Path(path), task).load_cfg()
+        settings,
+        load_env_cfg(settings.task, settings.control_dt) if path is None else Run.open(Path(path), task).load_cfg(),
     )
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim.commands.new_robot import main as new_robot
 from pace_optim.problem.parameter_space import ParameterSpace
 
@@ -107,12 +109,14 @@ def test_bounds_scale_with_each_joints_drive(tmp_path):
 
 
 def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
-    """In their middle a drive may have more friction than it moves against, which leads a descent astray."""
+    """In their middle a drive may have more friction than it moves against, and be late by a quarter of a period of
+    its motion: either leads a descent astray."""
     sim2real = cfg_of(tmp_path, ARM).sim2real
     n, space = len(sim2real.joint_order), ParameterSpace.of(sim2real)
     expected = 0.1 * sim2real.bounds_params[: 3 * n, 1]
     start = space.to_physical(space.start)
     assert start[: 3 * n].tolist() == pytest.approx(expected.tolist())
+    assert float(start[-1]) == pytest.approx(0.1 * float(sim2real.bounds_params[-1, 1]))
     sim2real.bounds_params[0, 0] = 0.5 * sim2real.bounds_params[0, 1]  # such as where the loop is stable
     raised = ParameterSpace.of(sim2real)
     assert float(raised.to_physical(raised.start)[0]) == pytest.approx(float(sim2real.bounds_params[0, 0]))
@@ -261,15 +265,34 @@ def test_where_no_mass_is_left_the_missing_meshes_are_told(tmp_path):
         cfg_of(tmp_path, only)
 
 
+def test_commands_come_at_the_rate_that_is_asked_for(tmp_path):
+    (tmp_path / "robot.xml").write_text(ARM)
+    task = str(tmp_path / "robot.xml")
+    usual, fast = load_env_cfg(task), load_env_cfg(task, 0.001)
+    assert (usual.sim.dt, usual.decimation) == (0.0025, 1) and (fast.sim.dt, fast.decimation) == (0.001, 1)
+    for cfg in (usual, fast):  # [control steps]
+        assert float(cfg.sim2real.bounds_params[-1, 1]) * cfg.sim.dt == pytest.approx(0.05)
+        assert drive_of(cfg).max_delay * cfg.sim.dt == pytest.approx(0.05)
+    assert "control rate: 1000 Hz" in " ".join(fast.sim2real.notes)
+    record = EnvironmentRecord.read(json.loads(json.dumps(EnvironmentRecord.of(task, fast).to_dict())), task)
+    assert record.load_cfg("settings.json").sim.dt == 0.001
+    for wrong in (0.0, -0.001, 0.2):
+        with pytest.raises(ValueError, match=r"control_dt is .* expected a time above 0 and up to 0.05 s"):
+            load_env_cfg(task, wrong)
+    with pytest.raises(ValueError, match=r"only a model file .* Leave --control_dt out"):
+        load_env_cfg("Pace-AnymalD-v0", 0.001)
+
+
 def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, monkeypatch, capsys):
     (tmp_path / "robot.xml").write_text(ARM)
     output = tmp_path / "conf" / "my_arm.py"
-    monkeypatch.setattr(sys, "argv", ["new_robot", str(tmp_path / "robot.xml"), "--output", str(output)])
+    words = [str(tmp_path / "robot.xml"), "--output", str(output), "--control_dt", "0.002"]
+    monkeypatch.setattr(sys, "argv", ["new_robot", *words])
     new_robot()
     task = capsys.readouterr().out.split(f"{output}:")[1].split()[0]
     spec = importlib.util.spec_from_file_location("my_arm_of_a_test", output)
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml")
+    written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml", 0.002)
     assert written.sim2real.joint_order == own.sim2real.joint_order
     assert written.sim2real.assumed_gains == own.sim2real.assumed_gains == ("rail",)
     torch.testing.assert_close(written.sim2real.bounds_params, own.sim2real.bounds_params, rtol=1e-4, atol=1e-9)

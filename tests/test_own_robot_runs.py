@@ -150,9 +150,10 @@ def test_a_file_names_a_task_as_well_as_a_module(project, elsewhere):
 def test_a_model_file_is_a_task(project, elsewhere):
     folder = project[0]
     words = ("--task", "../" + str((folder / "swing.xml").relative_to(elsewhere.parent)), *FIT)
-    run = last_run(run_script("fit", *words, "--data", folder / "data" / "swing.csv"))
+    run = last_run(run_script("fit", *words, "--data", folder / "data" / "swing.csv", "--control_dt", 0.005))
     settings = json.loads((run / "settings.json").read_text())["settings"]
-    assert settings["task"] == str(folder / "swing.xml")
+    assert settings["task"] == str(folder / "swing.xml") and settings["control_dt"] == 0.005
+    assert open_problem(run).control_dt == json.loads((run / "result.json").read_text())["control_dt"] == 0.005
     (elsewhere / "deeper").mkdir()
     done = run_script("compare", run.resolve(), "--data", folder / "data" / "swing.csv", cwd=elsewhere / "deeper")
     assert done.returncode == 0, done.stderr

@@ -18,6 +18,7 @@ from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
 from pace_envs.from_model.scaling import (
+    OF_BOUNDS,
     base_bounds,
     gains,
     has_gains,
@@ -54,11 +55,12 @@ class Robot:
     """What was assumed and what was left out, in plain sentences."""
 
 
-def read_robot(path: str | Path) -> Robot:
+def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Robot:
     """Read a robot from a model file.
 
     Args:
         path: MJCF or URDF.
+        control_dt: Time between two commands [s].
 
     Raises:
         ValueError: If the file is missing, is no model, or has no joints that a drive could move.
@@ -83,13 +85,13 @@ def read_robot(path: str | Path) -> Robot:
             *_degrees_note(joints, file),
             *file.notes,
             *notes,
-            *_assumptions(joints, key, model),
-            _loop_note(joints, model),
+            *_assumptions(joints, key, model, control_dt),
+            _loop_note(joints, model, control_dt),
         ),
     )
 
 
-def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
+def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> PaceSim2realEnvCfg:
     """The identification environment of the robot in a model file, its base held in the air.
 
     Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
@@ -98,18 +100,25 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
 
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).
+        control_dt: Time between two commands [s], which no file says.
 
     Raises:
         ValueError: If the file cannot be used; the message says what to do.
     """
-    robot = read_robot(path)
+    if not 0 < control_dt <= defaults.LONGEST_DELAY:
+        raise ValueError(
+            f"control_dt is {control_dt:g} s, expected a time above 0 and up to {defaults.LONGEST_DELAY:g} s, such as "
+            "0.001 for commands at 1 kHz."
+        )
+    robot = read_robot(path, control_dt)
     joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
     position, orientation = _base_pose(robot)
-    continuous = runs_continuously(joints, robot.model)
+    continuous = runs_continuously(joints, robot.model, control_dt)
+    longest_delay = defaults.LONGEST_DELAY / control_dt
     articulation = ArticulationCfg(
         mjcf_path=Path(path),
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
-        actuators={"drives": _drive_cfg(joints, continuous=continuous)},
+        actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
     )
     rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
@@ -119,7 +128,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
         sim=SimulationCfg(
-            dt=defaults.CONTROL_DT,
+            dt=control_dt,
             integrator="implicitfast" if continuous else "rk4",  # where all damping is stable, or torques are held
             gravity=_gravity(robot.model),
         ),
@@ -127,14 +136,17 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",
             joint_order=names,
-            bounds_params=torch.tensor([*rows, (0.0, _longest_delay())], dtype=torch.float64),
+            bounds_params=torch.tensor([*rows, (0.0, longest_delay)], dtype=torch.float64),
             excitation=ExcitationCfg(
                 bias=tuple(centre / amplitude for centre, amplitude in moves),
                 direction=(1.0,) * len(joints),
                 scale=tuple(amplitude for _, amplitude in moves),
             ),
             sample_params={**samples, "delay": 2.0},
-            start_params={group: dict(zip(names, [at[group] for at in starts], strict=True)) for group in starts[0]},
+            start_params={
+                **{group: dict(zip(names, [at[group] for at in starts], strict=True)) for group in starts[0]},
+                "delay": OF_BOUNDS * longest_delay,
+            },
             slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
             assumed_gains=tuple(joint.name for joint in joints if not has_gains(joint)),
             notes=robot.notes,
@@ -142,7 +154,7 @@ def cfg_from_model(path: str | Path) -> PaceSim2realEnvCfg:
     )
 
 
-def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool) -> PaceDCMotorCfg:
+def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous: bool) -> PaceDCMotorCfg:
     pairs = [gains(joint) for joint in joints]
     limits = [joint.effort_limit for joint in joints]
     speeds = [joint.velocity_limit for joint in joints]
@@ -152,13 +164,9 @@ def _drive_cfg(joints: Sequence[JointFacts], *, continuous: bool) -> PaceDCMotor
         damping=[damping for _, damping in pairs],
         effort_limit=limits if np.isfinite(limits).any() else None,
         velocity_limit=speeds if np.isfinite(speeds).any() else None,
-        max_delay=_longest_delay(),
+        max_delay=longest_delay,
         implicit=continuous,
     )
-
-
-def _longest_delay() -> float:
-    return defaults.LONGEST_DELAY / defaults.CONTROL_DT
 
 
 def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
@@ -198,7 +206,7 @@ def _gravity(model: mujoco.MjModel) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) -> list[str]:
+def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, control_dt: float) -> list[str]:
     notes = [f"home posture: {f'keyframe {key}' if key else 'all joints at 0, or in the middle of a range without it'}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
@@ -211,7 +219,7 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel) 
         notes.append(f"effort limit: none ({_listed(without)})")
     if not any(np.isfinite(joint.velocity_limit) for joint in joints):
         notes.append("speed limit: none")
-    notes.append(f"control rate: {1 / defaults.CONTROL_DT:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms")
+    notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
         notes.append("the base is held in the air, and nothing touches")
     return notes
@@ -228,8 +236,8 @@ def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
     ]
 
 
-def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel) -> str:
-    if runs_continuously(joints, model):
+def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> str:
+    if runs_continuously(joints, model, control_dt):
         return "the drives' loops run continuously, as MuJoCo holds the file's gains"
     return "the drives' loops run at the control rate and hold their torque (--drive_dt: a faster loop)"
 

@@ -15,7 +15,7 @@ _ACCELERATION, _SLIDE_ACCELERATION = 25.0, 10.0
 """A drive's largest torque over its rotor inertia is above this [rad/s^2] (a slide: [m/s^2])."""
 _OF_EFFORT = 0.2
 """Largest Coulomb friction, as a part of the drive's largest torque."""
-_OF_BOUNDS = 0.1
+OF_BOUNDS = 0.1
 """Where a fit begins, as a part of the upper bounds: from their middle, friction that hides the rest leads astray."""
 _SEEN_BY_FILE = 10.0
 """How much larger than the file says a parameter may be."""
@@ -48,7 +48,7 @@ def gains(joint: JointFacts) -> tuple[float, float]:
     return (0.0 if joint.command == "velocity" else stiffness), damping
 
 
-def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel) -> bool:
+def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> bool:
     """Whether the drives' loops are those of the file's actuators, which MuJoCo evaluates at every step.
 
     Loops are held at the control rate, as in PACE, where the file has no gains (no actuators, or motors), or gains with
@@ -59,9 +59,9 @@ def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel) -> bo
     implicit = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     if int(model.opt.integrator) in implicit or not any(gains(joint)[1] for joint in joints):
         return True
-    dt = defaults.CONTROL_DT
     return any(
-        gains(joint)[1] * dt + 0.5 * gains(joint)[0] * dt**2 > joint.inertia + joint.armature for joint in joints
+        gains(joint)[1] * control_dt + 0.5 * gains(joint)[0] * control_dt**2 > joint.inertia + joint.armature
+        for joint in joints
     )
 
 
@@ -88,7 +88,7 @@ def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
 def start_values(joint: JointFacts) -> dict[str, float]:
     """Where a fit begins: the bounds are what a drive may have at most, and most have a small part of it."""
     bounds = base_bounds(joint)
-    return {group: _OF_BOUNDS * bounds[group][1] for group in ("armature", "viscous_friction", "friction")}
+    return {group: OF_BOUNDS * bounds[group][1] for group in ("armature", "viscous_friction", "friction")}
 
 
 def motion(joint: JointFacts) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from typing import cast
 
 import torch
 
+from pace_envs.from_model.defaults import CONTROL_DT
 from pace_envs.from_model.robot import cfg_from_model
 from pace_envs.tasks.pace import ExcitationCfg, PaceSim2realEnvCfg
 
@@ -84,8 +85,11 @@ def env_cfg() -> PaceSim2realEnvCfg:
             ),
             sample_params={sample},
             start_params={{  # of a fit: a tenth of the upper bounds
-                group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
-                for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
+                "delay": 0.1 * LONGEST_DELAY,
+                **{{
+                    group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
+                    for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
+                }},
             }},{assumed}
         ),
     )
@@ -95,12 +99,15 @@ register_task({task!r}, env_cfg)
 '''
 
 
-def configuration_text(model: str | Path, output: str | Path) -> tuple[str, str, PaceSim2realEnvCfg]:
+def configuration_text(
+    model: str | Path, output: str | Path, control_dt: float | None = None
+) -> tuple[str, str, PaceSim2realEnvCfg]:
     """The Python file of a model file's configuration.
 
     Args:
         model: MJCF or URDF.
         output: Where the text will lie; the model is named from there.
+        control_dt: Time between two commands [s]; ``None``: 2.5 ms.
 
     Returns:
         The text, the name of the task that it registers, and the configuration.
@@ -108,7 +115,7 @@ def configuration_text(model: str | Path, output: str | Path) -> tuple[str, str,
     Raises:
         ValueError: If the model cannot be used.
     """
-    cfg = cfg_from_model(model)
+    cfg = cfg_from_model(model, CONTROL_DT if control_dt is None else control_dt)
     sim2real, robot = cfg.sim2real, cfg.scene.robot
     drive = robot.actuators["drives"]
     n, names = len(sim2real.joint_order), sim2real.joint_order

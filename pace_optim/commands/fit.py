@@ -7,6 +7,7 @@ from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import (
     add_common_options,
+    add_control_option,
     add_device_option,
     add_log_options,
     number,
@@ -60,6 +61,7 @@ def main() -> None:
     )
     parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
     parser.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
+    add_control_option(parser)
     parser.add_argument(
         "--drive_dt", type=number, metavar="S", help="time between two runs of the drives' own controllers (PD loops)"
     )

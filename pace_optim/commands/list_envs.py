@@ -4,16 +4,16 @@ from pathlib import Path
 
 from pace_envs import load_env_cfg, registered_tasks
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, take_common_options
+from pace_optim.terminal.options import add_common_options, add_control_option, take_common_options
 
 HEADER = ("task", "robot", "joints", "physics/control", "sample recording")
 
 
-def rows(tasks: list[str]) -> list[tuple[str, ...]]:
-    """One per environment."""
+def rows(tasks: list[str], control_dt: float | None = None) -> list[tuple[str, ...]]:
+    """One per environment; ``control_dt`` is that of a model file [s]."""
     result: list[tuple[str, ...]] = []
     for task in dict.fromkeys(tasks):
-        cfg = load_env_cfg(task)
+        cfg = load_env_cfg(task, control_dt)
         sim2real = getattr(cfg, "sim2real", None)
         robot = sim2real.robot_name if sim2real else Path(cfg.scene.robot.mjcf_path).stem
         joints = cfg.scene.robot.joint_order
@@ -38,8 +38,12 @@ def main() -> None:
         example="scripts/list_envs.py",
     )
     add_common_options(parser)
-    task = take_common_options(vars(parser.parse_args()))["task"]
-    table = [HEADER, *rows([*registered_tasks(), *([task] if task and ":" not in task else [])])]
+    add_control_option(parser)
+    args = take_common_options(vars(parser.parse_args()))
+    task, control_dt = args["task"], args["control_dt"]
+    own = [task] if task and ":" not in task else []
+    own = rows([each for each in own if each not in registered_tasks()], control_dt)
+    table = [HEADER, *rows(registered_tasks()), *own]
     widths = [max(len(row[i]) for row in table) for i in range(len(HEADER))]
     for row in table:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

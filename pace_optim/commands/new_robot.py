@@ -5,7 +5,7 @@ from pathlib import Path
 from pace_actuators.files import refuse_taken, write_atomically
 from pace_envs.from_model.writing import configuration_text
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_overwrite_option
+from pace_optim.terminal.options import add_control_option, add_overwrite_option
 
 
 def main() -> None:
@@ -16,12 +16,13 @@ def main() -> None:
     )
     parser.add_argument("model", metavar="MODEL", help="model file, .xml or .urdf")
     parser.add_argument("--output", required=True, type=Path, metavar="FILE.py", help="Python file to write")
+    add_control_option(parser)
     add_overwrite_option(parser)
     args = parser.parse_args()
     if args.output.suffix != ".py" or not args.output.stem.isidentifier():
         raise ValueError(f"--output {args.output}: expected a name that Python can import, such as my_robot.py.")
     refuse_taken([args.output], option="--output", overwrite=args.overwrite)
-    text, task, cfg = configuration_text(args.model, args.output)
+    text, task, cfg = configuration_text(args.model, args.output, args.control_dt)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(args.output, lambda file: file.write(text.encode()))
     for note in cfg.sim2real.notes:

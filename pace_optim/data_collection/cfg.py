@@ -51,6 +51,8 @@ class CollectionCfg:
     """``"command"`` or ``"effort"``; ``None`` means the robot's."""
     physics_dt: float | None = None
     """A finer physics step under the same control rate [s]."""
+    control_dt: float | None = None
+    """Time between two commands [s] of a robot that a model file states; ``None``: 2.5 ms."""
     output: Path | None = None
     """File of the recording; ``None`` means ``data/<robot_name>/<excitation>.npz``."""
     export_command: Path | None = None

@@ -68,7 +68,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
     Raises:
         ValueError: If the request cannot be met, or the motion must not be sent to the robot.
     """
-    env_cfg = load_env_cfg(cfg.task)
+    env_cfg = load_env_cfg(cfg.task, cfg.control_dt)
     sim2real = _sim2real(env_cfg, cfg.task)
     control_dt = env_cfg.sim.dt * env_cfg.decimation
     trajectories = make_excitation(

@@ -12,7 +12,13 @@ from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
 from pace_optim.plant import library_effects, outside_effects
 from pace_optim.recording import Load
 from pace_optim.terminal.cli import Parser, make_parser
-from pace_optim.terminal.options import add_common_options, add_overwrite_option, number, take_common_options
+from pace_optim.terminal.options import (
+    add_common_options,
+    add_control_option,
+    add_overwrite_option,
+    number,
+    take_common_options,
+)
 
 from .cfg import CollectionCfg
 
@@ -35,6 +41,7 @@ def make_collection_parser() -> Parser:
     kinds = "; ".join(f"{e.name}: {e.description} ({e.duration:g} s)" for e in excitations())
     add = parser.add_argument
     add_common_options(parser, required=True)
+    add_control_option(parser)
     add("--output", type=Path, metavar="FILE", help=".npz, .pt or .csv (default data/<robot>/<excitation>.npz)")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", default="chirp", metavar="NAME", help=f"(default chirp) {kinds}")

@@ -75,7 +75,7 @@ def simulate_hidden(
         effect_named(name)
     if len(set(cfg.effects)) < len(cfg.effects):
         raise ValueError(f"--effect names an effect twice: {', '.join(cfg.effects)}. Name each once.")
-    robot = plant_robot(cfg.task)
+    robot = plant_robot(cfg.task, cfg.control_dt)
     joints = joints_of(robot, cfg.effect_joints)
     values = {key: truth[space[key]].tolist() for key in (*PARAMETER_GROUPS, "delay")}
     base = {key: dict(zip(robot.joint_names, values[key], strict=True)) for key in PARAMETER_GROUPS}

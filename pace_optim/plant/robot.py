@@ -71,13 +71,17 @@ class PlantRobot:
         return spec
 
 
-def plant_robot(task: str) -> PlantRobot:
+def plant_robot(task: str, control_dt: float | None = None) -> PlantRobot:
     """The robot of an identification task.
+
+    Args:
+        task: As for :func:`pace_envs.load_env_cfg`.
+        control_dt: Time between two commands [s], of a model file.
 
     Raises:
         ValueError: If the task is unknown or no identification task.
     """
-    cfg = load_env_cfg(task)
+    cfg = load_env_cfg(task, control_dt)
     pace = getattr(cfg, "sim2real", None)
     if pace is None:
         raise ValueError(f"{task} is not an identification task: it has no PaceCfg. Choose a Pace-<Robot>-v0.")

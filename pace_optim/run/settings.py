@@ -62,6 +62,9 @@ class FitSettings:
     drive_dt: float | None = None
     """Time between two runs of the drives' own controllers [s]; ``None`` keeps the robot's."""
 
+    control_dt: float | None = None
+    """Time between two commands [s] of a robot that a model file states; ``None``: 2.5 ms."""
+
     joint_strategy: bool = False
     """Search all joints with one strategy although they do not influence each other."""
 
@@ -102,7 +105,7 @@ class FitSettings:
             value = getattr(self, name)
             if value is not None and value < lowest:
                 raise ValueError(f"{name} is {value}, expected at least {lowest}.")
-        for name in ("epsilon", "sigma", "physics_dt", "drive_dt", "max_duration"):
+        for name in ("epsilon", "sigma", "physics_dt", "drive_dt", "control_dt", "max_duration"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")

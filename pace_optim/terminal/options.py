@@ -31,6 +31,13 @@ def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco
     )
 
 
+def add_control_option(parser: argparse._ActionsContainer) -> None:
+    """Of every command that makes a robot of a model file; runs keep it."""
+    parser.add_argument(
+        "--control_dt", type=number, metavar="S", help="of a model file: time between two commands (default 0.0025)"
+    )
+
+
 def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, required: bool = False) -> None:
     """Options of every command that has to do with a robot.
 
