@@ -39,6 +39,7 @@ class Truth:
     """The effect that the model lacks."""
     hidden_on: tuple[str, ...] = ()
     size: np.ndarray | float = 0.0
+    """Torque of the motion's amplitude on kp [N m]."""
 
 
 class Plant:
@@ -150,7 +151,15 @@ def draw_truth(
     )
 
 
-def record(path: Path, command: Path, step: float | None, seed: int, hidden: str | None) -> tuple[Recording, Truth]:
+def record(
+    path: Path,
+    command: Path,
+    step: float | None,
+    seed: int,
+    hidden: str | None = None,
+    hidden_on: tuple[str, ...] = (),
+    truth: Truth | None = None,
+) -> tuple[Recording, Truth]:
     """Play the commands on the robot.
 
     Args:
@@ -158,7 +167,9 @@ def record(path: Path, command: Path, step: float | None, seed: int, hidden: str
         command: CSV of the commands, as ``data_collection.py --export_command`` writes it.
         step: Physics step [s]; ``None``: the file's own.
         seed: Of the truth and the noise.
-        hidden: An effect of two joints that the model lacks.
+        hidden: An effect of some joints that the model lacks.
+        hidden_on: Those joints; none: the two with the largest torques.
+        truth: A robot that was drawn for another motion; ``None``: it is drawn.
     """
     with command.open() as file:
         header = file.readline().strip().split(",")
@@ -169,18 +180,25 @@ def record(path: Path, command: Path, step: float | None, seed: int, hidden: str
     amplitude = np.ptp(target, axis=0) / 2
     own = plant.actuators_of()
     kp, kd = np.array([pair[2:] for pair in own]).T if own else stated_gains(plant)
-    truth = draw_truth(plant, joints, kp, kd, amplitude, seed)
-    if not own:
-        truth = replace(truth, delay=float(np.ceil(LATE / CONTROL_DT - 1e-6) * CONTROL_DT))
-    if hidden:
-        two = tuple(joints[i] for i in np.argsort(-amplitude * kp)[:2])
-        truth = replace(truth, hidden=hidden, hidden_on=two)
+    noise_seed = seed + (1000 if truth is None else 2000)
+    if truth is None:
+        truth = draw_truth(plant, joints, kp, kd, amplitude, seed)
+        if not own:
+            truth = replace(truth, delay=float(np.ceil(LATE / CONTROL_DT - 1e-6) * CONTROL_DT))
+        if hidden:
+            two = hidden_on or tuple(joints[i] for i in np.argsort(-amplitude * kp)[:2])
+            truth = replace(truth, hidden=hidden, hidden_on=two, size=kp * amplitude)
     position = simulate(plant, target, truth, own, kp, kd)
-    noise = np.random.default_rng(seed + 1000).normal(0, NOISE, position.shape)
+    noise = np.random.default_rng(noise_seed).normal(0, NOISE, position.shape)
     drive = Drive() if own else Drive(stiffness=kp, damping=kd)
     time_base = np.arange(len(target)) * CONTROL_DT
     recording = Recording(
-        time=time_base, dof_pos=position + noise, des_dof_pos=target, joint_names=joints, name="chirp", drive=drive
+        time=time_base,
+        dof_pos=position + noise,
+        des_dof_pos=target,
+        joint_names=joints,
+        name=command.stem,
+        drive=drive,
     )
     return recording, truth
 
@@ -215,7 +233,6 @@ def simulate(
     model.dof_damping[dofs] = truth.viscous_friction
     model.dof_frictionloss[dofs] = truth.friction
     hit = np.array([name in truth.hidden_on for name in truth.joints])
-    span = np.ptp(target, axis=0) / 2
     dt, limit = model.opt.timestep, effort_limits(plant)
     data.qpos[:] = plant.home
     positions = np.zeros_like(target)
@@ -234,7 +251,7 @@ def simulate(
                 torque = np.clip(kp * (target[late] - shown) - kd * data.qvel[dofs], -limit, limit)
             k += 1
         arrived = min(len(target) - 1, max(0, int(np.floor((now - LATE) / CONTROL_DT + 1e-6))))
-        extra = hidden_torque(truth, hit, data.qvel[dofs], kp * span)
+        extra = hidden_torque(truth, hit, data.qvel[dofs])
         data.qfrc_applied[dofs] = extra
         if truth.hidden == "stribeck":
             slow = np.exp(-((data.qvel[dofs] / 0.1) ** 2))
@@ -254,10 +271,10 @@ def control_of(model: mujoco.MjModel, a: int, length: float) -> float:
     return float((-bias[1] * length - bias[0]) / gain)
 
 
-def hidden_torque(truth: Truth, hit: np.ndarray, speed: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """What the hidden effect adds; ``scale`` is the torque of the motion's amplitude on kp."""
+def hidden_torque(truth: Truth, hit: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """What the hidden effect adds."""
     if truth.hidden == "quadratic":
         return -hit * truth.viscous_friction * 0.5 * speed * np.abs(speed)
     if truth.hidden == "offset":
-        return hit * 0.15 * scale
+        return hit * 0.15 * truth.size
     return np.zeros_like(speed)

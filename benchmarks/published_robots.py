@@ -6,13 +6,16 @@
 The file's own actuators move the robot (a file without actuators: a PD loop at the control rate, stated in the
 recording) at a fine step that is not the fit's; armature, friction, bias and noise are ours, and the command is late.
 Then the command lines run as a user's would, with nothing written by hand: ``fit``, and on a recording with a hidden
-effect on two joints ``fit`` and ``diagnose``. Each step is kept, so that a run that was broken off goes on.
+effect on the two joints that move most ``fit`` and ``diagnose``, with a second recording held out, of another motion:
+the last third of a chirp is its fast end, which hardly shows friction. Each step is kept, so that a run that was broken
+off goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import subprocess
@@ -20,9 +23,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 from published_plant import HIDDEN, Truth, record
 
-from pace_optim.recording import save_recording
+from pace_optim.recording import Recording, save_recording
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 SECONDS = 20.0
@@ -49,10 +53,18 @@ def last_run(output: str) -> Path:
 
 
 def errors(result: dict, truth: Truth) -> dict[str, dict]:
-    """Of each group the worst relative error of what is determined (biases: absolute), where, and what is not."""
+    """Of each group the worst relative error of what is determined (biases: absolute), where, and what is not.
+
+    With its error bar, by noise and the physics step, and the largest error in error bars.
+    """
     rows = {}
     for group in GROUPS:
-        found, std, right = result["parameters"][group], result["std"][group], getattr(truth, group)
+        found, right = result["parameters"][group], getattr(truth, group)
+        steps = result.get("step_error", {}).get(group, {})
+        std = {
+            name: None if noise is None else math.hypot(noise, steps.get(name) or 0.0)
+            for name, noise in result["std"][group].items()
+        }
         undetermined = [n for n in truth.joints if f"{group}/{n}" in result["undetermined"]]
         off = {
             name: abs(found[name] - value) / (1.0 if group == "encoder_bias" else abs(value))
@@ -64,7 +76,12 @@ def errors(result: dict, truth: Truth) -> dict[str, dict]:
         if worst is not None and group != "encoder_bias" and std[worst] is not None:
             value["std"] /= abs(right[truth.joints.index(worst)])
         above = [name for name, error in off.items() if error > 0.02]
-        rows[group] = {**value, "undetermined": undetermined, "above_2_percent": above}
+        bars = [
+            abs(found[name] - value) / bar
+            for name, value in zip(truth.joints, right, strict=True)
+            if name in off and (bar := std[name])
+        ]
+        rows[group] = {**value, "undetermined": undetermined, "above_2_percent": above, "bars": max(bars, default=None)}
     return rows
 
 
@@ -76,22 +93,28 @@ def run(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     row_file = folder / "row.json"
     row = json.loads(row_file.read_text()) if row_file.is_file() else {"robot": name, "seconds": args.seconds}
-    command = folder / "command.csv"
-    if not command.is_file():
-        call(
-            *("data_collection", "--task", path, "--command_only", "--export_command", command, "--no_plot"),
-            *("--duration", args.seconds, "--max_frequency", args.max_frequency),
-            log=folder / "command.log",
-        )
+    command, other = folder / "command.csv", folder / "held_out.csv"
+    for file, motion in ((command, "chirp"), *([(other, "multisine")] if args.hide else [])):
+        if not file.is_file():
+            call(
+                *("data_collection", "--task", path, "--command_only", "--export_command", file, "--no_plot"),
+                *("--duration", args.seconds, "--max_frequency", args.max_frequency, "--excitation", motion),
+                log=folder / "command.log",
+            )
+    step, moves = None if args.own_step else args.step, ()
     for hidden in (None, args.hide) if args.hide else (None,):
         kind = hidden or "plain"
-        data = folder / f"{kind}.npz"
-        recording, truth = record(path, command, None if args.own_step else args.step, args.seed, hidden)
+        data, held_out = folder / f"{kind}.npz", folder / f"{kind}_held_out.npz"
+        recording, truth = record(path, command, step, args.seed, hidden, moves)
+        moves = moving_most(recording)
         if not data.is_file():
             save_recording(data, recording)
+        if hidden and not held_out.is_file():
+            save_recording(held_out, record(path, other, step, args.seed, truth=truth)[0])
         if f"fit_{kind}" not in row:
             out, wall, used = call(
                 *("fit", "--task", path, "--data", data, "--log_dir", folder / "logs", *args.fit_options),
+                *(("--validation", held_out) if hidden else ()),
                 log=folder / f"fit_{kind}.log",
             )
             result = json.loads((last_run(out) / "result.json").read_text())
@@ -122,6 +145,12 @@ def run(args: argparse.Namespace) -> None:
             }
             row_file.write_text(json.dumps(row, indent=1))
     print(table([row]))
+
+
+def moving_most(recording: Recording) -> tuple[str, ...]:
+    """The two joints that move furthest: friction shows on them."""
+    order = np.argsort(-np.ptp(recording.dof_pos, axis=0))
+    return tuple(recording.joint_names[i] for i in order[:2])
 
 
 def bar(factor: float, std: float | None) -> str:

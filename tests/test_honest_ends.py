@@ -64,11 +64,35 @@ def test_what_has_no_influence_or_an_error_bar_as_wide_as_its_bounds_is_open_unl
     problem = joint_alone().problem
     std = np.zeros(problem.space.size)
     std[problem.space["encoder_bias"]] = 10.0
-    found = uncertainty(problem, std=std, no_influence=("delay/all",))
-    assert undetermined(problem, found) == ["encoder_bias/servo", "delay/all"]
-    assert undetermined(problem, found, far=True) == ["delay/all"]
+    found, start = uncertainty(problem, std=std, no_influence=("delay/all",)), problem.space.start
+    assert undetermined(problem, start, found) == ["encoder_bias/servo", "delay/all"]
+    assert undetermined(problem, start, found, far=True) == ["delay/all"]
     held = without(found, ["encoder_bias/servo"], problem.space)
     assert np.isnan(held.std[problem.space["encoder_bias"]]).all() and held.std[0] == 0.0
+
+
+def test_an_inertia_or_a_friction_that_is_told_neither_from_none_nor_from_its_prior_is_open():
+    """By noise and the physics step together; a bias or a delay of 0 is a value like others."""
+    problem = joint_alone().problem
+    space = problem.space
+    own = prior(problem)
+    values = {
+        **dict(zip(space.labels, own.tolist(), strict=True)),
+        "armature/servo": 0.1,
+        "viscous_friction/servo": 0.3,
+        "friction/servo": 0.2,
+    }
+    x = space.to_normalised(torch.tensor([values[label] for label in space.labels], dtype=torch.float64))
+
+    def open_(step=None, **std):
+        bars = np.array([std.get(label.split("/")[0], 1e-3) for label in space.labels])
+        shares = None if step is None else np.where([label.startswith(step) for label in space.labels], -0.3, 0.0)
+        return undetermined(problem, x, uncertainty(problem, std=bars, step=shares))
+
+    assert open_() == [] and open_(friction=0.05) == []
+    assert open_(friction=0.15) == ["friction/servo"]
+    assert open_(step="viscous") == ["viscous_friction/servo"]
+    assert open_(friction=np.nan) == []  # at its bound
 
 
 def test_the_prior_is_the_configuration_s_value_else_zero():
@@ -101,9 +125,10 @@ def test_warnings_are_one_for_each_kind_and_what_does_not_carry_over_comes_first
         at_bound=("friction/servo",),
         indistinguishable=(("encoder_bias/servo", "friction/servo"), ("encoder_bias/servo", "friction/servo")),
     )
-    told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"])
+    told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"], ["friction/servo"])
     assert "59.0 times" in told[0] and "at its" in told[1]
     assert told[2].startswith("These recordings do not determine delay:")
+    assert told[3].startswith("These recordings hardly determine friction of servo:")
     assert sum("cannot tell apart" in text for text in told) == 1
 
 

@@ -183,6 +183,16 @@ def test_a_parameter_at_its_bound_is_named_has_no_error_bar_and_narrows_the_othe
     assert found.std[0] < 0.8 * inside.std[0]
 
 
+@pytest.mark.parametrize(("sigma", "told"), [(1e-3, True), (1e-1, False)])
+def test_a_value_that_its_error_bar_tells_from_a_near_bound_is_not_at_it(sigma, told):
+    """Such as a friction of a small joint, within bounds for a strong drive."""
+    rng = np.random.default_rng(0)
+    jacobian, space = linear(rng.standard_normal((2, 4000)), sigma * rng.standard_normal(4000))
+    found = estimate_uncertainty(jacobian, space, torch.tensor([-0.9995, 0.0], dtype=torch.float64))
+    assert found.at_bound == (() if told else ("p0/j",))
+    assert np.isnan(found.std[0]) != told
+
+
 def test_everything_at_its_bound_is_survived():
     rng = np.random.default_rng(11)
     jacobian, space = linear(rng.standard_normal((2, 500)), rng.standard_normal(500))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
 import torch
 
 from pace_actuators.drive_result import ALL
@@ -13,12 +14,14 @@ from pace_optim.identification.optimization import NEAR, Optimization, Outcome
 from pace_optim.optimizers.jacobian import Jacobian
 from pace_optim.optimizers.least_squares import find_jacobian
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.summary import summary
 from pace_optim.uncertainty.assessment import Assessment, assess, assess_known, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.uncertainty.other_solutions import with_other_solutions
+from pace_optim.uncertainty.step_share import change_without_step, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without, without_delay
 from pace_optim.uncertainty.warnings import fit_warnings
@@ -44,6 +47,8 @@ class _End:
     """Where the optimizers ended [rad]."""
     times: float | None
     """The same as a multiple of the noise."""
+    without_step: torch.Tensor | None = None
+    """How the motion would change without a physics step, (K, R, n) [rad]; ``None``: not known."""
 
     @property
     def is_far(self) -> bool:
@@ -53,7 +58,15 @@ class _End:
     def moved(self, x: torch.Tensor, known: Assessment, held: list[str], run: Optimization) -> _End:
         """Another vector, with some parameters held."""
         uncertainty = without(known.uncertainty, held, run.problem.space)
-        return replace(self, x=x, uncertainty=uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+        end = replace(self, x=x, uncertainty=uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+        return end.with_step_share(run.problem.space)
+
+    def with_step_share(self, space: ParameterSpace) -> _End:
+        """With error bars that know what comes from the physics step, where that is known."""
+        if self.without_step is None:
+            return self
+        share = step_share(self.jacobian, self.without_step, space, self.x, ~np.isnan(self.uncertainty.std))
+        return replace(self, uncertainty=replace(self.uncertainty, step=share))
 
 
 def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> FitResult:
@@ -68,9 +81,11 @@ def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> 
         ValueError: If there the simulation diverges.
     """
     end = _reached(run, outcome)
+    if not end.is_far and not outcome.is_interrupted:
+        end = _told_of_step(run, end)
     if run.progress.elapsed > _LONG and not outcome.is_interrupted:
         run.progress.tell(f"{summary(_result(run, record, outcome, end))}\nThat was the fit; what follows checks it.")
-    if left_open := undetermined(run.problem, end.uncertainty, end.is_far):
+    if left_open := undetermined(run.problem, end.x, end.uncertainty, end.is_far):
         end = _with_prior(run, outcome, end, left_open)
     if not end.is_far and not outcome.is_interrupted:
         end = _perhaps_without_delay(run, end)
@@ -93,6 +108,8 @@ def _result(
     rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
     uncertainty = with_other_solutions(end.uncertainty, run.descents, problem.space)
     physical = problem.space.to_physical(end.x)
+    open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
+    unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
     return make_result(
         problem,
         end.x,
@@ -114,7 +131,7 @@ def _result(
         std_means_nothing=end.is_far,
         warnings=[
             *far_end(end.times, end.train_rmse, settings.optimizer, run.searched),
-            *fit_warnings(problem, physical, uncertainty, rmse, end.left_open),
+            *fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure),
             *consistency.sentences,
         ],
     )
@@ -149,6 +166,14 @@ def _ended_at(run: Optimization, x: torch.Tensor) -> Assessment | None:
 
 def _known_at(run: Optimization, x: torch.Tensor) -> Assessment:
     return assess(run.problem, run.assessor, run.colouring, x)
+
+
+def _told_of_step(run: Optimization, end: _End) -> _End:
+    """What of each value comes from the physics step."""
+    run.progress.say("simulating with a finer step, to tell what comes from the step")
+    space = run.problem.space
+    change = change_without_step(run.problem, space.to_physical(end.x), end.jacobian.residuals)
+    return replace(end, without_step=change).with_step_share(space)
 
 
 def _with_prior(run: Optimization, outcome: Outcome, end: _End, left_open: list[str]) -> _End:

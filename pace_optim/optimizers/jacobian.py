@@ -87,6 +87,24 @@ class Jacobian:
         result[..., joints] = self.columns[row][..., joints]
         return result
 
+    def times(self, vector: torch.Tensor) -> torch.Tensor:
+        """J v, (K, R, n) [rad], of a normalised change (size,) of the entries."""
+        result = torch.zeros_like(self.residuals.error[0])
+        for row, entries in zip(self.columns, self.colouring.colours, strict=True):
+            for entry in entries:
+                joints = list(self.colouring.joints[entry])
+                result[..., joints] += float(vector[entry]) * row[..., joints]
+        return result
+
+    def transposed_times(self, series: torch.Tensor) -> torch.Tensor:
+        """Jᵀ s, (size,), of a series like the residuals, (K, R, n) [rad], divided by the number of samples."""
+        result = torch.zeros(len(self.colouring.joints), dtype=torch.float64)
+        for row, entries in zip(self.columns, self.colouring.colours, strict=True):
+            by_joint = (row * series).sum(dim=(0, 1))
+            for entry in entries:
+                result[entry] = by_joint[list(self.colouring.joints[entry])].sum()
+        return result / self.residuals.where.sum()
+
     def normal_equations(self) -> tuple[torch.Tensor, torch.Tensor]:
         """JᵀJ (size, size) and Jᵀr (size,), divided by the number of samples as the score is."""
         size = len(self.colouring.joints)

@@ -45,6 +45,8 @@ class FitResult(DriveResult):
     stop_reasons: list[str]
     times_noise: float | None = None
     """The training error as a multiple of the measurement noise."""
+    step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    """What of each value comes from the physics step, shaped as ``std``; empty where that is not known."""
     std_means_nothing: bool = False
     """Whether the fit ended so far above the noise that its error bars say nothing."""
     measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -87,6 +89,11 @@ class FitResult(DriveResult):
         unit = self.units.get(name, "")
         return unit if isinstance(unit, str) else unit.get(key, "")
 
+    def error_bar(self, name: str, key: str) -> float | None:
+        """One standard deviation of a value, by noise and the physics step together; ``None`` where there is none."""
+        std = self.std.get(name, {}).get(key)
+        return None if std is None else math.hypot(std, self.step_error.get(name, {}).get(key) or 0.0)
+
     def joint_type(self, joint: str) -> JointType:
         """Whether a joint turns or slides."""
         return "slide" if self.unit_of("encoder_bias", joint) == "m" else "hinge"
@@ -103,9 +110,9 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     }
 
 
-def std_by_parameter(space: ParameterSpace, uncertainty: Uncertainty) -> dict[str, dict[str, float | None]]:
-    """Standard deviations shaped as the parameters; ``None`` where there is none."""
-    values = space.to_dict(torch.as_tensor(uncertainty.std))
+def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
+    """Standard deviations, or other errors, shaped as the parameters; ``None`` where there is none."""
+    values = space.to_dict(torch.as_tensor(errors))
     return {name: {key: None if math.isnan(v) else v for key, v in entries.items()} for name, entries in values.items()}
 
 
@@ -170,7 +177,7 @@ def make_result(
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
     trained = residuals.error[0].square()[train]
-    values, std = space.to_dict(physical), std_by_parameter(space, uncertainty)
+    values, std = space.to_dict(physical), by_parameter(space, uncertainty.std)
     return FitResult(
         task=problem.task,
         robot_name=problem.env_cfg.sim2real.robot_name,
@@ -181,6 +188,7 @@ def make_result(
         parameters=values,
         delay_s=float(physical[space["delay"]]) * problem.control_dt,
         std=std,
+        step_error={} if uncertainty.step is None else by_parameter(space, uncertainty.step),
         units=space.units,
         at_bound=list(uncertainty.at_bound),
         no_influence=list(uncertainty.no_influence),

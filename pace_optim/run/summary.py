@@ -22,6 +22,9 @@ def summary(result: FitResult) -> str:
             if name == "delay":
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
+    if result.step_error and not result.std_means_nothing:
+        step = f"{1e3 * result.physics_dt:g} ms"
+        lines.append(f"±: one standard deviation, of noise and of the error of the physics step of {step} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(whole(error))
     lines.append(
@@ -50,7 +53,7 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
 def _value(result: FitResult, name: str, key: str) -> str:
     if key not in result.parameters[name]:  # an effect that other joints have
         return "-"
-    std = result.std[name][key]
+    std = result.error_bar(name, key)
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
     error = "" if std is None else " ± ?" if result.std_means_nothing else f" ± {std:.1g}"

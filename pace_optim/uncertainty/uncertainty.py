@@ -13,7 +13,7 @@ from pace_optim.optimizers.jacobian import Colouring, Jacobian
 from pace_optim.problem.parameter_space import ParameterSpace
 
 AT_BOUND = 1e-3
-"""A normalised entry this close to -1 or 1 is at its bound."""
+"""A normalised entry this close to -1 or 1 is at its bound, unless its error bar tells it from there."""
 NO_INFLUENCE = 1e-6
 """A parameter whose whole range moves the joints by less than this (RMS) has no influence [rad]."""
 WEAK_STD = 0.05
@@ -23,6 +23,8 @@ SEEN = 1e-12
 _NOTHING_KNOWN = 1e6
 """Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
+SURE = 2.0
+"""Standard deviations that tell a value from another."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +41,13 @@ class Uncertainty:
     """Labels of parameters that do not move the joints."""
     indistinguishable: tuple[tuple[str, ...], ...]
     """Sets of labels that the recording cannot tell apart."""
+    step: np.ndarray | None = None
+    """What of each value comes from the physics step, (size,) as ``std``; ``None`` where that is not known."""
+
+    @property
+    def error_bar(self) -> np.ndarray:
+        """Of noise and the physics step together, (size,)."""
+        return self.std if self.step is None else np.hypot(self.std, self.step)
 
 
 def estimate_uncertainty(
@@ -90,18 +99,20 @@ def uncertainty_of(
     whole_range = 2 * np.sqrt(np.clip(hessian.diagonal(), 0, None) / samples)
     position = x.numpy()
     fixed = (space.upper <= space.lower).numpy()
-    bound = (np.abs(position) > 1 - AT_BOUND) & ~fixed
     silent = (whole_range < NO_INFLUENCE) & ~fixed
+    inside = 1 - np.abs(position)
+    bound = (inside < AT_BOUND) & ~fixed
+    if (near := bound & ~silent & (inside > 0)).any():
+        free = np.flatnonzero(~(bound & ~near | silent | fixed))
+        told = np.zeros(size, dtype=bool)
+        told[free] = SURE * np.sqrt(_covariance(hessian, middle, samples, free).diagonal().clip(0)) < inside[free]
+        bound &= ~(near & told)
     free = np.flatnonzero(~(bound | silent | fixed))
     std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
     groups: list[tuple[str, ...]] = []
     if len(free):
         h = hessian[np.ix_(free, free)]
-        scale = 1 / np.sqrt(h.diagonal())
-        values, vectors = _eigen(h * scale[:, None] * scale)
-        kept = values > SEEN
-        inverse = (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
-        covariance = inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
+        covariance = _covariance(hessian, middle, samples, free)
         normalised = np.sqrt(np.clip(covariance.diagonal(), 0, None))
         std[free] = normalised * space.slope(x).numpy()[free]
         outer = np.where(normalised > 0, normalised, 1.0)
@@ -120,6 +131,20 @@ def uncertainty_of(
     )
 
 
+def _covariance(hessian: np.ndarray, middle: np.ndarray, samples: int, free: np.ndarray) -> np.ndarray:
+    """C = H⁻¹ (Jᵀ Σ J) H⁻¹ of some entries, the others held."""
+    inverse = inverse_of(hessian[np.ix_(free, free)])
+    return inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
+
+
+def inverse_of(hessian: np.ndarray) -> np.ndarray:
+    """H⁻¹ of parameters that move the joints, without the directions that move nothing."""
+    scale = 1 / np.sqrt(hessian.diagonal())
+    values, vectors = _eigen(hessian * scale[:, None] * scale)
+    kept = values > SEEN
+    return (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
+
+
 def _middle(jacobian: Jacobian) -> np.ndarray:
     """JᵀΣJ, (size, size)."""
     residuals, colouring = jacobian.residuals, jacobian.colouring
@@ -133,7 +158,7 @@ def _middle(jacobian: Jacobian) -> np.ndarray:
             own = [entry for entry in row if joint in colouring.joints[entry]]
             columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
-            total[np.ix_(own, own)] += columns @ _filtered(columns, autocovariance(error)).T
+            total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
     return total
 
 
@@ -202,7 +227,7 @@ def sandwich(columns: np.ndarray, error: np.ndarray, prior: float = np.inf) -> n
     seen = values > SEEN
     middle = np.zeros((len(flat), len(flat)))
     for r in range(error.shape[1]):
-        middle += columns[..., r] @ _filtered(columns[..., r], autocovariance(error[:, r])).T
+        middle += columns[..., r] @ filtered(columns[..., r], autocovariance(error[:, r])).T
     inverse = (vectors[seen].T / values[seen]) @ vectors[seen] * scale[:, None]
     covariance = inverse @ middle @ inverse.T
     if not np.isfinite(prior):
@@ -213,7 +238,7 @@ def sandwich(columns: np.ndarray, error: np.ndarray, prior: float = np.inf) -> n
     return prior * every - prior**2 * np.linalg.inv(covariance + prior * every)
 
 
-def _filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Σ applied to each row of (entries, T), Σ the Toeplitz matrix of an autocovariance."""
     kernel = np.concatenate([covariance[:0:-1], covariance])
     return signal.fftconvolve(columns, kernel[None, :], mode="same", axes=1) if len(kernel) > 1 else columns * kernel

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
+from pace_actuators.drive_result import NOT_NEGATIVE
 from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace import GLOBAL
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
@@ -19,7 +20,7 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.uncertainty.other_solutions import AS_GOOD
-from pace_optim.uncertainty.uncertainty import Uncertainty
+from pace_optim.uncertainty.uncertainty import SURE, Uncertainty
 
 HARDLY_KNOWN = 0.5
 """A standard deviation above this part of the bound range leaves a parameter open."""
@@ -27,27 +28,44 @@ HARDLY_KNOWN = 0.5
 
 DELAY = f"delay/{GLOBAL}"
 """Label of the delay."""
-_SURE = 2.0
-"""Standard deviations that tell a delay from none."""
 
 
-def undetermined(problem: Problem, uncertainty: Uncertainty, far: bool = False) -> list[str]:
-    """Labels of parameters without influence, and of those whose error bar is as wide as their bounds.
+def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, far: bool = False) -> list[str]:
+    """Labels of parameters without influence, and of those whose error bar is as wide as their bounds or value.
 
-    A fact that the user declares unknown is open too where others can make up for it: what is stated then holds.
+    As wide as the value: an inertia or a friction that is told neither from none nor from its prior. A fact that the
+    user declares unknown is open too where others can make up for it: what is stated then holds.
 
     Args:
         problem: What was fitted.
-        uncertainty: At the result.
+        x: The result, normalised (size,).
+        uncertainty: There.
         far: Whether the fit ended so far above the noise that error bars mean nothing: then they leave nothing open.
     """
     silent = set(uncertainty.no_influence)
     if far:
         return [label for label in problem.space.labels if label in silent]
-    width = (problem.space.upper - problem.space.lower).numpy()
-    wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * width
     silent |= _of_unknown(problem) & {label for group in uncertainty.indistinguishable for label in group}
-    return [label for label, yes in zip(problem.space.labels, wide, strict=True) if yes or label in silent]
+    silent |= _wide(problem.space, uncertainty) | _none_or_prior(problem, x, uncertainty)
+    return [label for label in problem.space.labels if label in silent]
+
+
+def _wide(space: ParameterSpace, uncertainty: Uncertainty) -> set[str]:
+    """Labels of what has an error bar as wide as its bounds."""
+    wide = np.nan_to_num(uncertainty.error_bar) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
+    return {label for label, yes in zip(space.labels, wide, strict=True) if yes}
+
+
+def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) -> set[str]:
+    """Labels of what may be none, or as its prior is, by its error bar."""
+    space, value = problem.space, problem.space.to_physical(x).numpy()
+    apart = np.maximum(value, np.abs(value - _within_bounds(problem).numpy()))
+    unsure = apart < SURE * uncertainty.error_bar  # not where there is none
+    return {
+        label
+        for label, yes in zip(space.labels, unsure, strict=True)
+        if yes and label != DELAY and label.split("/")[0] in NOT_NEGATIVE
+    }
 
 
 def _of_unknown(problem: Problem) -> set[str]:
@@ -62,7 +80,8 @@ def held_at_prior(
     """A vector with what the recordings leave open at its prior, the rest fitted again beside it; and what that is.
 
     Several parameters that are open each may not be so together: where their prior costs more than another solution
-    may, only facts that are declared unknown are held, and where that costs too much, only what has no influence.
+    may, those are not held whose error bar is only as wide as their value; then only facts that are declared unknown
+    are, and where that costs too much, only what has no influence.
 
     Args:
         problem: What was fitted.
@@ -74,7 +93,9 @@ def held_at_prior(
     silent = [label for label in labels if label in uncertainty.no_influence]
     unknown = _of_unknown(problem)
     fewer = [label for label in labels if label in silent or label in unknown]
-    for chosen in dict.fromkeys((tuple(labels), tuple(fewer))):
+    wide = _wide(problem.space, uncertainty)
+    wide_or_fewer = [label for label in labels if label in wide or label in fewer]
+    for chosen in dict.fromkeys((tuple(labels), tuple(wide_or_fewer), tuple(fewer))):
         if cfg is not None and len(silent) < len(chosen):
             found = _fitted_beside(problem, x, list(chosen), cfg)
             if found is not None:
@@ -105,8 +126,8 @@ def without_delay(
     """
     space = problem.space
     at = space.labels.index(DELAY)
-    delay, std = float(space.to_physical(x)[at]), float(uncertainty.std[at])
-    if DELAY in held or float(space.lower[at]) != 0 or not 0 < delay <= _SURE * std:
+    delay, error = float(space.to_physical(x)[at]), float(uncertainty.error_bar[at])
+    if DELAY in held or float(space.lower[at]) != 0 or not 0 < delay <= SURE * error:
         return None
     return _fitted_beside(problem, x, [*held, DELAY], cfg)
 
@@ -134,8 +155,13 @@ def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tens
     space = problem.space
     at = [space.labels.index(label) for label in labels]
     result = x.clone()
-    result[at] = space.to_normalised(prior(problem).clamp(space.lower, space.upper))[at]
+    result[at] = space.to_normalised(_within_bounds(problem))[at]
     return result
+
+
+def _within_bounds(problem: Problem) -> torch.Tensor:
+    """The prior, or the bound that is nearest to it, physical (size,)."""
+    return prior(problem).clamp(problem.space.lower, problem.space.upper)
 
 
 def prior(problem: Problem) -> torch.Tensor:

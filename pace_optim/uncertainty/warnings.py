@@ -30,6 +30,7 @@ def fit_warnings(
     uncertainty: Uncertainty,
     rmse: dict[str, dict[str, float]],
     left_open: Sequence[str] = (),
+    unsure: Sequence[str] = (),
 ) -> list[str]:
     """Plain sentences, the most important first, one for each kind; none if all is well.
 
@@ -38,7 +39,8 @@ def fit_warnings(
         physical: The result, (size,).
         uncertainty: At the result.
         rmse: Errors as in ``result.json``.
-        left_open: Labels of parameters that the recordings do not determine.
+        left_open: Labels of parameters that the recordings do not determine, at their prior.
+        unsure: Labels of those that are not determined either, but fit worse there.
     """
     change = _change_at_half_the_step(problem, physical, rmse)
     return [
@@ -49,6 +51,7 @@ def fit_warnings(
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),
         *_undetermined(left_open),
+        *_unsure(unsure),
         *_alike(uncertainty.indistinguishable),
         *_coarse_step(problem, rmse, change),
     ]
@@ -58,7 +61,16 @@ def _undetermined(labels: Sequence[str]) -> list[str]:
     """One sentence for each parameter that the recordings leave open on some joints."""
     return [
         f"These recordings do not determine {name.replace('_', ' ')}{_of(keys)}: no influence, or an error bar as wide "
-        "as the bounds. It keeps its prior, and exports leave it out."
+        "as the bounds, or as the value itself. It keeps its prior, and exports leave it out."
+        for name, keys in _by_parameter(labels).items()
+    ]
+
+
+def _unsure(labels: Sequence[str]) -> list[str]:
+    """The same for those whose error bar leaves open what the error does not, with this physics step."""
+    return [
+        f"These recordings hardly determine {name.replace('_', ' ')}{_of(keys)}: an error bar as wide as the value "
+        "itself, or as the bounds. It keeps the value that fits best with this physics step."
         for name, keys in _by_parameter(labels).items()
     ]
 

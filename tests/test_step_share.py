@@ -1,0 +1,75 @@
+"""What of a result comes from the physics step: closed forms, and recordings of physics with the step and without."""
+
+import numpy as np
+import pytest
+import torch
+from problems import CALM, chirp, env_cfg, make_problem, record
+from test_uncertainty import linear
+
+from pace_envs import set_physics_dt
+from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.uncertainty.assessment import assess
+from pace_optim.uncertainty.step_share import change_without_step, step_share
+
+START = torch.zeros(2, dtype=torch.float64)
+
+
+def shares(left_in_error, part=1.0, known=(True, True)):
+    """Of a linear problem whose residuals change by J (0.02, -0.3) and something that no parameter makes up for."""
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((2, 4000))
+    columns[1] += 0.8 * columns[0]
+    own = rng.standard_normal(4000)
+    own -= columns.T @ np.linalg.solve(columns @ columns.T, columns @ own)
+    noise = 1e-3 * rng.standard_normal(4000)
+    jacobian, space = linear(columns, noise - left_in_error * 2e-3 * own)
+    change = part * (np.array([0.02, -0.3]) @ columns + 2e-3 * own)
+    series = torch.as_tensor(change)[:, None, None]
+    return step_share(jacobian, series, space, START, np.array(known))
+
+
+def test_a_value_less_its_share_is_what_a_fit_without_the_step_would_give():
+    assert shares(1.0) == pytest.approx([0.02, -0.3])
+    assert shares(0.0, part=1e-2) == pytest.approx(
+        [2e-4, -3e-3]
+    )  # 2 % of the noise: nobody can tell whether it is there
+    assert shares(0.0, part=0.0).tolist() == [0.0, 0.0]
+
+
+def test_what_has_no_error_bar_has_no_share():
+    assert np.isnan(shares(1.0, known=(True, False))).tolist() == [False, True]
+    assert np.isnan(shares(1.0, known=(False, False))).all()
+
+
+def test_a_recording_that_the_step_itself_made_has_no_share():
+    assert shares(0.0).tolist() == [0.0, 0.0]
+
+
+def fitted(step):
+    """A fit at 2.5 ms to a recording of physics at some step: shares, errors and standard deviations."""
+    recorded = env_cfg()
+    if step != 0.0025:
+        set_physics_dt(recorded, step)
+    problem = make_problem(record(chirp(2.0), CALM, cfg=recorded, noise=1e-4))
+    colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
+    truth = problem.space.from_dict(CALM)
+    best = least_squares(evaluator, colouring, [problem.space.to_normalised(truth)], LeastSquaresCfg(max_iteration=8))[
+        0
+    ]
+    known = assess(problem, evaluator, colouring, best.x)
+    physical = problem.space.to_physical(best.x)
+    change = change_without_step(problem, physical, known.jacobian.residuals)
+    share = step_share(known.jacobian, change, problem.space, best.x, ~np.isnan(known.uncertainty.std))
+    return share, (physical - truth).numpy(), known.uncertainty.std
+
+
+def test_error_bars_with_the_step_hold_the_truth_where_those_of_noise_do_not():
+    share, off, std = fitted(0.0005)
+    assert (np.abs(off) > 5 * std).any()
+    assert (np.abs(off) < 3 * np.hypot(std, share)).all() and (np.abs(share) < 2 * np.abs(off) + 3 * std).all()
+
+
+def test_a_simulation_with_this_very_step_is_known_as_one():
+    share, off, std = fitted(0.0025)
+    assert not share.any() and (np.abs(off) < 4 * std).all()
