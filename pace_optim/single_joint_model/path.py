@@ -220,7 +220,7 @@ def _along(
     whole = feel = links.feel(motion)
     whole_stiffness = torch.zeros_like(whole.torque)
     for moved in _one_of_each_tree(problem):
-        whole_stiffness[..., moved] = _stiffness(links, motion, moved)
+        whole_stiffness[..., moved] = _stiffness(links, motion, whole, moved)
     stiffness = whole_stiffness
     changes = {}
     for name in model_effects:
@@ -257,10 +257,14 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _stiffness(links: Links, motion: Motion, joints: Sequence[int]) -> torch.Tensor:
+def _stiffness(links: Links, motion: Motion, feel: JointLoad, joints: Sequence[int]) -> torch.Tensor:
     """Derivative of f_j - M_j a_j by the joint's own position of joints of which none moves another, (T, R, joints)."""
-    steps, motion = len(motion.qpos), motion.every(_STIFFNESS_EVERY)
-    at, there = links.feel(motion), links.feel(motion.moved(links.shifts(motion, joints, _STEP)))
+    steps, motion, at = (
+        len(motion.qpos),
+        motion.every(_STIFFNESS_EVERY),
+        feel.map(lambda each: each[::_STIFFNESS_EVERY]),
+    )
+    there = links.feel(motion.moved(links.shifts(motion, joints, _STEP)))
     change = (there.torque - at.torque) - (there.inertia - at.inertia) * motion.qacc[..., links.columns]
     return (change[..., joints] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
 
@@ -296,8 +300,9 @@ def _change(
         values[moved] = other[moved]
         robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
         links = Links.of(rollout.env)
-        there = vars(links.feel(motion)) | {"stiffness": torch.zeros_like(stiffness)}
-        there["stiffness"][..., moved] = _stiffness(links, motion, moved)
+        felt = links.feel(motion)
+        there = vars(felt) | {"stiffness": torch.zeros_like(stiffness)}
+        there["stiffness"][..., moved] = _stiffness(links, motion, felt, moved)
         for field, value in fields.items():
             changes[field][..., moved] = ((there[field] - value) / (other - now))[..., moved]
     robot.write_effect_parameter_to_sim(effect, parameter, now.expand(robot.num_envs, -1))

@@ -29,7 +29,7 @@ def change_without_step(problem: Problem, physical: torch.Tensor, there: Residua
         The change; ``None`` where the finer simulation diverges.
     """
     finer = problem.with_physics_dt(problem.physics_dt / _FINER)
-    change = _TO_NO_STEP * (finer.evaluator().residuals(physical[None]).error[0] - there.error[0])
+    change = _TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
     return change if bool(change.isfinite().all()) else None
 
 
