@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import joint_alone
+from diagnoses import FITS, joint_alone
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis.candidates.multistart import multistart
@@ -18,7 +18,6 @@ from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.problem import forked as processes
 from pace_optim.problem.forked import parallel_map
-from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
 
@@ -168,7 +167,7 @@ def test_a_collection_in_the_fork_does_not_touch_simulations(monkeypatch):
 def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     bench = joint_alone()
     model, yes = JointModel.base(bench.problem), torch.tensor([True])
-    base = Fits().side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
+    base = FITS.side_by_side(bench.twins, [Fitted.start(model, bench.truth_values)], 2, keep_jacobian=True)[0]
     effects, effort = [GAIN, ELASTICITY, RIPPLE], torch.tensor([5.0], dtype=torch.float64)
     heavy = bench.truth_values.clone()
     heavy[:, BASE.index("armature")] *= 2  # takes longer than one at the truth
@@ -179,11 +178,11 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
             Fitted.start(*model.extended(values, effect, yes, each), effect)
             for effect, values, each in zip(effects, (bench.truth_values, heavy, heavy), own, strict=True)
         ]
-        fits = Fits().side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
+        fits = FITS.side_by_side(bench.twins, starts, 4, keep_jacobian=True, part=0.4)
         return (
-            screen(Fits(), bench.twins, base, effects, effort, CFG),
+            screen(FITS, bench.twins, base, effects, effort, CFG),
             fits,
-            multistart(Fits(), bench.twins, base, effects, CFG),
+            multistart(FITS, bench.twins, base, effects, CFG),
         )
 
     probes, fits, far = found()

@@ -12,6 +12,7 @@ import pytest
 from command_lines import run_script
 from other_simulators import isaaclab_wheel, others_python
 from torque_sequence import write_result
+from warm_python import warm_python
 
 from pace_actuators.effects.__main__ import page as page_of_effects
 from pace_optim.export import export
@@ -41,15 +42,16 @@ def type_in(page: Path, home: Path, start: Path) -> str:
             script.append(f"python - < {home / f'block_{i}.py'}")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     kernels = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")  # each takes a compiler seconds
-    run = subprocess.run(
-        ["bash", "-c", "\n".join(script)],
-        cwd=start,
-        env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": kernels, "PATH": path, "PYTHONUTF8": "1"},
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    with warm_python() as function:
+        run = subprocess.run(
+            ["bash", "-c", "\n".join([function, *script])],
+            cwd=start,
+            env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": kernels, "PATH": path, "PYTHONUTF8": "1"},
+            capture_output=True,
+            text=True,
+            timeout=280,
+            check=False,
+        )
     assert run.returncode == 0, f"{page.name}:\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
     return run.stdout
 
