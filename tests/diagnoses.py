@@ -16,6 +16,7 @@ from pace_actuators.files import write_json
 from pace_envs import set_physics_dt
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.judging.candidate_results import Trial
+from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.problem.problem import load_problem
@@ -210,7 +211,8 @@ def make_search(errors, floor=(1e-4,), effects=(None,) * 30, off=(), **changes):
     """A search whose fits stay where they start, with the errors that a function gives of a model."""
     floor = torch.tensor(floor, dtype=torch.float64)
     fits, cfg = FakeFits(errors), DiagnosisCfg(off=off)
-    return Search(effects=effects, effort=5 * floor, floor=floor, max_effects=3, fits=fits, cfg=cfg, **changes)
+    own = {"effects": effects, "effort": 5 * floor, "floor": floor, "max_effects": 3, "fits": fits, "cfg": cfg}
+    return Search(**own, **{"try_effects": try_effects, **changes})
 
 
 def with_effects(model, values, *effects):

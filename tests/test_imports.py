@@ -44,6 +44,13 @@ FLOORS = {
         ["method"],
         ["diagnose"],
     ),
+    "pace_optim/diagnosis/search": (
+        ["state"],
+        ["one_round", "pooling", "replace_effect"],
+        ["grow"],
+        ["look_ahead"],
+        ["search"],
+    ),
 }
 """Package -> its rooms, from the ground up: a room imports from below and from beside, never from above."""
 

@@ -13,6 +13,7 @@ from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Search
@@ -79,6 +80,7 @@ def search_effects(
         floor=data.floor,
         max_effects=max_effects,
         fits=fits,
+        try_effects=try_effects,
         cfg=cfg,
         follow=reference.follow,
         say=say,

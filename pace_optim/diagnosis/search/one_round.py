@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -15,10 +14,8 @@ from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.decisions import Decision
+from pace_optim.diagnosis.search.state import Branch, Search
 from pace_optim.single_joint_fits.fitted import Fitted
-
-if TYPE_CHECKING:
-    from pace_optim.diagnosis.search.state import Branch, Search
 
 
 def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | None:

@@ -12,7 +12,6 @@ from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.decisions import Decision, Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
@@ -49,6 +48,8 @@ class Search:
     """Most effects of a joint."""
     fits: Fits
     """Fits models."""
+    try_effects: Callable[[Search, Branch, bool], Round | None]
+    """Tries what could be missing beside a model; the last says whether over wide steps."""
     cfg: DiagnosisCfg = DEFAULT
     """By what numbers it is decided."""
     say: Callable[[str], None] = lambda _: None
@@ -57,8 +58,6 @@ class Search:
     """Gets every decision."""
     follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]] = lambda problem, now: (problem, now)
     """Gives the joints along the motion of the robot with a model, and the model fitted there."""
-    try_effects: Callable[..., Round | None] = try_effects
-    """Tries what could be missing beside a model."""
 
     @property
     def at_floor(self) -> torch.Tensor:
