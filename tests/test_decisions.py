@@ -23,7 +23,7 @@ CASES = read_cases(sorted((Path(__file__).parent / "decisions").glob("*.jsonl*")
 """The decisions of the reference: benchmarks/ablation.md."""
 PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}
 """Numbers of arithmetic and units: halves, squares, tenths, percent, milli."""
-GUARDS = {"_RIDGE", "_PRIOR", "_LEAST", "_MOST", "_POINTS"}
+GUARDS = {"_RIDGE", "_LEAST", "_MOST", "_POINTS"}
 """Of the linear algebra, and of a grid over which a maximum is taken: none decides anything."""
 TELLING = {"_EFFECTS", "_LEAST_TOLD"}
 """How much is printed, and how exactly."""

@@ -27,7 +27,6 @@ from pace_optim.uncertainty.undetermined import (
     held_at_prior,
     prior,
     undetermined,
-    without,
     without_delay,
 )
 from pace_optim.uncertainty.warnings import fit_warnings
@@ -67,8 +66,14 @@ def test_what_has_no_influence_or_an_error_bar_as_wide_as_its_bounds_is_open_unl
     found, start = uncertainty(problem, std=std, no_influence=("delay/all",)), problem.space.start
     assert undetermined(problem, start, found) == ["encoder_bias/servo", "delay/all"]
     assert undetermined(problem, start, found, far=True) == ["delay/all"]
-    held = without(found, ["encoder_bias/servo"], problem.space)
-    assert np.isnan(held.std[problem.space["encoder_bias"]]).all() and held.std[0] == 0.0
+
+
+def test_a_bias_that_others_make_up_for_exactly_is_a_choice_of_origin():
+    problem = joint_alone().problem
+    group = ("encoder_bias/servo", "torque_ripple.sine/servo")
+    assert undetermined(problem, problem.space.start, uncertainty(problem, indistinguishable=(group,))) == []
+    exact = uncertainty(problem, indistinguishable=(group,), combinations=(group,))
+    assert undetermined(problem, problem.space.start, exact) == ["encoder_bias/servo"]
 
 
 def test_an_inertia_or_a_friction_that_is_told_neither_from_none_nor_from_its_prior_is_open():

@@ -55,6 +55,30 @@ def test_white_noise_gives_the_classic_covariance():
     assert (found.at_bound, found.no_influence, found.indistinguishable) == ((), (), ())
 
 
+def test_what_is_held_has_no_error_bar_and_costs_the_others_none():
+    """It was blanked only: what is like it kept the error bar of both being free."""
+    rng, sigma = np.random.default_rng(0), 2e-3
+    columns = rng.standard_normal((2, 4000))
+    columns[1] = columns[0] + 0.02 * columns[1]
+    jacobian, space = linear(columns, sigma * rng.standard_normal(4000))
+    x = torch.zeros(2, dtype=torch.float64)
+    both, one = (estimate_uncertainty(jacobian, space, x, held=held) for held in ((), space.labels[1:]))
+    assert np.isnan(one.std[1]) and one.std[0] == pytest.approx(sigma / np.linalg.norm(columns[0]), rel=0.1)
+    assert both.std[0] > 20 * one.std[0]
+
+
+def test_two_that_move_the_same_may_be_anywhere_and_are_told_to_be_one_combination():
+    """Their error bars were those of their sum, which is known well."""
+    rng, sigma = np.random.default_rng(0), 2e-3
+    columns = rng.standard_normal((3, 4000))
+    columns[1] = columns[0]
+    jacobian, space = linear(columns, sigma * rng.standard_normal(4000))
+    found = estimate_uncertainty(jacobian, space, torch.zeros(3, dtype=torch.float64))
+    assert found.combinations == found.indistinguishable == (tuple(space.labels[:2]),)
+    assert found.std[:2] == pytest.approx(np.sqrt(1 / 6) * space.slope(torch.zeros(3)).numpy()[:2], rel=0.01)
+    assert found.std[2] == pytest.approx(sigma / np.linalg.norm(columns[2]), rel=0.1)
+
+
 def test_the_first_samples_noise_adds_its_own_variance():
     # one parameter, residual e = J dx + S dq0: Var(x) = σ²/JᵀJ + σ² (JᵀS / JᵀJ)²
     rng, count, sigma = np.random.default_rng(3), 4000, 1e-3

@@ -4,8 +4,6 @@ import argparse
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from pace_actuators.files import refuse_taken
 from pace_optim.recording import SUFFIXES, save_recording, written_files
 from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, write_map
@@ -66,7 +64,7 @@ def _robot(task: str | None) -> Robot:
     cfg.scene.num_envs = 1
     env = ManagerBasedRLEnv(cfg)  # type: ignore[arg-type]
     robot = env.scene["robot"]
-    known = Robot(joint_names=tuple(robot.joint_names), limits=np.array(robot.data.joint_pos_limits))
+    known = Robot(joint_names=tuple(robot.joint_names), limits=robot.data.joint_pos_limits.numpy().copy())
     env.close()
     return known
 

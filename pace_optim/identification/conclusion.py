@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_no
 from pace_optim.uncertainty.other_solutions import with_other_solutions
 from pace_optim.uncertainty.step_share import change_without_step, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without, without_delay
+from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without_delay
 from pace_optim.uncertainty.warnings import fit_warnings
 
 _LONG = 60.0
@@ -55,10 +56,10 @@ class _End:
         """Whether that is so far above the noise that error bars mean nothing."""
         return self.times is not None and self.times >= FAR_ABOVE_NOISE
 
-    def moved(self, x: torch.Tensor, known: Assessment, held: list[str], run: Optimization) -> _End:
+    def moved(self, x: torch.Tensor, held: list[str], run: Optimization) -> _End:
         """Another vector, with some parameters held."""
-        uncertainty = without(known.uncertainty, held, run.problem.space)
-        end = replace(self, x=x, uncertainty=uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+        known = _known_at(run, x, held)
+        end = replace(self, x=x, uncertainty=known.uncertainty, residuals=known.residuals, jacobian=known.jacobian)
         return end.with_step_share(run.problem.space)
 
     def with_step_share(self, space: ParameterSpace) -> _End:
@@ -164,8 +165,8 @@ def _ended_at(run: Optimization, x: torch.Tensor) -> Assessment | None:
     return None if ended.jacobian is None else assess_known(run.problem, run.assessor, run.evaluator, ended.jacobian, x)
 
 
-def _known_at(run: Optimization, x: torch.Tensor) -> Assessment:
-    return assess(run.problem, run.assessor, run.colouring, x)
+def _known_at(run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
+    return assess(run.problem, run.assessor, run.colouring, x, held)
 
 
 def _told_of_step(run: Optimization, end: _End) -> _End:
@@ -181,13 +182,13 @@ def _with_prior(run: Optimization, outcome: Outcome, end: _End, left_open: list[
     run.progress.say(f"fitting again with what the recordings do not determine at its prior: {len(left_open)} values")
     cfg = None if outcome.is_interrupted else NEAR
     x, left_open = held_at_prior(run.problem, end.x, end.uncertainty, left_open, cfg)
-    return replace(end.moved(x, _known_at(run, x), left_open, run), left_open=left_open)
+    return replace(end.moved(x, left_open, run), left_open=left_open)
 
 
 def _perhaps_without_delay(run: Optimization, end: _End) -> _End:
     """A delay that is none is put to none."""
     x = without_delay(run.problem, end.x, end.uncertainty, end.left_open, NEAR)
-    return end if x is None else end.moved(x, _known_at(run, x), [*end.left_open, DELAY], run)
+    return end if x is None else end.moved(x, [*end.left_open, DELAY], run)
 
 
 def _check_consistency(run: Optimization, outcome: Outcome, end: _End) -> Consistency:

@@ -71,6 +71,7 @@ def check_same_configuration(run: Run, problem: Problem) -> None:
     """
     now = resolved(problem)
     now["configuration"]["sim2real"]["cmaes"].pop("max_iteration")  # a resumed run may be given another
+    now["configuration"]["sim2real"].pop("notes")  # words about the rest
     if run.overridden:
         now["configuration"]["scene"]["robot"].pop("mjcf_path")
     for part in run.resolved:

@@ -29,8 +29,10 @@ class Assessment:
     """On the training samples of the recordings that are trained on."""
 
 
-def assess(problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor) -> Assessment:
-    """Error bars at x from the training samples, and x's residuals on all samples."""
+def assess(
+    problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor, held: Sequence[str] = ()
+) -> Assessment:
+    """Error bars at x from the training samples, where some labels are held, and x's residuals on all samples."""
     data, probes = problem.dataset, make_probes(x, colouring, problem.trees, problem.joint_names)
     every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
     recordings = data.trained()
@@ -40,7 +42,7 @@ def assess(problem: Problem, evaluator: Evaluator, colouring: Colouring, x: torc
     trained = Residuals(error=error, where=train[steps], step=every.step[steps])
     initial = probes.initial(trained.error)
     there = jacobian(trained, probes.step, colouring)
-    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held)
     residuals = Residuals(error=every.error[:1], where=every.where, step=every.step)
     return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there)
 

@@ -55,7 +55,7 @@ def step_share(
     if not len(free):
         return result
     hessian, _ = there.normal_equations()
-    inverse = inverse_of(hessian.numpy()[np.ix_(free, free)])
+    inverse, _ = inverse_of(hessian.numpy()[np.ix_(free, free)])
     move = torch.zeros(space.size, dtype=torch.float64)
     move[free] = torch.from_numpy(-inverse @ there.transposed_times(change).numpy()[free])
     if not _has_no_step(there, change + there.times(move)):

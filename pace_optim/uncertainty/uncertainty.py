@@ -20,11 +20,15 @@ WEAK_STD = 0.05
 """A direction known no better than this part of the bound range cannot be told apart."""
 SEEN = 1e-12
 """A direction of JᵀJ, scaled to a unit diagonal, with less than this moves nothing but rounding errors."""
+_NOTHING = 1e-10
+"""One with less than this moves nothing that counts."""
 _NOTHING_KNOWN = 1e6
 """Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
 SURE = 2.0
 """Standard deviations that tell a value from another."""
+ANYWHERE = 1 / 3
+"""Variance of a value that may be anywhere between its bounds, normalised to -1 and 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +45,8 @@ class Uncertainty:
     """Labels of parameters that do not move the joints."""
     indistinguishable: tuple[tuple[str, ...], ...]
     """Sets of labels that the recording cannot tell apart."""
+    combinations: tuple[tuple[str, ...], ...] = ()
+    """Those of them of which a combination moves nothing at all."""
     step: np.ndarray | None = None
     """What of each value comes from the physics step, (size,) as ``std``; ``None`` where that is not known."""
 
@@ -56,6 +62,7 @@ def estimate_uncertainty(
     x: torch.Tensor,
     initial: torch.Tensor | None = None,
     initial_joints: Sequence[tuple[int, ...]] = (),
+    held: Sequence[str] = (),
 ) -> Uncertainty:
     """Error bars at an optimum.
 
@@ -73,17 +80,24 @@ def estimate_uncertainty(
         x: The optimum, normalised (size,).
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
+        held: Labels of what is held where it is; it has no error bar, and the others have those beside it.
     """
     samples = int(jacobian.residuals.where.sum())
     hessian, _ = jacobian.normal_equations()
     middle = _middle(jacobian)
     if initial is not None:
         middle += _from_first_sample(jacobian, initial, initial_joints)
-    return uncertainty_of(hessian.numpy() * samples, middle, samples, jacobian.colouring, space, x)
+    return uncertainty_of(hessian.numpy() * samples, middle, samples, jacobian.colouring, space, x, held)
 
 
 def uncertainty_of(
-    hessian: np.ndarray, middle: np.ndarray, samples: int, colouring: Colouring, space: ParameterSpace, x: torch.Tensor
+    hessian: np.ndarray,
+    middle: np.ndarray,
+    samples: int,
+    colouring: Colouring,
+    space: ParameterSpace,
+    x: torch.Tensor,
+    held: Sequence[str] = (),
 ) -> Uncertainty:
     """Error bars from the two matrices of the sandwich C = H⁻¹ (Jᵀ Σ J) H⁻¹.
 
@@ -94,12 +108,14 @@ def uncertainty_of(
         colouring: Which joints each entry moves.
         space: The parameters.
         x: The optimum, normalised (size,).
+        held: Labels of what is held where it is.
     """
     size = space.size
     whole_range = 2 * np.sqrt(np.clip(hessian.diagonal(), 0, None) / samples)
     position = x.numpy()
     fixed = (space.upper <= space.lower).numpy()
     silent = (whole_range < NO_INFLUENCE) & ~fixed
+    fixed |= np.isin(space.labels, list(held))
     inside = 1 - np.abs(position)
     bound = (inside < AT_BOUND) & ~fixed
     if (near := bound & ~silent & (inside > 0)).any():
@@ -109,7 +125,7 @@ def uncertainty_of(
         bound &= ~(near & told)
     free = np.flatnonzero(~(bound | silent | fixed))
     std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
-    groups: list[tuple[str, ...]] = []
+    groups: dict[tuple[str, ...], bool] = {}
     if len(free):
         h = hessian[np.ix_(free, free)]
         covariance = _covariance(hessian, middle, samples, free)
@@ -118,9 +134,8 @@ def uncertainty_of(
         outer = np.where(normalised > 0, normalised, 1.0)
         correlation[np.ix_(free, free)] = covariance / outer[:, None] / outer
         for members in _trees(colouring, free):
-            for group in _weak_directions(h[np.ix_(members, members)], normalised[members], free[members], space):
-                if group not in groups:
-                    groups.append(group)
+            weak = _weak_directions(h[np.ix_(members, members)], normalised[members], free[members], space)
+            groups = weak | groups
     labels = space.labels
     return Uncertainty(
         std=std,
@@ -128,21 +143,24 @@ def uncertainty_of(
         at_bound=tuple(labels[i] for i in np.flatnonzero(bound)),
         no_influence=tuple(labels[i] for i in np.flatnonzero(silent)),
         indistinguishable=tuple(groups),
+        combinations=tuple(group for group, nothing in groups.items() if nothing),
     )
 
 
 def _covariance(hessian: np.ndarray, middle: np.ndarray, samples: int, free: np.ndarray) -> np.ndarray:
-    """C = H⁻¹ (Jᵀ Σ J) H⁻¹ of some entries, the others held."""
-    inverse = inverse_of(hessian[np.ix_(free, free)])
-    return inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
+    """C = H⁻¹ (Jᵀ Σ J) H⁻¹ of some entries, the others held; a direction that moves nothing may be anywhere."""
+    inverse, unseen = inverse_of(hessian[np.ix_(free, free)])
+    covariance = inverse @ middle[np.ix_(free, free)] @ inverse * samples / max(1, samples - len(free))
+    return covariance + ANYWHERE * unseen @ unseen.T
 
 
-def inverse_of(hessian: np.ndarray) -> np.ndarray:
-    """H⁻¹ of parameters that move the joints, without the directions that move nothing."""
+def inverse_of(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H⁻¹ of parameters that move the joints, without the directions that move nothing, and those, (m, k)."""
     scale = 1 / np.sqrt(hessian.diagonal())
     values, vectors = _eigen(hessian * scale[:, None] * scale)
-    kept = values > SEEN
-    return (vectors[kept].T / values[kept]) @ vectors[kept] * scale[:, None] * scale
+    seen = values > SEEN
+    inverse = (vectors[seen].T / values[seen]) @ vectors[seen] * scale[:, None] * scale
+    return inverse, np.linalg.qr(vectors[~seen].T * scale[:, None])[0]
 
 
 def _middle(jacobian: Jacobian) -> np.ndarray:
@@ -254,8 +272,8 @@ def _trees(colouring: Colouring, free: np.ndarray) -> list[list[int]]:
 
 def _weak_directions(
     hessian: np.ndarray, std: np.ndarray, entries: np.ndarray, space: ParameterSpace
-) -> list[tuple[str, ...]]:
-    """Sets of parameters that move the joints almost alike and are, together, hardly known.
+) -> dict[tuple[str, ...], bool]:
+    """Sets of parameters that move the joints almost alike and are, together, hardly known; whether nothing moves.
 
     A small eigenvalue of JᵀJ scaled to a unit diagonal is a combination of parameters that hardly moves the joints
     although each of its members does.
@@ -266,13 +284,14 @@ def _weak_directions(
         entries: Where they are in the full vector, (m,).
         space: The parameters.
     """
-    groups: list[tuple[str, ...]] = []
+    groups: dict[tuple[str, ...], bool] = {}
     scale = 1 / np.sqrt(hessian.diagonal())
     for value, vector in zip(*_eigen(hessian * scale[:, None] * scale), strict=True):
         members = np.flatnonzero(np.abs(vector) > _WEAK_SHARE)
         hardly_known = bool((std[members] > 2 * WEAK_STD).any())
-        if len(members) > 1 and (value < 1e-10 or (value < 0.1 and hardly_known)):
-            groups.append(tuple(space.labels[int(entries[i])] for i in members))
+        nothing = bool(value < _NOTHING)
+        if len(members) > 1 and (nothing or (value < 0.1 and hardly_known)):
+            groups[tuple(space.labels[int(entries[i])] for i in members)] = nothing
     return groups
 
 

@@ -28,13 +28,16 @@ HARDLY_KNOWN = 0.5
 
 DELAY = f"delay/{GLOBAL}"
 """Label of the delay."""
+BIAS = "encoder_bias"
+"""Name of the biases."""
 
 
 def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, far: bool = False) -> list[str]:
     """Labels of parameters without influence, and of those whose error bar is as wide as their bounds or value.
 
     As wide as the value: an inertia or a friction that is told neither from none nor from its prior. A fact that the
-    user declares unknown is open too where others can make up for it: what is stated then holds.
+    user declares unknown is open too where others can make up for it: what is stated then holds. So is an encoder bias
+    that others make up for exactly, as the phase of a ripple where gravity does not load the joint: a choice of origin.
 
     Args:
         problem: What was fitted.
@@ -46,7 +49,7 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
     if far:
         return [label for label in problem.space.labels if label in silent]
     silent |= _of_unknown(problem) & {label for group in uncertainty.indistinguishable for label in group}
-    silent |= _wide(problem.space, uncertainty) | _none_or_prior(problem, x, uncertainty)
+    silent |= _origins(uncertainty) | _wide(problem.space, uncertainty) | _none_or_prior(problem, x, uncertainty)
     return [label for label in problem.space.labels if label in silent]
 
 
@@ -54,6 +57,11 @@ def _wide(space: ParameterSpace, uncertainty: Uncertainty) -> set[str]:
     """Labels of what has an error bar as wide as its bounds."""
     wide = np.nan_to_num(uncertainty.error_bar) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
     return {label for label, yes in zip(space.labels, wide, strict=True) if yes}
+
+
+def _origins(uncertainty: Uncertainty) -> set[str]:
+    """Labels of encoder biases that can be anywhere, as others make up for them exactly."""
+    return {label for group in uncertainty.combinations for label in group if label.startswith(f"{BIAS}/")}
 
 
 def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) -> set[str]:
@@ -93,7 +101,7 @@ def held_at_prior(
     silent = [label for label in labels if label in uncertainty.no_influence]
     unknown = _of_unknown(problem)
     fewer = [label for label in labels if label in silent or label in unknown]
-    wide = _wide(problem.space, uncertainty)
+    wide = _wide(problem.space, uncertainty) | _origins(uncertainty)
     wide_or_fewer = [label for label in labels if label in wide or label in fewer]
     for chosen in dict.fromkeys((tuple(labels), tuple(wide_or_fewer), tuple(fewer))):
         if cfg is not None and len(silent) < len(chosen):
@@ -137,6 +145,7 @@ def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: Le
     physical = problem.space.to_physical(at_prior(problem, x, labels))
     held = replace(problem, space=problem.space.holding(labels, physical))
     evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
+    cfg = replace(cfg, score_tolerance=min(cfg.score_tolerance, AS_GOOD))  # as finely as it is judged
     before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
     best = least_squares(evaluator, colouring, [held.space.to_normalised(physical)], cfg)[0]
     if best.score > (1 + AS_GOOD) * before:
@@ -182,15 +191,3 @@ def prior(problem: Problem) -> torch.Tensor:
                 null = parameter.start if parameter.null is None else parameter.null
                 result[here] = null if math.isfinite(null) else parameter.upper
     return result
-
-
-def without(uncertainty: Uncertainty, labels: Sequence[str], space: ParameterSpace) -> Uncertainty:
-    """The same with neither error bars, bounds nor likes of some parameters, as they are held."""
-    held = set(labels)
-    std = np.where([label in held for label in space.labels], np.nan, uncertainty.std)
-    correlation = uncertainty.correlation.copy()
-    correlation[np.isnan(std)] = np.nan
-    correlation[:, np.isnan(std)] = np.nan
-    groups = tuple(group for group in uncertainty.indistinguishable if not held & set(group))
-    at_bound = tuple(label for label in uncertainty.at_bound if label not in held)
-    return replace(uncertainty, std=std, correlation=correlation, indistinguishable=groups, at_bound=at_bound)

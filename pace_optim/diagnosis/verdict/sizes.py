@@ -11,10 +11,7 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.uncertainty.uncertainty import sandwich
-
-_PRIOR = 1 / 3
-"""Variance of a parameter that may be anywhere between its bounds, normalised to -1 and 1."""
+from pace_optim.uncertainty.uncertainty import ANYWHERE, sandwich
 
 
 def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
@@ -82,6 +79,6 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
         own = columns[..., j].double()
         free = own.flatten(1).norm(dim=1).nonzero()[:, 0]
         if len(free):
-            covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), _PRIOR)
+            covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), ANYWHERE)
             result[j, free] = torch.as_tensor(covariance.diagonal().copy()).clamp(min=0.0).sqrt() * slope[j, free]
     return result
