@@ -11,7 +11,7 @@ from pace_actuators import PaceDCMotorCfg
 from pace_optim.diagnosis.diagnose import _as_found
 from pace_optim.fit import fit
 from pace_optim.problem.problem import load_problem
-from pace_optim.problem.unknown_facts import started_from, with_identified
+from pace_optim.problem.unknown_facts import identified_gains, started_from, with_identified
 from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 
@@ -51,6 +51,23 @@ def test_a_run_knows_what_was_unknown_and_a_drive_has_what_was_found(run):
     assert problem.unknown == ("stiffness", "damping") and problem.effects == result.effects
     drive = PaceDCMotorCfg.from_result(folder, stiffness=20.0, damping=0.6)
     assert {cfg.effect_class.name for cfg in drive.effects} == {"proportional_gain", "derivative_gain"}
+
+
+def test_the_gains_themselves_are_told_where_they_are_one_set(run, soft):
+    result, folder = run
+    problem = open_problem(folder)
+    assert not any("found:" in note for note in result.notes)  # recordings state two sets
+
+    def told(recordings, undetermined=()):
+        return identified_gains(
+            problem.env_cfg, recordings, problem.unknown, result.parameters, undetermined, result.unit_of
+        )
+
+    assert told(problem.dataset.recordings) == []
+    stiffness, damping = told(problem.dataset.recordings[:1])
+    assert float(stiffness.split()[2]) == pytest.approx(40.0, rel=0.02) and stiffness.endswith("N m/rad (servo)")
+    assert float(damping.split()[2]) == pytest.approx(1.2, rel=0.1) and damping.endswith("N m s/rad (servo)")
+    assert told(problem.dataset.recordings[:1], ["proportional_gain.gain/servo"]) == [damping]
 
 
 def test_a_stiffness_that_the_recordings_do_not_determine_is_listed(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
 from pace_optim.recording import Recording
+from pace_optim.recording.keys import listed
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 
 LIMITS = {
@@ -134,6 +135,38 @@ def with_identified(
         return replace(recording, drive=replace(recording.drive, **changes))
 
     return [stated(recording) for recording in recordings]
+
+
+def identified_gains(
+    cfg: PaceSim2realEnvCfg,
+    recordings: Sequence[Recording],
+    facts: Iterable[str],
+    parameters: Mapping[str, Mapping[str, float]],
+    undetermined: Iterable[str],
+    unit_of: Callable[[str, str], str],
+) -> list[str]:
+    """The gains themselves, of which a fit finds factors, in a sentence each; none where recordings state several.
+
+    Args:
+        cfg: The environment, whose gains hold where a recording states none.
+        recordings: The recordings.
+        facts: What was unknown.
+        parameters: What was found.
+        undetermined: Labels of what the recordings leave open.
+        unit_of: Unit of a parameter of a joint.
+    """
+    joints, result = list(cfg.sim2real.joint_order), []
+    known = with_identified(cfg, recordings, [fact for fact in facts if fact in GAINS], parameters, undetermined)
+    for fact in [fact for fact in GAINS if fact in facts]:
+        found = [getattr(recording.drive, fact) for recording in known]
+        label, left_open = GAINS[fact], set(undetermined)
+        told = [j for j in joints if label in parameters and f"{label}/{j}" not in left_open]
+        if told and all(np.array_equal(each, found[0]) for each in found):
+            per = {"stiffness": "/{bias}", "damping": " s/{bias}"}[fact]
+            units = {j: unit_of("friction", j) + per.format(bias=unit_of("encoder_bias", j)) for j in told}
+            values = [f"{found[0][joints.index(j)]:.4g} {units[j]} ({j})" for j in told]
+            result.append(f"{fact} found: {listed(values, 12)}")
+    return result
 
 
 def identified_limits(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from pace_actuators.joint_units import JointType
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.unknown_facts import identified_limits
+from pace_optim.problem.unknown_facts import identified_gains, identified_limits
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.whole_delay import whole_delay
 
@@ -178,7 +178,8 @@ def make_result(
     train, validation = data.train[residuals.step], data.validation[residuals.step]
     trained = residuals.error[0].square()[train]
     values, std = space.to_dict(physical), by_parameter(space, uncertainty.std)
-    return FitResult(
+    open_ = facts.get("undetermined", ())
+    result = FitResult(
         task=problem.task,
         robot_name=problem.env_cfg.sim2real.robot_name,
         joint_names=list(problem.joint_names),
@@ -205,6 +206,8 @@ def make_result(
         + list(problem.measured.notes)
         + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
         + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
-        drive=drive_in_force(problem) | identified_limits(problem.unknown, values, facts.get("undetermined", ())),
+        drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         **facts,
     )
+    gains = identified_gains(problem.env_cfg, data.recordings, problem.unknown, values, open_, result.unit_of)
+    return replace(result, notes=[*gains, *result.notes])
