@@ -70,7 +70,8 @@ def _unsure(labels: Sequence[str]) -> list[str]:
     """The same for those whose error bar leaves open what the error does not, with this physics step."""
     return [
         f"These recordings hardly determine {name.replace('_', ' ')}{_of(keys)}: an error bar as wide as the value "
-        "itself or as the bounds, or others can make up for it. It keeps the value that fits best with this physics step."
+        "itself or as the bounds, or others can make up for it. It keeps the value that fits best with this physics "
+        "step."
         for name, keys in _by_parameter(labels).items()
     ]
 
