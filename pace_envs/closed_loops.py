@@ -24,6 +24,8 @@ _ON_THE_WAY = 20
 class ClosedLoops:
     """Moves a model's passive joints so that its equality constraints hold: connect, weld, joint and tendon.
 
+    Joints that lean on a stop stay there where the loops can be closed so: a spring holds them.
+
     With r(q) the constraints' residual and J_p its derivative with respect to the passive degrees of freedom,
     Newton's method takes q_p ← q_p - J_p⁺ r until r = 0, from the passive joints' present positions; where that does
     not lead there, the joints are taken there step by step from the model's own closed posture, so that a loop keeps
@@ -84,7 +86,10 @@ class ClosedLoops:
 
     def close(self, qpos: np.ndarray) -> np.ndarray:
         """The posture (nq,) with its passive joints where the loops close, or come nearest to closing."""
-        here, gap = self._newton(qpos, self.passive)
+        loose = self._off_their_stops(qpos)
+        here, gap = self._newton(qpos, loose)
+        if gap > _CLOSED and len(loose) < len(self.passive):
+            here, gap = self._newton(qpos, self.passive)
         if gap <= _CLOSED:
             return here
         start, own = self._newton(self.model.qpos0.copy(), np.arange(self.model.nv))
@@ -98,6 +103,15 @@ class ClosedLoops:
             there = self._moved(there, way / _ON_THE_WAY)
             there, other = self._newton(there, self.passive)
         return there if other < gap else here
+
+    def _off_their_stops(self, qpos: np.ndarray) -> np.ndarray:
+        """Passive degrees of freedom without those of joints that lean on a stop: they stay there if loops let them."""
+        model = self.model
+        joints = model.dof_jntid[self.passive]
+        place, (low, high) = qpos[model.jnt_qposadr[joints]], model.jnt_range[joints].T
+        single = model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_BALL
+        leans = model.jnt_limited[joints].astype(bool) & single & ((place <= low) | (place >= high))
+        return self.passive[~leans]
 
     def following(self, qpos: np.ndarray) -> np.ndarray:
         """How all speeds follow from those of the driven joints at a posture (nq,): v = T v_d, (nv, nv).

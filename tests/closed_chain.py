@@ -14,3 +14,11 @@ FOUR_BAR = """
   <actuator><position joint="crank" kp="8" kv="0.2" forcerange="-3 3"/></actuator>
 </mujoco>
 """
+
+FINGER = FOUR_BAR.replace(
+    '<geom fromto="0 0 0 0.2 0 0"/><site name="tip" pos="0.2 0 0"/></body>',
+    """<geom fromto="0 0 0 0.1 0 0"/><body pos="0.1 0 0">
+      <joint name="tip" range="-0.5 0" stiffness="0.02" springref="1" solreflimit="0.004 1"/>
+      <geom fromto="0 0 0 0.1 0 0"/><site name="tip" pos="0.1 0 0"/></body></body>""",
+)
+"""The same with a joint in the coupler that the loop leaves free: a spring holds it against its stop."""

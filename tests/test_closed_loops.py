@@ -2,13 +2,15 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 import torch
-from closed_chain import FOUR_BAR
+from closed_chain import FINGER, FOUR_BAR
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
+from pace_envs.from_model.rest import at_rest
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.recording import Recording
@@ -54,6 +56,35 @@ def test_the_assembly_is_the_one_that_the_model_or_the_configuration_has(four_ba
     assert other.scene["robot"].closed_loops.gap(other.sim.qpos[0].numpy())[0] < 1e-8
     assert (other.sim.qpos[0, 1:] - own[1:]).abs().min() > 0.3
     other.close()
+
+
+def test_what_a_spring_holds_against_a_stop_is_there_wherever_the_crank_is(tmp_path):
+    """The loop leaves it free. It fell from the middle of its range at the beginning of every recording."""
+    path = tmp_path / "finger.xml"
+    path.write_text(FINGER)
+    cfg = cfg_from_model(path)
+    cfg.scene.num_envs = 1
+    env = ManagerBasedRLEnv(cfg)
+    robot, sim = env.scene["robot"], env.sim
+    tip = int(sim.model.joint("tip").qposadr[0])
+    for position in (0.8, 0.7, 1.0):
+        robot.write_joint_state_to_sim(torch.tensor([[position]]), torch.zeros(1, 1))
+        assert robot.closed_loops.gap(sim.qpos[0].numpy())[0] < 1e-8
+        assert float(sim.qpos[0, tip]) == pytest.approx(0.0, abs=1e-2)  # it was at -0.64
+    env.close()
+
+
+def test_joints_without_drives_are_at_rest_where_a_robot_begins():
+    """A pendulum on a held arm hangs, a spring has its own angle, and what is held stays."""
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><compiler angle="radian"/><default><joint axis="0 1 0"/><geom size="0.01"/></default><worldbody>
+      <body><joint name="arm"/><geom type="capsule" fromto="0 0 0 0.2 0 0"/>
+        <body pos="0.2 0 0"><joint name="swing"/><geom type="capsule" fromto="0 0 0 0.1 0 0"/></body></body>
+      <body pos="0 1 0"><joint name="spring" axis="0 0 1" stiffness="1" springref="0.3"/><geom pos="0.1 0 0"/></body>
+    </worldbody></mujoco>""")
+    rest = at_rest(model, np.array([0.4, 0.0, 0.0]), ["arm"])
+    assert rest.tolist() == pytest.approx([0.4, np.pi / 2 - 0.4, 0.3], abs=1e-4)
+    assert at_rest(model, rest, ["arm", "swing", "spring"]) is rest
 
 
 def test_a_loop_that_no_bias_closes_is_refused_with_its_distance(tmp_path):

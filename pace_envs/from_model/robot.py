@@ -17,6 +17,7 @@ from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
 from pace_envs.from_model.couplings import followers
 from pace_envs.from_model.joints import JointFacts, home_posture, joint_facts
+from pace_envs.from_model.rest import at_rest
 from pace_envs.from_model.scaling import (
     OF_BOUNDS,
     base_bounds,
@@ -72,6 +73,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
     if not names:
         raise ValueError(f"The model {path} has no hinge or slide joint that a drive could move.")
     home, key = home_posture(model)
+    home = at_rest(model, home, names)
     stated = {drive.joint: drive for drive in drives}
     velocity, command = ({}, {}) if file.urdf is None else (file.urdf.velocity_limits, file.urdf.command)
     joints = joint_facts(model, home, names, stated, velocity, command)
