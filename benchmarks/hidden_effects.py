@@ -34,8 +34,8 @@ def run_all(jobs: list[Job], results: Path, workers: int, limit: int | None = No
     done = {line["case"] for line in read_results(results) if "error" not in line}
     left = [job for job in jobs if job.case.name not in done]
     left.sort(key=lambda job: hashlib.sha256(job.case.name.encode()).digest())  # a part of them is a fair sample
-    left = left[:limit]
     print(f"{len(jobs)} cases, {len(jobs) - len(left)} done before")
+    left = left[:limit]
     results.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     with pinned_pool(workers) as pool, results.open("a") as file:

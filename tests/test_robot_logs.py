@@ -286,6 +286,8 @@ def test_empty_cells_give_columns_clocks_of_their_own(tmp_path):
     (recording,) = load_recordings(rows(["time", *cells], columns, tmp_path / "leg.csv"), ROBOT)
     check(recording, absolute=False)
     assert recording.des_time is not None
+    (note,) = [note for note in recording.notes if "empty cells" in note]
+    assert note[0].isdigit()  # a table without a name is not told as one
 
 
 def test_two_files_that_are_halves_of_one_log_are_joined(tmp_path):

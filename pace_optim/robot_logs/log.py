@@ -57,16 +57,16 @@ def cleaned(
         columns: Values by key, (T,) each; NaN where a cell is empty.
         what: `series` and `joint` by key, where they are known.
     """
-    notes = []
+    notes, where = [], f"{table}: " if table else ""
     order = np.flatnonzero(np.isfinite(time))
     if np.any(np.diff(time[order]) < 0.0):
         order = order[np.argsort(time[order], kind="stable")]
-        notes.append(f"{table}: rows out of order were sorted by time.")
+        notes.append(f"{where}rows out of order were sorted by time.")
     fresh = np.ones(len(order), dtype=bool)
     fresh[:-1] = np.diff(time[order]) > 0.0  # of one instant, the last
     if repeated := int(np.sum(~fresh)):
         order = order[fresh]
-        notes.append(f"{table}: {repeated} rows of an instant that comes again were left out.")
+        notes.append(f"{where}{repeated} rows of an instant that comes again were left out.")
     unchanged = len(order) == len(time) and np.array_equal(order, np.arange(len(time)))
     shared = time if unchanged else time[order]
     clocks: dict[bytes, np.ndarray] = {}
@@ -84,5 +84,5 @@ def cleaned(
             said = {name: by_key.get(key, "") for name, by_key in what.items()}
             channels.append(Channel(key=key, table=table, time=own, values=values, **said))
     if empty:
-        notes.append(f"{table}: {empty} empty cells were left out, each in its column alone.")
+        notes.append(f"{where}{empty} empty cells were left out, each in its column alone.")
     return channels, notes
