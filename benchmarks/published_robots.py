@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import re
 import subprocess
@@ -55,16 +54,11 @@ def last_run(output: str) -> Path:
 def errors(result: dict, truth: Truth) -> dict[str, dict]:
     """Of each group the worst relative error of what is determined (biases: absolute), where, and what is not.
 
-    With its error bar, by noise and the physics step, and the largest error in error bars.
+    With its error bar, and the largest error in error bars.
     """
     rows = {}
     for group in GROUPS:
-        found, right = result["parameters"][group], getattr(truth, group)
-        steps = result.get("step_error", {}).get(group, {})
-        std = {
-            name: None if noise is None else math.hypot(noise, steps.get(name) or 0.0)
-            for name, noise in result["std"][group].items()
-        }
+        found, std, right = result["parameters"][group], result["std"][group], getattr(truth, group)
         undetermined = [n for n in truth.joints if f"{group}/{n}" in result["undetermined"]]
         off = {
             name: abs(found[name] - value) / (1.0 if group == "encoder_bias" else abs(value))

@@ -91,8 +91,8 @@ def test_an_inertia_or_a_friction_that_is_told_neither_from_none_nor_from_its_pr
 
     def open_(step=None, **std):
         bars = np.array([std.get(label.split("/")[0], 1e-3) for label in space.labels])
-        shares = None if step is None else np.where([label.startswith(step) for label in space.labels], -0.3, 0.0)
-        return undetermined(problem, x, uncertainty(problem, std=bars, step=shares))
+        share = np.where([step is not None and label.startswith(step) for label in space.labels], -0.3, 0.0)
+        return undetermined(problem, x, uncertainty(problem, std=bars).with_step(share))
 
     assert open_() == [] and open_(friction=0.05) == []
     assert open_(friction=0.15) == ["friction/servo"]

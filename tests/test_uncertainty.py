@@ -207,6 +207,17 @@ def test_a_parameter_at_its_bound_is_named_has_no_error_bar_and_narrows_the_othe
     assert found.std[0] < 0.8 * inside.std[0]
 
 
+def test_what_comes_from_the_step_widens_error_bars_and_goes_the_same_way_in_all():
+    rng = np.random.default_rng(0)
+    jacobian, space = linear(rng.standard_normal((3, 4000)), 1e-3 * rng.standard_normal(4000))
+    noise = estimate_uncertainty(jacobian, space, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    share = np.array([3.0, -4.0, np.nan]) * 1e-4
+    both = noise.with_step(share)
+    assert both.std[:2] == pytest.approx(np.hypot(noise.std[:2], share[:2])) and np.isnan(both.std[2])
+    assert both.correlation.diagonal()[:2] == pytest.approx(1.0)
+    assert both.correlation[0, 1] < -0.9 and np.isnan(both.correlation[2]).all()
+
+
 @pytest.mark.parametrize(("sigma", "told"), [(1e-3, True), (1e-1, False)])
 def test_a_value_that_its_error_bar_tells_from_a_near_bound_is_not_at_it(sigma, told):
     """Such as a friction of a small joint, within bounds for a strong drive."""

@@ -67,7 +67,7 @@ class _End:
         if self.without_step is None:
             return self
         share = step_share(self.jacobian, self.without_step, space, self.x, ~np.isnan(self.uncertainty.std))
-        return replace(self, uncertainty=replace(self.uncertainty, step=share))
+        return replace(self, uncertainty=self.uncertainty.with_step(share))
 
 
 def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> FitResult:

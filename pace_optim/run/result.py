@@ -46,7 +46,7 @@ class FitResult(DriveResult):
     times_noise: float | None = None
     """The training error as a multiple of the measurement noise."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """What of each value comes from the physics step, shaped as ``std``; empty where that is not known."""
+    """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
     std_means_nothing: bool = False
     """Whether the fit ended so far above the noise that its error bars say nothing."""
     measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -88,11 +88,6 @@ class FitResult(DriveResult):
         """The unit of a parameter of a joint, or of all joints (``"all"``)."""
         unit = self.units.get(name, "")
         return unit if isinstance(unit, str) else unit.get(key, "")
-
-    def error_bar(self, name: str, key: str) -> float | None:
-        """One standard deviation of a value, by noise and the physics step together; ``None`` where there is none."""
-        std = self.std.get(name, {}).get(key)
-        return None if std is None else math.hypot(std, self.step_error.get(name, {}).get(key) or 0.0)
 
     def joint_type(self, joint: str) -> JointType:
         """Whether a joint turns or slides."""

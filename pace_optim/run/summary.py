@@ -53,7 +53,7 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
 def _value(result: FitResult, name: str, key: str) -> str:
     if key not in result.parameters[name]:  # an effect that other joints have
         return "-"
-    std = result.error_bar(name, key)
+    std = result.std[name][key]
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
     error = "" if std is None else " ± ?" if result.std_means_nothing else f" ± {std:.1g}"

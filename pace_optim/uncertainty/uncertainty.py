@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -48,12 +48,14 @@ class Uncertainty:
     combinations: tuple[tuple[str, ...], ...] = ()
     """Those of them of which a combination moves nothing at all."""
     step: np.ndarray | None = None
-    """What of each value comes from the physics step, (size,) as ``std``; ``None`` where that is not known."""
+    """What of each value comes from the physics step, (size,), which ``std`` and ``correlation`` then know of."""
 
-    @property
-    def error_bar(self) -> np.ndarray:
-        """Of noise and the physics step together, (size,)."""
-        return self.std if self.step is None else np.hypot(self.std, self.step)
+    def with_step(self, share: np.ndarray) -> Uncertainty:
+        """The same, knowing what of each value comes from the physics step, (size,): an error of one size for all."""
+        std = np.hypot(self.std, share)
+        scale = np.where(std > 0, std, 1.0)
+        covariance = self.correlation * np.outer(self.std, self.std) + np.outer(share, share)
+        return replace(self, std=std, correlation=covariance / np.outer(scale, scale), step=share)
 
 
 def estimate_uncertainty(

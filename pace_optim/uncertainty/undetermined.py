@@ -55,7 +55,7 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
 
 def _wide(space: ParameterSpace, uncertainty: Uncertainty) -> set[str]:
     """Labels of what has an error bar as wide as its bounds."""
-    wide = np.nan_to_num(uncertainty.error_bar) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
+    wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
     return {label for label, yes in zip(space.labels, wide, strict=True) if yes}
 
 
@@ -68,7 +68,7 @@ def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) 
     """Labels of what may be none, or as its prior is, by its error bar."""
     space, value = problem.space, problem.space.to_physical(x).numpy()
     apart = np.maximum(value, np.abs(value - _within_bounds(problem).numpy()))
-    unsure = apart < SURE * uncertainty.error_bar  # not where there is none
+    unsure = apart < SURE * uncertainty.std  # not where there is none
     return {
         label
         for label, yes in zip(space.labels, unsure, strict=True)
@@ -134,8 +134,8 @@ def without_delay(
     """
     space = problem.space
     at = space.labels.index(DELAY)
-    delay, error = float(space.to_physical(x)[at]), float(uncertainty.error_bar[at])
-    if DELAY in held or float(space.lower[at]) != 0 or not 0 < delay <= SURE * error:
+    delay, std = float(space.to_physical(x)[at]), float(uncertainty.std[at])
+    if DELAY in held or float(space.lower[at]) != 0 or not 0 < delay <= SURE * std:
         return None
     return _fitted_beside(problem, x, [*held, DELAY], cfg)
 

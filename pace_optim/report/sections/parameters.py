@@ -52,12 +52,8 @@ def _article(title: str, unit: str, content: Markup) -> Markup:
 
 def _card(run: RunData, name: str) -> Markup:
     """One parameter of all joints: a table whose rows are also a plot."""
-    values = run.result.parameters[name]
-    ends = [
-        v + side * _CONFIDENCE * (run.result.error_bar(name, key) or 0.0)
-        for key, v in values.items()
-        for side in (-1, 1)
-    ]
+    values, std = run.result.parameters[name], run.result.std.get(name, {})
+    ends = [v + side * _CONFIDENCE * (std.get(key) or 0.0) for key, v in values.items() for side in (-1, 1)]
     low, high = _padded(min(ends), max(ends), run, name)
     unit = " or ".join(pretty_unit(u) for u in dict.fromkeys(run.result.unit_of(name, key) for key in values))
     mixed = " or " in unit
@@ -81,7 +77,7 @@ def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, fl
 
 
 def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None) -> list[str]:
-    value, std = run.result.parameters[name][key], run.result.error_bar(name, key)
+    value, std = run.result.parameters[name][key], run.result.std.get(name, {}).get(key)
     label = f"{name}/{key}"
     std = None if run.result.std_means_nothing else std
     text, error = value_and_error(value, std)
