@@ -1,7 +1,9 @@
 """The steps of the search: where it ends, its verdict, what takes another's place, what to record next."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from diagnoses import FITS, errors_of, joint_alone, make_search, make_trial, outcome_of, with_effects
@@ -15,7 +17,7 @@ from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Outcome
-from pace_optim.diagnosis.telling.advice import rivals
+from pace_optim.diagnosis.telling.advice import advise, rivals
 from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 from pace_optim.experiment_design import telling_apart
@@ -105,6 +107,23 @@ def test_rivals_are_sent_to_the_recording_where_they_part(bench):
     assert f"{1e3 * float(apart.max()):.2g} mrad" in sentence and "scripts/data_collection.py --task" in sentence
     (sentence,) = next_experiments(bench.problem, pairs, torch.tensor([1.0], dtype=torch.float64))
     assert "Nor would any of" in sentence
+
+
+def test_a_velocity_drive_is_sent_to_another_velocity_gain(bench):
+    """A stiffness of 0 times 1.5 was on the menu, and a stiffness was advised."""
+    problem = bench.problem
+    like = [
+        replace(recording, drive=replace(recording.drive, stiffness=np.zeros(1), damping=np.ones(1)))
+        for recording in problem.dataset.recordings
+    ]
+    problem = replace(problem, dataset=replace(problem.dataset, recordings=like))
+    words = {choice.words for choice in menu(problem, 0, MenuCfg())}
+    assert any("the derivative gain" in each for each in words)
+    assert not any("proportional" in each for each in words)
+    data = SimpleNamespace(gains=1, loads=2, noise=torch.tensor([1e-4]))
+    outcome = outcome_of([1e-3], [2e-4], [STRIBECK])
+    sentence = next(each for each in advise(problem, outcome, "effect", data, ()) if "same gains" in each)
+    assert "another velocity gain (damping in the recording)" in sentence
 
 
 def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monkeypatch):

@@ -191,13 +191,16 @@ def _predicted(problem: Problem, model: RobotModel, data: Dataset) -> torch.Tens
 
 
 def _other_gain(like: Recording, cfg: MenuCfg) -> Iterator[tuple[str, str, Recording]]:
-    stiffness = like.drive.stiffness
-    if stiffness is None:
+    """The proportional gain, of a velocity drive the derivative one."""
+    for name, word in (("stiffness", "proportional"), ("damping", "derivative")):
+        gain = getattr(like.drive, name)
+        if gain is None or not np.any(gain):
+            continue
+        same = bool(np.ptp(gain) < 1e-9)
+        arguments = f" --{name} {cfg.factor * gain[0]:g}" if same else ""
+        drive = replace(like.drive, **{name: cfg.factor * gain})
+        yield f", {cfg.factor:g} times the {word} gain", arguments, replace(like, drive=drive)
         return
-    words = f", {cfg.factor:g} times the proportional gain"
-    same = bool(np.ptp(stiffness) < 1e-9)
-    arguments = f" --stiffness {cfg.factor * stiffness[0]:g}" if same else ""
-    yield words, arguments, replace(like, drive=replace(like.drive, stiffness=cfg.factor * stiffness))
 
 
 def _other_load(problem: Problem, like: Recording, joint: int, cfg: MenuCfg) -> Iterator[tuple[str, str, Recording]]:

@@ -12,6 +12,7 @@ from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.diagnosis.verdict.verdict import confounded
 from pace_optim.experiment_design.telling_apart import Rivals, RobotModel, next_experiments
 from pace_optim.problem.problem import Problem
+from pace_optim.run.result import drive_in_force
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.labels import found_effects
 from pace_optim.single_joint_fits.model import whole_values
@@ -28,9 +29,11 @@ def advise(
             "be told from other things. Record once with a known added mass (added_mass in the recording)."
         )
     if data.gains == 1:
+        has_stiffness = any(drive_in_force(problem).get("stiffness", {}).values())
+        other_gain = "another proportional gain (stiffness" if has_stiffness else "another velocity gain (damping"
         result.append(
             "All recordings have the same gains: errors of the gains and some delays cannot be seen. Record once with "
-            "another proportional gain (stiffness in the recording)."
+            f"{other_gain} in the recording)."
         )
     result += [
         f"{effect.name} would not show in these recordings: the {effect.absorbed_by} absorbs it. What would tell "
