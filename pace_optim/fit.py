@@ -10,7 +10,7 @@ from typing import Any
 from pace_actuators.effects import effect_modules
 from pace_envs import load_env_cfg
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.identification.beginning import load_for_fit, make_optimizer, make_searcher
+from pace_optim.identification.beginning import load_for_fit, logged_control_dt, make_optimizer, make_searcher
 from pace_optim.identification.conclusion import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.optimizers.search import agree_to_stop, search
@@ -61,6 +61,10 @@ def fit(
     else:
         env_cfg, place = before.load_cfg(), before.record.folder
     problem = load_for_fit(settings, env_cfg, told=before is not None)
+    if before is None and (control_dt := logged_control_dt(settings, problem)) is not None:
+        settings = replace(settings, control_dt=control_dt)
+        env_cfg = load_env_cfg(settings.task, control_dt)
+        problem = load_for_fit(settings, env_cfg, told=True)
     settings = with_absolute_paths(settings, env_cfg)
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
     digests, inputs = recording_digests(settings), input_digests(settings, record)

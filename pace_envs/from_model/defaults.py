@@ -3,6 +3,9 @@
 CONTROL_DT = 0.0025
 """Time between two commands [s]: 400 Hz, PACE's rate."""
 
+SHORTEST_CONTROL_DT = 0.0005
+"""Of a log with faster commands [s]: no bus of a robot's joints is faster than 2 kHz by much."""
+
 LONGEST_DELAY = 0.05
 """Upper bound of the delay [s]."""
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
+from pace_envs.model_file.read import is_model_file
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.refine import BEGINNING
 from pace_optim.problem.evaluator import Evaluator
@@ -17,6 +19,22 @@ from pace_optim.run.settings import FitSettings
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+_SHORTER = 0.95
+"""Commands that come at this part of a control step, or faster, are faster."""
+
+
+def logged_control_dt(settings: FitSettings, problem: Problem) -> float | None:
+    """The control step of the fastest log, where a model file is fitted to it, nobody has told one, and it is shorter.
+
+    Args:
+        settings: What to fit.
+        problem: The same, with the control step that model files have.
+    """
+    if settings.control_dt is not None or not is_model_file(settings.task):
+        return None
+    logged = [each.command_dt for each in problem.dataset.recordings if each.command_dt is not None]
+    interval = max(min(logged, default=problem.control_dt), SHORTEST_CONTROL_DT)
+    return interval if interval < _SHORTER * problem.control_dt else None
 
 
 def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Problem:

@@ -13,6 +13,8 @@ from .time_base import TimeBase
 
 GRID_COMMANDS = {"des_dof_pos": "command", "des_dof_vel": "command_vel", "des_dof_effort": "command_effort"}
 """The field of a conformed recording that holds each command on the control grid."""
+_EVEN = 2e-3
+"""An interval this near to a tenth of a millisecond or to a whole number of Hz is that."""
 
 
 def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
@@ -44,3 +46,18 @@ def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) ->
     if recording.des_time is not None:
         result["des_time"] = control_dt * np.arange(count)
     return result
+
+
+def command_interval(recording: Recording) -> float:
+    """Time from one command to the next, as they were logged [s]: a command that is repeated is none.
+
+    Args:
+        recording: As `load_recording` gives it.
+    """
+    instants = recording.time if recording.des_time is None else recording.des_time
+    series = [values for key in COMMAND_SERIES if (values := getattr(recording, key)) is not None]
+    every = np.nan_to_num(np.concatenate(series, axis=1))
+    new = np.flatnonzero((np.diff(every, axis=0) != 0).any(axis=1)) + 1
+    interval = float(np.median(np.diff(instants[new] if len(new) > 1 else instants)))
+    even = min((1 / max(1, round(1 / interval)), round(interval, 4)), key=lambda each: abs(each - interval))
+    return even if abs(even / interval - 1) < _EVEN else interval

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .checks import MIN_SAMPLES
-from .commands import GRID_COMMANDS, commands_on_grid
+from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
 from .keys import JOINT_SERIES, MEASURED_SERIES, listed
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
@@ -76,6 +76,7 @@ def conform_recording(
         **on_grid,
         time_origin=origin,
         sample_stride=base.sample_stride,
+        command_dt=command_interval(recording),
         logged=None if base.exact and recording.des_time is None else recording,
         notes=(*recording.notes, *base.notes, *notes),
     )

@@ -99,6 +99,8 @@ class Recording:
     """Path of the file."""
     logged: Recording | None = None
     """The same as it was logged, where it was resampled or its commands have a clock of their own."""
+    command_dt: float | None = None
+    """Time between two commands as they were logged [s]; None until conformed."""
     part_of: str = ""
     """Name of the recording that this is a part of; empty: it is whole."""
 

@@ -91,7 +91,8 @@ def fit_time_base(time: np.ndarray, control_dt: float, source: str, may_place: b
     if not exact and median < 0.95 * control_dt:
         notes.append(
             f"The recording ({1 / median:.4g} Hz) is finer than the control step ({1 / control_dt:.4g} Hz), "
-            "so information is lost; a smaller control step (sim.dt times decimation) keeps it."
+            "so information is lost; a smaller control step keeps it (of a model file --control_dt, else sim.dt times "
+            "decimation)."
         )
     num_samples = len(time) if exact else int(np.floor(time[-1] / spacing + 1e-6)) + 1
     return TimeBase(sample_stride=stride, num_samples=num_samples, exact=exact, notes=tuple(notes))

@@ -34,7 +34,10 @@ def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco
 def add_control_option(parser: argparse._ActionsContainer) -> None:
     """Of every command that makes a robot of a model file; runs keep it."""
     parser.add_argument(
-        "--control_dt", type=number, metavar="S", help="of a model file: time between two commands (default 0.0025)"
+        "--control_dt",
+        type=number,
+        metavar="S",
+        help="of a model file: time between two commands (default: as logged, at most 0.0025)",
     )
 
 
