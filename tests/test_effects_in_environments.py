@@ -57,7 +57,7 @@ def bounds_corners(name):
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_at_their_null_all_effects_are_the_base_model_bit_for_bit(delay_mode, calls, integrator):
     options = {"base": CALM, "delay_mode": delay_mode, "calls": calls, "integrator": integrator, "load": HEAVY}
-    targets = MOVING[200:300]
+    targets = MOVING[200:250]
     expected = Bench(**options).follow(targets, sensed=True)
     for effects in [[name] for name in EFFECTS] + [list(EFFECTS)]:
         assert torch.equal(Bench(effects, **options).follow(targets, sensed=True), expected), effects
@@ -90,8 +90,10 @@ def write_rows(bench, values):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])  # at the control step, the longest there is
-def test_the_extremes_of_all_bounds_stay_finite_for_20_s(integrator):
+@pytest.mark.parametrize(
+    ("integrator", "seconds"), [("implicitfast", 10.0), ("rk4", 20.0)]
+)  # the harder one for longer
+def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, seconds):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
     cfgs, corners, bases = [], [], []
     for name in EFFECTS:  # side by side, each on its rows, with each base
@@ -104,7 +106,7 @@ def test_the_extremes_of_all_bounds_stay_finite_for_20_s(integrator):
     of_rows = {key: torch.tensor([base[key] for base in bases], dtype=torch.float64) for key in TRUTH}
     bench = Bench(cfgs, num_envs=len(corners), base=of_rows, integrator=integrator)
     write_rows(bench, [values for _, values in corners])
-    reached = bench.follow(long_chirp(20.0))[:, :, 0]
+    reached = bench.follow(long_chirp(seconds))[:, :, 0]
     for i, corner in enumerate(zip(corners, bases, strict=True)):
         assert bool(reached[:, i].isfinite().all()), corner
         assert float(reached[:, i].abs().max()) < 10.0, corner

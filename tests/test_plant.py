@@ -203,6 +203,7 @@ def _replay(dataset, space, x, ratio, delay_mode):
 
 CHIRP = [run_of(chirp(amplitude=0.8), session_start=30.0)]
 COARSE = PlantCfg(noise=0.0, step=5e-4)
+COARSE_STEP = ("--physics_dt", "0.0005")
 
 
 @pytest.fixture(scope="module")
@@ -354,7 +355,7 @@ def collect(*args):
 
 def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(tmp_path, capsys):
     path = tmp_path / "r.npz"
-    options = ("--task", BENCH, "--duration", "2", "--no_plot", "--noise", "1e-4", "--output", str(path))
+    options = ("--task", BENCH, "--duration", "2", "--no_plot", "--noise", "1e-4", "--output", str(path), *COARSE_STEP)
     assert collect(*options, "--effect", "torque_offset", "--seed", "4") == 0
     said = capsys.readouterr().out
     assert "hidden: torque_offset: tau_0" in said and f"truth: {tmp_path / 'r.truth.json'}" in said
@@ -368,7 +369,7 @@ def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(tmp_pa
 def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(tmp_path):
     truths = []
     for motion in ("steps", "multisine"):
-        options = ("--task", BENCH, "--duration", "2", "--no_plot", "--excitation", motion, "--seed", "3")
+        options = ("--task", BENCH, "--duration", "2", "--no_plot", "--excitation", motion, "--seed", "3", *COARSE_STEP)
         path = tmp_path / f"{motion}.npz"
         assert collect(*options, "--effect", "stribeck_friction", "--noise", "1e-4", "--output", str(path)) == 0
         truths.append(json.loads((tmp_path / f"{motion}.truth.json").read_text()))
@@ -376,7 +377,7 @@ def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(tmp_path
 
 
 def test_data_collection_with_a_battery_writes_every_recording(tmp_path):
-    options = ("--task", BENCH, "--duration", "0.5", "--no_plot", "--excitation", "battery")
+    options = ("--task", BENCH, "--duration", "0.5", "--no_plot", "--excitation", "battery", *COARSE_STEP)
     assert collect(*options, "--effect", "torque_gain", "--output", str(tmp_path / "b.npz")) == 0
     assert len(list(tmp_path.glob("b_*.npz"))) == 6 and (tmp_path / "b.truth.json").is_file()
 
