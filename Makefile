@@ -16,7 +16,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PACKAGES := pace_actuators pace_envs pace_optim
 PIP_INSTALL_ARGS ?=
-PYTEST_ARGS ?= -n auto --dist loadfile
+# files in their own order: by number of tests, files of a few long ones would come last, on one processor
+PYTEST_ARGS ?= -n auto --dist loadfile --no-loadscope-reorder
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 

@@ -13,12 +13,11 @@ from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
 from pace_optim.optimizers.jacobian import Jacobian
-from pace_optim.optimizers.least_squares import find_jacobian
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.summary import summary
-from pace_optim.uncertainty.assessment import Assessment, assess, assess_known, trajectories
+from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.uncertainty.other_solutions import with_other_solutions
@@ -140,7 +139,7 @@ def _result(
 
 def _reached(run: Optimization, outcome: Outcome) -> _End:
     """Where the optimizers ended, with error bars."""
-    problem, known = run.problem, _ended_at(run, outcome.x) or _known_at(run, outcome.x)
+    problem, known = run.problem, _known_at(run, outcome.x)
     run.refuse_divergence(float(known.residuals.score[0]))
     train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)[ALL]
     return _End(
@@ -152,17 +151,6 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
         train_rmse=train,
         times=times_noise(problem, train),
     )
-
-
-def _ended_at(run: Optimization, x: torch.Tensor) -> Assessment | None:
-    """The same as :func:`_known_at`, by the derivatives of the descent that ended there; ``None`` if it has none."""
-    ended = next((each for each in run.descents if each.is_fresh and torch.equal(each.x, x)), None)
-    if ended is None:
-        return None
-    if ended.jacobian is None:  # a run that goes on had not kept it
-        with run.evaluator.again():
-            find_jacobian(ended, run.evaluator, run.colouring)
-    return None if ended.jacobian is None else assess_known(run.problem, run.assessor, run.evaluator, ended.jacobian, x)
 
 
 def _known_at(run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:

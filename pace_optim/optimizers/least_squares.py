@@ -160,7 +160,7 @@ def least_squares(
     for descent in descents:
         if descent.lost_jacobian:
             with evaluator.again():
-                find_jacobian(descent, evaluator, colouring, where)
+                _find_jacobian(descent, evaluator, colouring, where)
     while running := [d for d in descents if d.stop_reason is None]:
         batches, steps = [], []
         for descent in running:
@@ -181,9 +181,7 @@ def least_squares(
     return sorted(descents, key=lambda d: d.score)
 
 
-def find_jacobian(
-    descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None = None
-) -> None:
+def _find_jacobian(descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None) -> None:
     """Compute the Jacobian again, beside the descent's iterations."""
     seen = descent.x if descent.jacobian_x is None else descent.jacobian_x
     neighbours, step = perturbed(seen, colouring)

@@ -47,22 +47,6 @@ def assess(
     return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there)
 
 
-def assess_known(
-    problem: Problem, evaluator: Evaluator, trained: Evaluator, there: Jacobian, x: torch.Tensor
-) -> Assessment:
-    """The same where the derivatives at x are known.
-
-    Args:
-        problem: What was fitted.
-        evaluator: Simulates all recordings.
-        trained: Simulates those that are trained on.
-        there: Residuals and derivatives at x, on the training samples of these.
-        x: Normalised, (size,).
-    """
-    residuals = evaluator.residuals(problem.space.to_physical(x)[None], problem.dataset.sampled)
-    return Assessment(uncertainty=error_bars(problem, trained, there, x), residuals=residuals, jacobian=there)
-
-
 def error_bars(problem: Problem, evaluator: Evaluator, there: Jacobian, x: torch.Tensor) -> Uncertainty:
     """Error bars at x from derivatives that are known: only first positions are moved once more.
 
