@@ -20,7 +20,8 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.identification.optimization import Optimization
+from pace_optim.optimizers.jacobian import NARROW, WIDE, Colouring, colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
@@ -216,6 +217,35 @@ class Fake:
 
 def dense(size):
     return Colouring(colours=tuple((i,) for i in range(size)), joints=tuple((0,) for _ in range(size)))
+
+
+def test_wide_derivatives_lead_on_where_a_rattle_makes_the_error_rough():
+    """Its size is a thousandth of the error at the start, and its slope hundreds of times the valley's."""
+    generator = torch.Generator().manual_seed(0)
+    slope, phase = torch.randn(200, 2, dtype=torch.float64, generator=generator), torch.arange(200)
+    target = torch.tensor([0.3, -0.2], dtype=torch.float64)
+
+    def valley(x):
+        return slope @ (x - target) + 1e-3 * torch.sin(1e6 * x.sum() + phase)
+
+    start = torch.tensor([-0.5, 0.4], dtype=torch.float64)
+    narrow, wide = (
+        least_squares(Fake(valley), dataclasses.replace(dense(2), step=step), [start])[0] for step in (NARROW, WIDE)
+    )
+    assert (narrow.x - target).abs().max() > 0.05
+    assert (wide.x - target).abs().max() < 2e-3
+
+
+def test_a_descent_that_creeps_goes_on_over_wide_steps_and_its_error_bars_too(monkeypatch):
+    crept = Descent(x=torch.zeros(2, dtype=torch.float64), score=1.0, stop_reason="max_iteration 40")
+    better, worse = (dataclasses.replace(crept, score=score, stop_reason="converged") for score in (0.1, 2.0))
+    run = SimpleNamespace(colouring=dense(2), evaluator=None, progress=SimpleNamespace(say=lambda _: None))
+    for found, ends, taken, step in (
+        (dataclasses.replace(crept, stop_reason="converged"), better, None, NARROW), (crept, worse, None, NARROW),
+        (crept, better, better, WIDE),
+    ):  # fmt: skip
+        monkeypatch.setattr("pace_optim.identification.optimization.least_squares", lambda *_, ends=ends: [ends])
+        assert Optimization._over_wide_steps(run, found) is (taken or found) and run.colouring.step == step
 
 
 def test_trials_that_diverge_do_not_break_a_descent():
