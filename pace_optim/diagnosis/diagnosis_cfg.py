@@ -87,6 +87,7 @@ class VerdictCfg:
 RULES = (
     "look_ahead",
     "replace",
+    "idle",
     "pool",
     "trim",
     "wide_steps",

@@ -152,19 +152,6 @@ class JointModel:
         has[self.effects.index(effect)] &= ~joints
         return replace(self, has=has)
 
-    def vanished(self, x: torch.Tensor) -> torch.Tensor:
-        """Which joint has which effect at its null, where it vanishes exactly, (effects, n) bool.
-
-        Args:
-            x: Normalised, (n, P).
-        """
-        physical, result = self.to_physical(x), self.has.clone()
-        for row, effect in zip(result, self.effects, strict=True):
-            sizes = [p.null is not None for p in effect.parameters]
-            nulls = torch.tensor([p.null for p in effect.parameters if p.null is not None], dtype=torch.float64)
-            row &= (physical[:, self.columns(effect)][:, sizes] == nulls).all(dim=1) & any(sizes)
-        return result
-
     def extended(
         self, physical: torch.Tensor, effect: type[Effect], joints: torch.Tensor, values: torch.Tensor
     ) -> tuple[JointModel, torch.Tensor]:

@@ -78,6 +78,13 @@ def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if taken else None for _ in decision.joints]
 
 
+def _idle(decision: Decision, cfg: DiagnosisCfg) -> Taken:
+    """An effect that a joint can do without."""
+    ((name, after),) = decision.after.items()
+    errors = zip(after.mse.tolist(), decision.before.mse.tolist(), strict=True)
+    return [name if within(without, having, cfg.judging.as_good) else None for without, having in errors]
+
+
 def _trim(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """The fit without some windows, where it is better."""
     ((name, after),) = decision.after.items()
@@ -118,6 +125,7 @@ _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "add": _add,
     "replace": _replace,
     "look_ahead": _look_ahead,
+    "idle": _idle,
     "pool": _pool,
     "trim": _trim,
     "curves": _curves,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
+from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
@@ -36,14 +37,14 @@ def add_effects(
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
-    final = _without_vanished(branch.now)
+    branch = without_idle(search, branch)
     return Outcome(
         problem=branch.problem,
         base=base,
         base_errors=errors,
-        final=final,
+        final=branch.now,
         final_errors=branch.errors,
-        unevenness=size_consistency(final),
+        unevenness=size_consistency(branch.now),
         rounds=[*branch.rounds, *([] if found is None else [found])],
         cfg=cfg,
     )
@@ -58,7 +59,24 @@ def added(search: Search, branch: Branch, found: Round) -> tuple[Branch, Round |
     return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)
 
 
-def _without_vanished(now: Fitted) -> Fitted:
-    """The model without effects that have ended where they vanish: what paid there is another end of the base model."""
-    left = now.model.has & ~now.model.vanished(now.x)
-    return replace(now, model=replace(now.model, has=left)) if bool(left.any()) else now
+def without_idle(search: Search, branch: Branch) -> Branch:
+    """The branch without effects that their joints can do without, if others are left.
+
+    What paid there is another end of the base model: fitted again from where the effect led, it is as good.
+    """
+    fits, now, errors, cfg = search.fits, branch.now, branch.errors, search.cfg
+    for row, (effect, has) in enumerate(zip(branch.now.model.effects, branch.now.model.has, strict=True)):
+        if effect.shared or not bool(has.any()) or not cfg.has("idle"):
+            continue
+        start = Fitted.start(now.model.without_effect(effect, has), now.physical, tried=effect)
+        (without,), (after,) = fits.on_joints(branch.problem, [start], has, errors)
+        joints = has.nonzero()[:, 0].tolist()
+        taken = decide("idle", joints, errors, {effect.name: after}, cfg=cfg, log=search.log)
+        idle = torch.tensor([j in taken for j in range(len(has))])
+        left = now.model.has.clone()
+        left[row] &= ~idle
+        if bool(idle.any()) and bool(left.any()):
+            now, errors = now.with_joints(idle, without), errors.with_joints(idle, after)
+    if now is not branch.now and now.jacobian is None:
+        now = fits.looked_at(branch.problem, [now])[0]
+    return replace(branch, now=now, errors=errors)
