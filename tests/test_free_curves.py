@@ -224,6 +224,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         "friction_over_speed@b. With all of it"
     )
     monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
+    monkeypatch.setattr("pace_optim.diagnosis.telling.advice.drive_in_force", lambda _: {})
     advice = advise(robot, found.outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
     told = error_map(curves, robot.joint_names, curves.errors[0])
