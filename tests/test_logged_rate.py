@@ -44,6 +44,12 @@ def test_a_command_that_is_repeated_is_none(repeat, own_clock, interval):
     assert command_interval(recording) == pytest.approx(interval, rel=1e-9)
 
 
+def test_commands_for_each_control_step_need_no_clock():
+    time, held = np.arange(500) * 0.004, np.sin(np.arange(1997.0))[:, None]
+    recording = Recording(name="r", joint_names=("j",), time=time, dof_pos=held[::4], des_dof_pos=held)
+    assert command_interval(recording) == pytest.approx(0.001)
+
+
 def test_a_fit_takes_the_rate_of_the_logs_commands_and_its_run_keeps_it(tmp_path):
     robot = tmp_path / "head.xml"
     robot.write_text(HEAD.format(MOTORS))

@@ -57,6 +57,8 @@ def command_interval(recording: Recording) -> float:
     instants = recording.time if recording.des_time is None else recording.des_time
     series = [values for key in COMMAND_SERIES if (values := getattr(recording, key)) is not None]
     every = np.nan_to_num(np.concatenate(series, axis=1))
+    if len(every) != len(instants):  # one for each control step
+        instants = np.linspace(instants[0], instants[-1], len(every))
     new = np.flatnonzero((np.diff(every, axis=0) != 0).any(axis=1)) + 1
     interval = float(np.median(np.diff(instants[new] if len(new) > 1 else instants)))
     even = min((1 / max(1, round(1 / interval)), round(interval, 4)), key=lambda each: abs(each - interval))
