@@ -8,6 +8,7 @@ import mujoco
 import torch
 
 from pace_actuators import resolve_joint_values
+from pace_actuators.joint_units import JointType
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
@@ -95,6 +96,12 @@ class RobotState:
         model = self._sim.model
         slide = mujoco.mjtJoint.mjJNT_SLIDE
         return tuple(name for name in self.joint_names if int(model.joint(name).type[0]) == slide)
+
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        """Whether each of the joints turns or slides."""
+        slides = self.slide_joints
+        return tuple("slide" if name in slides else "hinge" for name in self.joint_names)
 
     def find_joints(
         self, name_keys: str | Sequence[str], *, preserve_order: bool = False

@@ -11,6 +11,7 @@ from problems import BENCH, CALM
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
+from pace_actuators.joint_units import all_hinges
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.search.state import Outcome
@@ -213,7 +214,9 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         ("contributions", {spring: 0.8, curve: 0.2}),
     ):
         monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result, **__: result)
-    robot = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=0.0025)
+    robot = SimpleNamespace(
+        joint_names=("a", "b", "c", "d"), joint_types=all_hinges(4), dataset=run.problem.dataset, control_dt=0.0025
+    )
     found = search_effects(robot, None, [spring], 3)
     assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]
     assert found.added == ["parallel_spring@a"] and found.free_form == ["friction_over_speed@b"]

@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from run_folders import JOINTS, make_history, make_trajectory
 
-from pace_optim.report.number_text import angle_text, angle_unit, three_figures
+from pace_optim.report.number_text import position_text, position_unit, three_figures
 from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.report.trajectory_errors import held_out_spans
 from pace_optim.run.history import History
@@ -120,13 +120,13 @@ def test_held_out_spans_begin_and_end_with_the_samples():
     ("angle", "text"), [(6.8e-3, "6.8 mrad"), (2.5e-6, "2.5 µrad"), (3e-11, "0.03 nrad"), (0.0, "0 nrad"), (None, "–")]
 )
 def test_angles_read_well(angle, text):
-    assert angle_text(angle) == text
+    assert position_text(angle, ["hinge"]) == text
 
 
 def test_a_unit_fits_the_largest_and_survives_what_is_no_number():
-    assert angle_unit([1e-9, 2e-3]) == (1e3, "mrad")
-    assert angle_unit([float("nan"), None, 1e-6]) == (1e6, "µrad")
-    assert angle_unit([]) == (1e3, "mrad")
+    assert position_unit([1e-9, 2e-3], ["hinge"]) == (1e3, "mrad")
+    assert position_unit([float("nan"), None, 1e-6], ["hinge"]) == (1e6, "µrad")
+    assert position_unit([], ["hinge"]) == (1e3, "mrad")
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.12, "0.120"), (11.96, "12.0"), (114.2, "114"), (0.0, "0.00")])

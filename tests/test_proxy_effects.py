@@ -11,6 +11,7 @@ from diagnoses import hidden_run
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect
+from pace_actuators.joint_units import all_hinges
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose, search_effects
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.judging.size_consistency import unevenness
@@ -139,7 +140,9 @@ def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
         ("pool", outcome),
     ):
         monkeypatch.setattr(module, name, lambda *_, made=made, **__: made)
-    joints = SimpleNamespace(joint_names=("a", "b", "c", "d"), dataset=run.problem.dataset, control_dt=DT)
+    joints = SimpleNamespace(
+        joint_names=("a", "b", "c", "d"), joint_types=all_hinges(4), dataset=run.problem.dataset, control_dt=DT
+    )
     found = search_effects(joints, None, [SPRING], 3)
     assert (found.verdict, found.paying, found.added) == ("nothing_missing", [], [])
     assert found.outcome.final_errors.mse.tolist() == pytest.approx(outcome.base_errors.mse.tolist())

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pace_actuators.effects import get_effect
-from pace_actuators.joint_units import in_slide_units
+from pace_actuators.joint_units import units_for
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
 from pace_envs.tasks.pace import base_parameters, effect_parameters
@@ -47,7 +47,7 @@ def gantry(tmp_path):
     ],
 )
 def test_units_of_a_hinge_become_those_of_a_slide(hinge, slide):
-    assert in_slide_units(hinge) == slide
+    assert units_for(hinge, ["slide"]) == slide
 
 
 def test_each_joint_has_the_units_of_its_kind(gantry):

@@ -64,7 +64,11 @@ def _robot(task: str | None) -> Robot:
     cfg.scene.num_envs = 1
     env = ManagerBasedRLEnv(cfg)  # type: ignore[arg-type]
     robot = env.scene["robot"]
-    known = Robot(joint_names=tuple(robot.joint_names), limits=robot.data.joint_pos_limits.numpy().copy())
+    known = Robot(
+        joint_names=tuple(robot.joint_names),
+        limits=robot.data.joint_pos_limits.numpy().copy(),
+        joint_types=robot.joint_types,
+    )
     env.close()
     return known
 

@@ -14,6 +14,7 @@ from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.run.find import find_mean, find_run
 from pace_optim.run.history import History
 from pace_optim.run.replay import replay
+from pace_optim.run.result import FitResult
 from pace_optim.run.tensors import read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
@@ -46,6 +47,7 @@ def main() -> None:
     from matplotlib import pyplot as plt
 
     figures: dict[str, Figure] = {}
+    types = FitResult.load(run).joint_types if (run / "result.json").exists() else ()
     title = f"{args.robot_name} · {run.name}"
     if args.plot_trajectory or both:
         if args.mean_name:
@@ -57,11 +59,11 @@ def main() -> None:
                 raise ValueError(f"{path}: {error}") from None
         else:
             content, of = read_trajectory(run), "best"
-        drawn = plot_trajectories(content, title=f"{title} · {of}", make_figure=plt.figure)
+        drawn = plot_trajectories(content, joint_types=types, title=f"{title} · {of}", make_figure=plt.figure)
         figures |= {stem if of == "best" else f"{stem}_{of}": figure for stem, figure in drawn.items()}
     if args.plot_score or both:
         history = History.load(existing(run / "history.json"))
-        figures["score"] = plot_scores(history, title=title, make_figure=plt.figure)
+        figures["score"] = plot_scores(history, joint_types=types or ("hinge",), title=title, make_figure=plt.figure)
     if on_screen:
         plt.show()
         return

@@ -14,7 +14,7 @@ from pace_actuators.files import write_together
 from pace_optim.recording.keys import listed
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
-from pace_optim.report.number_text import angle_unit
+from pace_optim.report.number_text import position_unit
 from pace_optim.report.trajectory_errors import held_out_spans
 from pace_optim.run.open import run_folder
 
@@ -80,7 +80,8 @@ def compare(
 def compare_run(run: RunTracks) -> dict[str, Any]:
     """Everything about one run, for comparison.json."""
     joints = run.result.joint_names
-    compared = [compare_joint(joint, j, run.tracks) for j, joint in enumerate(joints)]
+    types = run.result.joint_types
+    compared = [compare_joint(joint, j, run.tracks, types[j]) for j, joint in enumerate(joints)]
     worst = worst_places([joint.places for joint in compared])
     floors = [joint.content["noise_floor"] for joint in compared]
     return {
@@ -122,7 +123,7 @@ def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tr
             alone = noise_floor(track.measured[:, j], track.dt).sigma
             times = own["noise_floor"] / max(alone, NEGLIGIBLE)
             if times > _UNREPEATABLE and times > worst.get(track.group, (0.0, ""))[0]:
-                factor, unit = angle_unit([own["noise_floor"]])
+                factor, unit = position_unit([own["noise_floor"]], [one.content["type"]])
                 apart = f"{factor * own['noise_floor']:.3g} {unit}, {times:.0f} times what is noise of each"
                 worst[track.group] = times, f"{name} moved differently by {apart}"
     return [

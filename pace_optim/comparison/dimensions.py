@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType, units_for
+
 from .motion import Motion
 
 _REVERSAL_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
@@ -45,6 +47,7 @@ def dimensions_of(
     times: Sequence[np.ndarray],
     loads: Sequence[np.ndarray] | None,
     enabled: Sequence[np.ndarray] | None = None,
+    joint_type: JointType = "hinge",
 ) -> list:
     """Every dimension of one joint over all its recordings, whose samples follow each other.
 
@@ -53,6 +56,7 @@ def dimensions_of(
         times: Of each recording, (K_r,) [s].
         loads: Load torque in each recording, (K_r,) [N m], if known.
         enabled: Whether the drive gave torque in each recording, (K_r,) bool; ``None``: always.
+        joint_type: Whether it turns or slides.
     """
     speed = np.concatenate([motion.speed for motion in motions])
     acceleration = np.concatenate([motion.acceleration for motion in motions])
@@ -61,18 +65,25 @@ def dimensions_of(
     since = np.concatenate([motion.since_reversal for motion in motions])
     time = np.concatenate([np.asarray(t) - t[0] for t in times])
     still = _round(max(motion.standstill for motion in motions))
+    types = [joint_type]
+    speed_unit = units_for("rad/s", types)
     sizes = _size_edges(np.abs(speed), still)
     result = [
-        _cut("speed", "speed", "rad/s", np.abs(speed), sizes),
-        _cut("velocity", "velocity", "rad/s", speed, _mirrored(sizes)),
+        _cut("speed", "speed", speed_unit, np.abs(speed), sizes),
+        _cut("velocity", "velocity", speed_unit, speed, _mirrored(sizes)),
         _cut("direction", "direction of motion", "", direction, (-np.inf, 0.0, np.inf)),
         _cut("since_reversal", "time since the last reversal", "s", since, _REVERSAL_EDGES),
-        _cut("position", "position", "rad", position, _even_edges(position)),
-        *_sized("acceleration", "acceleration", "rad/s²", acceleration),
+        _cut("position", "position", units_for("rad", types), position, _even_edges(position)),
+        *_sized("acceleration", "acceleration", units_for("rad/s²", types), acceleration),
         _cut("time", "time", "s", time, _time_edges(time)),
     ]
     if loads is not None:
-        result += _sized("load", "load torque", "N m", np.concatenate(loads))
+        result += _sized(
+            "load",
+            "load force" if joint_type == "slide" else "load torque",
+            units_for("N m", types),
+            np.concatenate(loads),
+        )
     if enabled is not None:
         on = np.concatenate(enabled).astype(float)
         result.append(_cut("drive", "drive off, on", "", on, (-np.inf, 0.5, np.inf)))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType
 from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
 from pace_optim.report.trajectory_errors import rms
 
@@ -36,13 +37,14 @@ class JointComparison:
     """Where its error sits; empty at the noise floor."""
 
 
-def compare_joint(joint: str, j: int, tracks: Sequence[Track]) -> JointComparison:
+def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: JointType = "hinge") -> JointComparison:
     """Analyse joint j of all recordings.
 
     Args:
         joint: Its name.
         j: Its index.
         tracks: The recordings.
+        joint_type: Whether it turns or slides.
     """
     floors = noise_floors(j, tracks)
     motions = [motion_of(t.measured[:, j], t.dt, f.sigma) for t, f in zip(tracks, floors, strict=True)]
@@ -52,6 +54,7 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track]) -> JointCompariso
         [t.time for t in tracks],
         loads if len(loads) == len(tracks) else None,
         [t.enabled for t in tracks],
+        joint_type=joint_type,
     )
     error = np.concatenate([t.error[:, j] for t in tracks])
     sigma = np.concatenate([np.full(len(t.time), f.sigma) for t, f in zip(tracks, floors, strict=True)])
@@ -63,9 +66,10 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track]) -> JointCompariso
     in_bands = _shares(pooled["above"])
     total, floor = rms(error) or 0.0, rms(sigma) or 0.0
     places = places_of(joint, error, sigma, dimensions, layouts, (edges, octaves, in_bands), [t.name for t in tracks])
-    sentence = joint_sentence(joint, total, floor, places)
+    sentence = joint_sentence(joint, total, floor, places, joint_type)
     told = places if places and sentence == places[0].sentence else []
     content: dict[str, Any] = {
+        "type": joint_type,
         "rmse": rmse_by_part(tracks, j),
         "noise_floor": floor,
         "share_above_floor": share_above(total, floor),

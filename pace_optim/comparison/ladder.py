@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.drive_result import ALL
-from pace_optim.report.number_text import angle_unit, three_figures
+from pace_actuators.joint_units import JointType
+from pace_optim.report.number_text import position_unit, three_figures
 from pace_optim.report.trajectory_errors import rms
 
 from .joint import noise_floors, rmse_by_part
@@ -80,10 +81,10 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
     return {"steps": steps, "noise_floor": floors}
 
 
-def ladder_table(ladder: dict[str, Any]) -> str:
-    """The ladder for a terminal."""
+def ladder_table(ladder: dict[str, Any], joint_types: Sequence[JointType]) -> str:
+    """The ladder for a terminal; its errors are of joints of these types."""
     steps, floor = ladder["steps"], ladder["noise_floor"][ALL]
-    factor, unit = angle_unit([s["rmse"][part].get(ALL) for s in steps for part in _PARTS])
+    factor, unit = position_unit([s["rmse"][part].get(ALL) for s in steps for part in _PARTS], joint_types)
     rows = [["", *(f"{part} [{unit}]" for part in _PARTS), "× better (train, validation)"]]
     for step in steps:
         values = [_cell(step["rmse"][part].get(ALL), factor) for part in _PARTS]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pace_optim.report.number_text import angle_text, angle_unit
+from pace_actuators.joint_units import JointType
+from pace_optim.report.number_text import position_text, position_unit
 
 from .dimensions import Dimension
 from .regions import Layout, Region, best_region, evidence, inside, refine
@@ -129,20 +130,23 @@ def worst_places(places: Sequence[Sequence[Place]]) -> list[Place]:
     return sorted(every, key=lambda place: -place.weight)[:MOST_PLACES]
 
 
-def joint_sentence(joint: str, rmse: float, floor: float, places: Sequence[Place]) -> str:
+def joint_sentence(
+    joint: str, rmse: float, floor: float, places: Sequence[Place], joint_type: JointType = "hinge"
+) -> str:
     """What is to be said of a joint, honestly where there is little."""
+    types = [joint_type]
     if rmse < NEGLIGIBLE:
-        return f"{joint}: the error is {angle_text(rmse)}, below what any encoder shows."
+        return f"{joint}: the error is {position_text(rmse, types)}, below what any encoder shows."
     if rmse <= AT_THE_FLOOR * floor:
-        factor, unit = angle_unit([rmse])
+        factor, unit = position_unit([rmse], types)
         return (
             f"{joint} is at the noise floor: {factor * rmse:.3g} {unit} against {factor * floor:.3g} {unit} of noise."
         )
     if places:
         return places[0].sentence
     return (
-        f"{joint}: the error of {angle_text(rmse)} ({angle_text(floor)} of it noise) is spread evenly; no speed, "
-        "position, load or frequency holds much more than its share."
+        f"{joint}: the error of {position_text(rmse, types)} ({position_text(floor, types)} of it noise) is spread "
+        "evenly; no speed, position, load or frequency holds much more than its share."
     )
 
 

@@ -39,7 +39,10 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
         return _after_reversal(low, high)
     if dimension.name == "time":
         return f"in the first {high:g} s" if low is None else _between(low, high, "s", "after", "before")
-    return _OF.get(dimension.name, "") + _between(low, high, dimension.unit)
+    of = _OF.get(dimension.name, "")
+    if dimension.unit == "N":
+        of = of.replace("torques", "forces")
+    return of + _between(low, high, dimension.unit)
 
 
 def band_text(low: float, high: float, nyquist: float) -> str:

@@ -158,6 +158,7 @@ def _write(
                     None if recording is None else recording.dof_pos,
                     title=f"{sim2real.robot_name}, {trajectory.name}: {how}",
                     position_limits=limits.position,
+                    joint_types=limits.joint_types,
                 )
             )
     return Collection(
@@ -194,4 +195,5 @@ def _limits_of(env: Any) -> MotionLimits:
         position=robot.data.joint_pos_limits.numpy(),
         velocity=velocity,
         effort=effort,
+        joint_types=robot.joint_types,
     )

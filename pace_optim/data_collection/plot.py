@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pace_actuators.files import write_atomically
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.excitation import Trajectory
 
 _TARGET, _TARGET_ALONE, _MEASURED, _LIMIT = "#b4b9bf", "#5f6368", "#1f5fa8", "#c0392b"
@@ -22,6 +24,7 @@ def plot_motion(
     *,
     title: str,
     position_limits: np.ndarray | None = None,
+    joint_types: Sequence[JointType] = (),
 ) -> Path:
     """Draw targets and positions over time as PNG, one panel per joint. The file appears whole or not at all.
 
@@ -31,6 +34,7 @@ def plot_motion(
         measured: Encoder positions, (T, n) [rad].
         title: Above everything.
         position_limits: (n, 2) [rad]; drawn where they lie in or near the range of motion.
+        joint_types: Whether each joint turns or slides; none: all turn.
     """
     path = Path(path)
     names = trajectory.joint_names
@@ -62,8 +66,8 @@ def plot_motion(
         panel.set_xlim(0.0, end)
         panel.grid(alpha=0.25)
         panel.tick_params(labelsize=8)
-        if j % columns == 0:
-            panel.set_ylabel("position [rad]", fontsize=9)
+        if j % columns == 0 or joint_types[j : j + 1] != joint_types[j - 1 : j]:
+            panel.set_ylabel(units_for("position [rad]", joint_types[j : j + 1]), fontsize=9)
         if j + columns >= len(names):
             panel.set_xlabel("time [s]", fontsize=9)
             panel.tick_params(labelbottom=True)

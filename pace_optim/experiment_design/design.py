@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from pace_actuators.joint_units import JointType
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.excitation import Trajectory
 from pace_optim.experiment_design.motion_check import MotionLimits
@@ -57,6 +58,8 @@ class Design:
     """How each joint moves; ``None`` where the unoptimised motion is kept."""
     space: ParameterSpace
     """The parameters, for labels, units and ranges."""
+    joint_types: tuple[JointType, ...]
+    """Whether each joint turns or slides."""
     slowed: tuple[str, ...]
     """Joints whose targets, in the motion asked for, are faster than their drives; the unoptimised motion is
     that one made slower there."""
@@ -144,6 +147,7 @@ def optimize_motion(
         trajectory=replace(unoptimized, name=f"{unoptimized.name}_optimized", des_dof_pos=search.target),
         joints=tuple(search.joints),
         space=problem.space,
+        joint_types=problem.joint_types,
         before=expected[0],
         after=expected[1],
         slowed=tuple(f.joint for f in asked.findings if f.quantity == "speed"),

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.excitation import Trajectory
 
 MAX_SHARE_AT_LIMIT = 0.5
@@ -36,6 +37,8 @@ class MotionLimits:
     """No-load speed of the drive, (n,) [rad/s]; may be infinite."""
     effort: np.ndarray
     """Largest torque of the drive, (n,) [N m]; may be infinite."""
+    joint_types: tuple[JointType, ...] = ()
+    """Whether each joint turns or slides; none: all turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +94,7 @@ def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFi
                 f"{joint}: its target moves at up to {value:.3g} rad/s (at {time[k]:.2f} s), faster than the drive's "
                 f"no-load speed of {limit:.3g} rad/s, and in {share:.1%} of the time too fast to be followed."
             )
+            message = units_for(message, limits.joint_types[j : j + 1])
             findings.append(_finding(joint, "speed", value, limit, time[k], share, message))
     return findings
 
@@ -117,6 +121,7 @@ def check_simulated(
             f"{joint}: in simulation its torque reaches the limit of {limit:.3g} N m, first at {time[k]:.2f} s, and "
             f"is there in {share:.1%} of the time."
         )
+        message = units_for(message, limits.joint_types[j : j + 1])
         too_much = share > MAX_SHARE_AT_LIMIT
         if too_much:
             message += " The drive hardly follows: make the motion smaller or slower, or lower the gains."
@@ -177,6 +182,7 @@ def _beyond_position(
             f"{joint}: {what} {value:.3f} rad at {time[k]:.2f} s, outside its limits of {low:.3f} to "
             f"{high:.3f} rad.{cure}"
         )
+        message = units_for(message, limits.joint_types[j : j + 1])
         limit = low if below[k, j] > above[k, j] else high
         findings.append(_finding(joint, quantity, value, limit, time[k], share, message, is_error=is_error))
     return findings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from pace_actuators.joint_units import units_for
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.warnings import in_words
@@ -19,8 +20,9 @@ def design_table(design: Design) -> str:
     width = max(len(joint) for joint in [*joints, "joint"])
     titles = [f"{p.name} [{' or '.join(dict.fromkeys(p.units or (p.unit,)))}]" for p in own]
     columns = [max(len(title), 19) for title in titles]
+    noise = units_for(f"{design.noise:g} rad", design.joint_types)
     lines = [
-        f"expected error bars (one standard deviation) for encoder noise of {design.noise:g} rad: "
+        f"expected error bars (one standard deviation) for encoder noise of {noise}: "
         f"unoptimised -> optimised, {design.tried} candidates tried",
         "  ".join(["joint".ljust(width), *(t.rjust(c) for t, c in zip(titles, columns, strict=True)), "  motion"]),
     ]
@@ -51,10 +53,8 @@ def _motion(design: Design, j: int) -> str:
     motion = design.joints[j]
     if motion is None:
         return "as it was"
-    return (
-        f"{motion.centre:+.2f} ± {abs(motion.amplitude):.2f} rad, "
-        f"{motion.min_frequency:.2g} to {motion.max_frequency:.2g} Hz"
-    )
+    place = units_for(f"{motion.centre:+.2f} ± {abs(motion.amplitude):.2f} rad", design.joint_types[j : j + 1])
+    return f"{place}, {motion.min_frequency:.2g} to {motion.max_frequency:.2g} Hz"
 
 
 def _unknown(which: str, uncertainty: Uncertainty) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import EffectCfg
+from pace_actuators.joint_units import units_for
 from pace_optim.excitation import make_excitation
 from pace_optim.problem.forked import parallel_map
 from pace_optim.problem.problem import Problem
@@ -122,12 +123,13 @@ def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
 def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
     choice = told[0].choice
     task = shlex.quote(problem.task)
+    unit = units_for("mrad", [problem.joint_types[j] for each in told for j in each.pair.joints])
     pairs = ", nor ".join(_named(each.pair, problem) for each in told)
     apart = _range([1e3 * each.apart for each in told], "{:.2g}")
     times = _range([each.times for each in told], "{:.0f}")
     return (
         f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
-        f"mrad, {times} times the noise. {command('data_collection')} --task {task} {choice.arguments} "
+        f"{unit}, {times} times the noise. {command('data_collection')} --task {task} {choice.arguments} "
         "--command_only --export_command next.csv"
     )
 

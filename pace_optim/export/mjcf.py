@@ -126,7 +126,7 @@ def _notes_of_joints(drives: IdentifiedDrives) -> list[str]:
     bias = [abs(value) for value in drives.parameters["encoder_bias"].values()]
     delayed = "targets" if drives.delay_mode == "command" else "the controller's torque"
     return [
-        f"encoder bias (up to {max(bias):.3g} rad): the encoder shows q - bias; it is not in the model.",
+        f"encoder bias (up to {max(bias):.3g} rad, of slides m): the encoder shows q - bias; it is not in the model.",
         f"delay of {1e3 * drives.delay_s:.3g} ms of {delayed}: it is not in the model.",
         "gains and torque-speed limits of the drives: there are no actuators in the model but those it had.",
     ]

@@ -115,8 +115,8 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
                 key.qpos = qpos
     most = max(map(abs, shifted.values()))
     notes.append(
-        f"encoder bias (up to {most:.3g} rad): joint positions, targets and keyframes of this model are what the "
-        "encoders show, q - bias (the joints' ref is shifted)."
+        f"encoder bias (up to {most:.3g} rad, of slides m): joint positions, targets and keyframes of this model are "
+        "what the encoders show, q - bias (the joints' ref is shifted)."
     )
     if spec.tendons:
         notes.append("tendons over joints with a bias have lengths of what the encoders show.")

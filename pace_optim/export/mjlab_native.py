@@ -51,7 +51,7 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         '"""For EntityCfg(articulation=ARTICULATION)."""',
         "",
         *["ENCODER_BIAS = {", *bias, "}"],
-        '"""mjlab\'s encoder shows q + these [rad]."""',
+        '"""mjlab\'s encoder shows q + these [rad, of slides m]."""',
     ]
     functions = inspect.getsource(mjlab_native_template).split(_START)[1]
     return "\n".join(body) + "\n" + functions, notes

@@ -49,7 +49,7 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         '"""Step of the identification [s]."""',
         "",
         f"JOINTS = {_table(joints)}",
-        '"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]."""',
+        '"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]; of a slide [kg], [N], [N s/m]."""',
         "",
         f"DRIVES = {_table({joint: _parts(drive) for joint, drive in plain.items()})}",
         '"""Delay [s], control law and clamp, in SI units."""',
@@ -74,8 +74,8 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
     dt, notes = drives.at.physics_dt, whole_steps_note(drives, plain)
     most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
     notes.append(
-        f"encoder bias (up to {most:.3g} rad): in const_effort. Targets are the encoder's, joint positions are true: "
-        "observe q - bias."
+        f"encoder bias (up to {most:.3g} rad, of slides m): in const_effort. Targets are the encoder's, joint "
+        "positions are true: observe q - bias."
     )
     rates = {drive.run_dt for drive in plain.values()}
     if 0.0 in rates:

@@ -130,7 +130,7 @@ def _result(
         times_noise=end.times,
         std_means_nothing=end.is_far,
         warnings=[
-            *far_end(end.times, end.train_rmse, settings.optimizer, run.searched),
+            *far_end(end.times, end.train_rmse, settings.optimizer, run.searched, problem.joint_types),
             *fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure),
             *consistency.sentences,
         ],

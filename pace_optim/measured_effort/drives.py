@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType
 from pace_optim.recording import Recording
 
 from .law import APART, SURE, MeasuredLaw, has_offset, read_law
@@ -81,7 +82,7 @@ def read_drives(
         taken_in.append(taken)
     every = [law for by_recording in laws.values() for law in by_recording.values() if follows(law)]
     bounds, sentence = _delay(every, delay_bounds, delay_mode, control_dt)
-    lines = [line_of_joint(list(by.values()), follows, control_dt, j in slides) for j, by in laws.items()]
+    lines = [line_of_joint(list(by.values()), follows, control_dt, _type(j, slides)) for j, by in laws.items()]
     return MeasuredDrives(
         recordings=tuple(changed),
         laws=laws,
@@ -93,6 +94,10 @@ def read_drives(
         notes=(*lines, *([sentence] if sentence else [])),
         warnings=tuple(warnings.values()),
     )
+
+
+def _type(joint: str, slides: Collection[str]) -> JointType:
+    return "slide" if joint in slides else "hinge"
 
 
 def follows(law: MeasuredLaw) -> bool:
@@ -120,7 +125,7 @@ def _with_facts(
             if value is None:
                 continue
             if apart(value, std, float(values[j])):
-                text = contradiction(law, fact, float(values[j]), value, std, holds, law.joint in slides)
+                text = contradiction(law, fact, float(values[j]), value, std, holds, _type(law.joint, slides))
                 said.append((f"{fact} {law.joint} {values[j]:.3g}", text))
             if not holds:
                 values[j] = value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from pace_actuators.joint_units import in_slide_units
+from pace_actuators.joint_units import JointType, units_for
 
 from .law import MeasuredLaw, has_offset
 
@@ -13,7 +13,7 @@ _UNITS = {"stiffness": "N m/rad", "damping": "N m s/rad", "effort_limit": "N m"}
 
 
 def line_of_joint(
-    laws: Sequence[MeasuredLaw], follows: Callable[[MeasuredLaw], bool], control_dt: float, slides: bool
+    laws: Sequence[MeasuredLaw], follows: Callable[[MeasuredLaw], bool], control_dt: float, joint_type: JointType
 ) -> str:
     """One line on a joint, of all its recordings.
 
@@ -21,7 +21,7 @@ def line_of_joint(
         laws: Of the joint, one for each recording.
         follows: Whether a torque follows a law.
         control_dt: Control step [s].
-        slides: Whether the joint slides.
+        joint_type: Whether the joint turns or slides.
     """
     good = [law for law in laws if follows(law)]
     joint = laws[0].joint
@@ -44,11 +44,11 @@ def line_of_joint(
         f"{joint}: its dof_effort says {', '.join(part for part in parts if part)} "
         f"(R² {r_squared:.4f}, residual {residual:.2g} N m)."
     )
-    return in_slide_units(text) if slides else text
+    return units_for(text, [joint_type])
 
 
 def contradiction(
-    law: MeasuredLaw, fact: str, stated: float, value: float, std: float, holds: bool, slides: bool
+    law: MeasuredLaw, fact: str, stated: float, value: float, std: float, holds: bool, joint_type: JointType
 ) -> str:
     """What is stated, what the torque says, and which of the two counts."""
     error = f" ± {std:.1g}" if std else ""
@@ -58,7 +58,7 @@ def contradiction(
         text += f": what is stated is used. Correct {fact}, or fit with --unknown {fact}."
     else:
         text += ": that is used."
-    return in_slide_units(text) if slides else text
+    return units_for(text, [joint_type])
 
 
 def delay_sentence(

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
@@ -61,6 +62,12 @@ class Problem:
     def joint_names(self) -> tuple[str, ...]:
         """The joints, in order."""
         return tuple(self.env_cfg.sim2real.joint_order)
+
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        """Whether each joint turns or slides."""
+        slides = self.env_cfg.sim2real.slide_joints
+        return tuple("slide" if joint in slides else "hinge" for joint in self.joint_names)
 
     @property
     def physics_dt(self) -> float:
@@ -299,7 +306,8 @@ def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
 def _contradictions(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Limits of the drives that the recordings contradict."""
     limits = of_joints(env, "velocity_limit"), of_joints(env, "effort_limit")
-    return tuple(f"{r.name}: {text}" for r in recordings for text in contradicted_limits(r, *limits))
+    types = env.scene["robot"].joint_types
+    return tuple(f"{r.name}: {text}" for r in recordings for text in contradicted_limits(r, *limits, types))
 
 
 def as_vector(problem: Problem, values: dict) -> torch.Tensor:

@@ -70,7 +70,7 @@ def _conformed(
 ) -> list[Recording]:
     robot = env.scene["robot"]
     limits = robot.data.joint_pos_limits.numpy()
-    known = Robot(joint_names=tuple(robot.joint_names), limits=limits)
+    known = Robot(joint_names=tuple(robot.joint_names), limits=limits, joint_types=robot.joint_types)
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     return [
         conform_recording(
@@ -78,6 +78,7 @@ def _conformed(
             joint_order=known.joint_names,
             control_dt=control_dt,
             joint_pos_limits=limits,
+            joint_types=robot.joint_types,
             load_bodies=robot.body_names,
             accepts_load=sim2real.apply_load is not None,
         )

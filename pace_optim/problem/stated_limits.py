@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.recording import Recording
 
 _BEYOND = 1.1
@@ -13,13 +16,16 @@ _SPAN = 0.02
 """Time over which a speed is taken from positions [s]."""
 
 
-def contradicted_limits(recording: Recording, velocity_limit: ArrayLike, effort_limit: ArrayLike) -> list[str]:
+def contradicted_limits(
+    recording: Recording, velocity_limit: ArrayLike, effort_limit: ArrayLike, joint_types: Sequence[JointType] = ()
+) -> list[str]:
     """Measured speeds and torques beyond what is stated, in words.
 
     Args:
         recording: The recording; its own facts come before what is configured.
         velocity_limit: No-load speed as configured, (n,) [rad/s]; NaN or infinite where there is none.
         effort_limit: Torque limit as configured, (n,) [N m]; NaN or infinite where there is none.
+        joint_types: Whether each joint turns or slides; none: all turn.
     """
     n = recording.num_joints
     span = max(1, round(_SPAN / float(np.median(np.diff(recording.time)))))
@@ -36,8 +42,9 @@ def contradicted_limits(recording: Recording, velocity_limit: ArrayLike, effort_
             values = measured[np.isfinite(measured[:, j]), j]
             largest = float(np.quantile(values, 0.999)) if values.size else 0.0
             if np.isfinite(stated[j]) and largest > _BEYOND * stated[j]:
+                own_unit = units_for(unit, joint_types[j : j + 1])
                 notes.append(
-                    f"the recording contradicts the stated {words}: {name} reaches {largest:.3g} {unit}, {field} is "
-                    f"{stated[j]:.3g} {unit}. Correct {field}."
+                    f"the recording contradicts the stated {words}: {name} reaches {largest:.3g} {own_unit}, {field} "
+                    f"is {stated[j]:.3g} {own_unit}. Correct {field}."
                 )
     return notes

@@ -206,8 +206,8 @@ def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], sou
         sample, joint = np.argwhere(huge)[0]
         name = joint_names[joint] if joint_names else joint
         raise ValueError(
-            f"{source}: {key} is {array[sample, joint]:.3g} at sample {sample}, joint {name}; expected rad (or rad/s), "
-            f"below {_HUGE:g}. Correct the value, or cut the file there."
+            f"{source}: {key} is {array[sample, joint]:.3g} at sample {sample}, joint {name}; expected rad (or rad/s, "
+            f"of a slide m or m/s), below {_HUGE:g}. Correct the value, or cut the file there."
         )
     if finite.all():
         return

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType
+
 from .checks import MIN_SAMPLES
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
@@ -24,6 +26,7 @@ def conform_recording(
     control_dt: float,
     joint_pos_limits: np.ndarray | None = None,
     limit_margin: float = 0.2,
+    joint_types: Sequence[JointType] = (),
     load_bodies: Collection[str] = (),
     accepts_load: bool = False,
 ) -> Recording:
@@ -44,6 +47,7 @@ def conform_recording(
         control_dt: Control step of the simulation [s].
         joint_pos_limits: Lower and upper limit per joint of `joint_order`, (n, 2) [rad]; infinite where none.
         limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops).
+        joint_types: Whether each joint of `joint_order` turns or slides; none: all turn.
         load_bodies: Bodies that `added_mass` may name.
         accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
 
@@ -57,7 +61,7 @@ def conform_recording(
     check_load(recording, load_bodies, accepts_load)
     columns, notes = column_order(recording, joint_order)
     recording = with_columns(recording, columns, tuple(joint_order))
-    notes += check_motion(recording, joint_pos_limits, limit_margin)
+    notes += check_motion(recording, joint_pos_limits, limit_margin, joint_types)
     if recording.command is not None:
         _check_conformed(recording, control_dt)
         return recording

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import TypeVar
 
 import numpy as np
+
+from pace_actuators.joint_units import JointType, all_hinges, units_for
 
 from .data import Recording
 from .keys import COMMAND_SERIES, did_you_mean, listed
 
-_STILL = 2e-3  # [rad]
-_FAR = 0.5  # [rad]
+_STILL = 2e-3  # [rad, of slides m]
+_FAR = 0.5  # [rad, of slides m]
+_T = TypeVar("_T")
 _DEGREES = "The values look like degrees: multiply them by pi/180."
 
 
@@ -56,35 +60,44 @@ def check_load(recording: Recording, load_bodies: Collection[str], accepts_load:
         )
 
 
-def check_motion(recording: Recording, limits: np.ndarray | None, limit_margin: float) -> list[str]:
+def check_motion(
+    recording: Recording, limits: np.ndarray | None, limit_margin: float, joint_types: Sequence[JointType] = ()
+) -> list[str]:
     """Refuse positions that the robot cannot have; return notes on what is odd but possible."""
-    _check_wraps(recording)
+    types = joint_types or all_hinges(recording.num_joints)
+    turns = np.array([each == "hinge" for each in types])
+    _check_wraps(recording, turns)
     notes: list[str] = []
     if limits is not None:
-        notes += _check_limits(recording, np.asarray(limits, dtype=np.float64), limit_margin)
+        notes += _check_limits(recording, np.asarray(limits, dtype=np.float64), limit_margin, types)
     names = recording.joint_names
     position, commanded = recording.dof_pos, recording.has_position_command
     target = np.where(commanded, position[:1] if recording.des_dof_pos is None else recording.des_dof_pos, position[:1])
-    if turning := _those(names, np.abs(position).max(axis=0) > 8.0 * np.pi):
+    if turning := _those(names, turns & (np.abs(position).max(axis=0) > 8.0 * np.pi)):
         notes.append(f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}")
-    if still := _those(names, np.ptp(position, axis=0) < _STILL):
+    still = np.ptp(position, axis=0) < _STILL
+    if any(still):
+        least = units_for(f"{_STILL * 1e3:g} mrad", _those(types, still))
         notes.append(
-            f"{listed(still)}: moves less than {_STILL * 1e3:g} mrad, so its parameters cannot be found from "
-            "this recording."
+            f"{listed(_those(names, still))}: moves less than {least}, so its parameters cannot be found from this "
+            "recording."
         )
-    if uncommanded := _those(names, commanded & _still_commanded(recording) & (np.ptp(position, axis=0) >= _STILL)):
+    if uncommanded := _those(names, commanded & _still_commanded(recording) & ~still):
         notes.append(f"{listed(uncommanded)}: moves although its command never changes.")
-    if far := _those(names, np.abs(position[0] - target[0]) > _FAR):
+    far = np.abs(position[0] - target[0]) > _FAR
+    if any(far):
+        most = units_for(f"{_FAR:g} rad", _those(types, far))
         notes.append(
-            f"{listed(far)}: starts more than {_FAR:g} rad from its target; the first instants are a transient."
+            f"{listed(_those(names, far))}: starts more than {most} from its target; the first instants are a "
+            "transient."
         )
     if recording.torque_enable is not None and not recording.torque_enable.all():
         notes.append(f"The drive is off in {np.mean(~recording.torque_enable):.0%} of the samples.")
     return notes
 
 
-def _check_wraps(recording: Recording) -> None:
-    jump = np.abs(np.diff(recording.dof_pos, axis=0))
+def _check_wraps(recording: Recording, turns: np.ndarray) -> None:
+    jump = np.where(turns, np.abs(np.diff(recording.dof_pos, axis=0)), 0.0)
     wraps = np.argwhere(np.abs(jump - 2.0 * np.pi) < 0.3)
     if len(wraps):
         sample, joint = wraps[0]
@@ -95,7 +108,7 @@ def _check_wraps(recording: Recording) -> None:
         )
 
 
-def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> list[str]:
+def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types: Sequence[JointType]) -> list[str]:
     names, source = recording.joint_names, recording.label
     if limits.shape != (len(names), 2) or np.any(np.isnan(limits)) or np.any(limits[:, 0] > limits[:, 1]):
         raise ValueError(
@@ -111,16 +124,19 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float) -> li
         if key in excess and np.any(excess[key] > allowed):
             joint = int(np.nanargmax(excess[key]))
             values = getattr(recording, key)[:, joint]
+            unit = units_for("rad", [types[joint]])
             cure = "Check the column order, the signs and the zero, or the model's limits."
-            if np.abs(values).max() > 2.0 * np.pi:
+            if types[joint] == "hinge" and np.abs(values).max() > 2.0 * np.pi:
                 cure = _DEGREES
             raise ValueError(
-                f"{source}: {key} of {names[joint]} goes from {values.min():.3f} to {values.max():.3f} rad; "
-                f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} rad, the joint's limits (and at "
+                f"{source}: {key} of {names[joint]} goes from {values.min():.3f} to {values.max():.3f} {unit}; "
+                f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} {unit}, the joint's limits (and at "
                 f"most {allowed:.3g} beyond). {cure}"
             )
     if "des_dof_pos" in excess and (beyond := _those(names, excess["des_dof_pos"] > 0.0)):
-        return [f"{listed(beyond)}: commanded beyond the joint limits, by {np.nanmax(excess['des_dof_pos']):.3f} rad."]
+        unit = units_for("rad", [each for each, name in zip(types, names, strict=True) if name in beyond])
+        most = np.nanmax(excess["des_dof_pos"])
+        return [f"{listed(beyond)}: commanded beyond the joint limits, by {most:.3f} {unit}."]
     return []
 
 
@@ -133,5 +149,5 @@ def _still_commanded(recording: Recording) -> np.ndarray:
     return still
 
 
-def _those(names: Sequence[str], where: np.ndarray) -> list[str]:
+def _those(names: Sequence[_T], where: np.ndarray) -> list[_T]:
     return [name for name, flag in zip(names, where, strict=True) if flag]

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from pace_actuators.joint_units import JointType, units_for
+
 _UNITS = ((1e-4, 1e3, "mrad"), (1e-7, 1e6, "µrad"), (0.0, 1e9, "nrad"))
 
 
@@ -14,17 +16,23 @@ def three_figures(value: float) -> str:
     return f"{value:#.3g}".rstrip(".")
 
 
-def angle_unit(values: Iterable[float | None]) -> tuple[float, str]:
-    """A factor and a unit in which the largest of some angles [rad] reads well; mrad unless all are tiny."""
+def position_unit(values: Iterable[float | None], joint_types: Iterable[JointType]) -> tuple[float, str]:
+    """A factor and a unit in which the largest of some positions reads well; mrad or mm unless all are tiny.
+
+    Args:
+        values: Positions or errors of them [rad], of slides [m].
+        joint_types: Of the joints that they belong to.
+    """
     largest = max((abs(value) for value in values if value is not None and np.isfinite(value)), default=1.0)
-    return next((factor, unit) for least, factor, unit in _UNITS if largest >= least)
+    factor, unit = next((factor, unit) for least, factor, unit in _UNITS if largest >= least)
+    return factor, units_for(unit, joint_types)
 
 
-def angle_text(value: float | None) -> str:
-    """An angle [rad] in words: "6.8 mrad"."""
+def position_text(value: float | None, joint_types: Iterable[JointType]) -> str:
+    """A position [rad, of slides m] in words: "6.8 mrad", of joints of both types "6.8 mrad or mm"."""
     if value is None:
         return "–"
-    factor, unit = angle_unit([value])
+    factor, unit = position_unit([value], joint_types)
     return f"{factor * value:.3g} {unit}"
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from pace_actuators.files import write_atomically
-from pace_actuators.joint_units import in_slide_units
 
 from .markup import ENVIRONMENT, Section
 from .run_data import RunData
@@ -51,10 +48,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
         ValueError: If there is no result, or a file is damaged; the message names it.
     """
     run = RunData.load(Path(folder), new)
-    sections = make_sections(run)
-    if all(run.result.joint_type(joint) == "slide" for joint in run.result.joint_names):
-        sections = [replace(s, lead=in_slide_units(s.lead), html=Markup(in_slide_units(s.html))) for s in sections]
-    return render(run, sections).encode()
+    return render(run, make_sections(run)).encode()
 
 
 def check_folder(folder: str | Path, *, anew: str = "") -> None:

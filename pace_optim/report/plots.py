@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from pace_optim.report.number_text import angle_text, angle_unit
+from pace_actuators.joint_units import JointType, all_hinges, units_for
+from pace_optim.report.number_text import position_text, position_unit
 from pace_optim.report.trajectory_errors import held_out_spans, rms
 from pace_optim.run.history import History
 
@@ -24,12 +25,17 @@ _GRID: dict[str, Any] = {"alpha": 0.25, "linewidth": 0.6}
 
 
 def plot_trajectories(
-    best_trajectory: Mapping[str, Any], *, title: str = "", make_figure: Callable[..., Figure] = Figure
+    best_trajectory: Mapping[str, Any],
+    *,
+    joint_types: Sequence[JointType] = (),
+    title: str = "",
+    make_figure: Callable[..., Figure] = Figure,
 ) -> dict[str, Figure]:
     """Draw every joint of every recording: positions above, the error underneath, validation data shaded.
 
     Args:
         best_trajectory: The content of ``best_trajectory.pt``.
+        joint_types: Whether each joint turns or slides; none: all turn.
         title: Written before the recording's name.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
 
@@ -37,6 +43,7 @@ def plot_trajectories(
         One figure per recording and dozen joints, by a name fit for a file.
     """
     names = list(best_trajectory["joint_names"])
+    types = joint_types or all_hinges(len(names))
     parts = [range(i, min(i + _JOINTS_PER_FIGURE, len(names))) for i in range(0, len(names), _JOINTS_PER_FIGURE)]
     figures = {}
     for r, recording in enumerate(best_trajectory["recordings"]):
@@ -45,7 +52,7 @@ def plot_trajectories(
             stem += f"_{p + 1}" if len(parts) > 1 else ""
             stem += f"_recording_{r + 1}" if stem in figures else ""
             heading = " · ".join(text for text in (title, recording["name"]) if text)
-            figures[stem] = _plot_joints(recording, names, joints, heading, make_figure)
+            figures[stem] = _plot_joints(recording, names, types, joints, heading, make_figure)
     return figures
 
 
@@ -56,6 +63,7 @@ def _tight_layout() -> ConstrainedLayoutEngine:
 def _plot_joints(
     recording: Mapping[str, Any],
     names: Sequence[str],
+    types: Sequence[JointType],
     joints: Sequence[int],
     title: str,
     make_figure: Callable[..., Figure],
@@ -65,7 +73,8 @@ def _plot_joints(
     rows = -(-len(joints) // columns)
     figure = make_figure(figsize=(max(9.0, 5.4 * columns), 1.1 + max(3.9, 3.1 * rows)), layout=_tight_layout())
     series = {key: np.asarray(recording[key]) for key in ("time", "des_dof_pos", "dof_pos", "sim_dof_pos", "train")}
-    factor, unit = angle_unit(np.abs(series["sim_dof_pos"] - series["dof_pos"])[:, list(joints)].max(axis=0))
+    largest = np.abs(series["sim_dof_pos"] - series["dof_pos"])[:, list(joints)].max(axis=0)
+    factor, unit = position_unit(largest, ["hinge"])
     outer = figure.add_gridspec(rows, columns)
     for place, j in enumerate(joints):
         inner = outer[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2.6, 1), hspace=0.04)
@@ -73,10 +82,10 @@ def _plot_joints(
         below = figure.add_subplot(inner[1], sharex=above)
         _plot_joint(above, below, series, j, factor)
         above.set_title(names[j], fontsize=10, loc="left")
-        above.set_title(_errors(series, j), fontsize=8, loc="right", color="#5f6368")
-        if place % columns == 0:
-            above.set_ylabel("position [rad]", fontsize=9)
-            below.set_ylabel(f"error [{unit}]", fontsize=9)
+        above.set_title(_errors(series, j, types[j]), fontsize=8, loc="right", color="#5f6368")
+        if place % columns == 0 or types[j] != types[joints[place - 1]]:
+            above.set_ylabel(units_for("position [rad]", [types[j]]), fontsize=9)
+            below.set_ylabel(units_for(f"error [{unit}]", [types[j]]), fontsize=9)
         if place + columns >= len(joints):
             below.set_xlabel("time [s]", fontsize=9)
     handles: list[Line2D | Patch] = [
@@ -108,18 +117,25 @@ def _plot_joint(above: Axes, below: Axes, series: Mapping[str, np.ndarray], j: i
     above.tick_params(labelbottom=False)
 
 
-def _errors(series: Mapping[str, np.ndarray], j: int) -> str:
+def _errors(series: Mapping[str, np.ndarray], j: int, joint_type: JointType) -> str:
     error = series["sim_dof_pos"][:, j] - series["dof_pos"][:, j]
     train = series["train"].astype(bool)
     parts = (("train", rms(error[train])), ("validation", rms(error[~train])))
-    return ",  ".join(f"{name} {angle_text(value)}" for name, value in parts if value is not None)
+    return ",  ".join(f"{name} {position_text(value, [joint_type])}" for name, value in parts if value is not None)
 
 
-def plot_scores(history: History, *, title: str = "", make_figure: Callable[..., Figure] = Figure) -> Figure:
+def plot_scores(
+    history: History,
+    *,
+    joint_types: Iterable[JointType] = ("hinge",),
+    title: str = "",
+    make_figure: Callable[..., Figure] = Figure,
+) -> Figure:
     """Draw the score over the iterations of search and refinement; the axis above counts simulated steps.
 
     Args:
         history: What happened.
+        joint_types: Of the joints whose errors are in the score.
         title: Above everything.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
     """
@@ -139,7 +155,7 @@ def plot_scores(history: History, *, title: str = "", make_figure: Callable[...,
     else:
         axes.text(0.5, 0.5, "no iteration was recorded", ha="center", va="center", transform=axes.transAxes)
     axes.set_xlabel("iteration (generations of the search, iterations of the refinement)" if refine else "generation")
-    axes.set_ylabel("score [rad²]")
+    axes.set_ylabel(units_for("score [rad²]", joint_types))
     axes.grid(**_GRID)
     axes.spines["right"].set_visible(False)
     figure.suptitle(title, fontsize=11)

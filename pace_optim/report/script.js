@@ -67,8 +67,8 @@
   function makeExplorer(element) {
     const content = read(element), canvas = element.querySelector(".canvas");
     const chosen = (name) => Number(element.querySelector(`[data-choice="${name}"] input:checked`).value);
-    const line = (name, x, y, color, more) => ({
-      type: "scatter", mode: "lines", name, x, y, line: { color, width: 1.5, ...more }, hovertemplate: "%{y:.4f} rad",
+    const line = (name, x, y, color, more, rest) => ({
+      type: "scatter", mode: "lines", name, x, y, line: { color, width: 1.5, ...more }, ...rest,
     });
 
     function draw() {
@@ -78,11 +78,12 @@
         kept[i] = time[sample];
         return kept;
       }, new Float32Array(decode(curve.sample, Uint32Array).length));
+      const shown = { hovertemplate: `%{y:.4f} ${curve.position_unit}` };
       const measured = decode(curve.measured, Float32Array), error = decode(curve.error, Float32Array);
       const data = [
-        line("target", x, decode(curve.target, Float32Array), "var(--target)", { width: 1.2 }),
-        line("measured", x, measured, "var(--measured)", { width: 2 }),
-        line("simulated", x, measured.map((value, i) => value + error[i]), "var(--simulated)", { dash: "5px,2px" }),
+        line("target", x, decode(curve.target, Float32Array), "var(--target)", { width: 1.2 }, shown),
+        line("measured", x, measured, "var(--measured)", { width: 2 }, shown),
+        line("simulated", x, measured.map((value, i) => value + error[i]), "var(--simulated)", { dash: "5px,2px" }, shown),
         {
           ...line("error", x, error.map((value) => value * curve.factor), "var(--simulated)", { width: 1.1 }),
           yaxis: "y2", showlegend: false, hovertemplate: `%{y:.3g} ${curve.unit}`,
@@ -97,7 +98,7 @@
         uirevision: `recording ${chosen("recording")}`,
         hovermode: "x unified", hoversubplots: "axis",
         xaxis: { title: title("time [s]"), anchor: "y2", range: [x[0], x[x.length - 1]] },
-        yaxis: { title: title("position [rad]"), domain: [0.34, 1], uirevision: `joint ${chosen("joint")}` },
+        yaxis: { title: title(`position [${curve.position_unit}]`), domain: [0.34, 1], uirevision: `joint ${chosen("joint")}` },
         yaxis2: {
           title: title(`error [${curve.unit}]`), domain: [0, 0.27], uirevision: `joint ${chosen("joint")}`,
           zerolinecolor: "var(--muted)",

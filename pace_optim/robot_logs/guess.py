@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from pace_actuators.joint_units import JointType
 from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, listed
 
 from .column_map import ColumnMap, Source
@@ -30,6 +31,13 @@ class Robot:
     """In order; () where no robot is known: the log's own names are kept."""
     limits: np.ndarray | None = None
     """Lower and upper limit of each joint, (n, 2) [rad]; infinite where there is none."""
+    joint_types: tuple[JointType, ...] = ()
+    """Whether each joint turns or slides; none where it is not known."""
+
+    def joint_type(self, joint: str) -> JointType:
+        """Whether a joint turns or slides; what is not known turns."""
+        types = dict(zip(self.joint_names, self.joint_types, strict=False))
+        return types.get(joint, "hinge")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,17 +196,18 @@ def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -
 def _with_units(
     picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str]
 ) -> tuple[dict[str, dict[str, Source]], list[str]]:
-    groups: dict[tuple[str, str], dict[str, _Candidate]] = defaultdict(dict)
+    groups: dict[tuple[str, str, JointType], dict[str, _Candidate]] = defaultdict(dict)
     for name, by in picked.items():
         for series, each in by.items():
-            groups[series, each.unit or each.channel.table][name] = each
+            groups[series, each.unit or each.channel.table, robot.joint_type(name)][name] = each
     sources: dict[str, dict[str, Source]] = {name: {} for name in names}
     scaled: dict[str, Channel] = {}
     notes = []
-    for (series, _), group in sorted(groups.items(), key=_order_of_group):
+    for (series, _, joint_type), group in sorted(groups.items(), key=_order_of_group):
         stated = next(iter(group.values())).unit
         channels = {name: each.channel for name, each in group.items()}
-        unit, note = (stated, "") if stated else guessed_unit(series, channels, scaled, robot.limits, names)
+        told = (stated, "") if stated else guessed_unit(series, channels, scaled, robot.limits, names, joint_type)
+        unit, note = told
         notes += [note] if note else []
         if unit in CURRENTS:
             keys = listed(channel.key for channel in channels.values())
@@ -216,8 +225,8 @@ def _with_units(
     return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes
 
 
-def _order_of_group(entry: tuple[tuple[str, str], object]) -> tuple[int, str]:
-    return JOINT_SERIES.index(entry[0][0]), entry[0][1]
+def _order_of_group(entry: tuple[tuple[str, str, str], object]) -> tuple[int, str, str]:
+    return JOINT_SERIES.index(entry[0][0]), *entry[0][1:]
 
 
 def _effort_as_command(sources: dict[str, dict[str, Source]], notes: list[str]) -> None:

@@ -93,6 +93,11 @@ class FitResult(DriveResult):
         """Whether a joint turns or slides."""
         return "slide" if self.unit_of("encoder_bias", joint) == "m" else "hinge"
 
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        """Whether each joint turns or slides."""
+        return tuple(self.joint_type(joint) for joint in self.joint_names)
+
 
 def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[str, ...]) -> dict[str, float]:
     """Root mean square error of each joint and of all, over a (K, R) part of the samples [rad]; empty if none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pace_actuators.drive_result import ALL
-from pace_actuators.joint_units import JOINT_TYPES, JointType, in_slide_units, unit_for
+from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
 from pace_optim.run.result import FitResult
 
 
@@ -15,7 +15,6 @@ def summary(result: FitResult) -> str:
     for joint_type in JOINT_TYPES:
         joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
         lines += _table(result, names, joints, joint_type, width)
-    whole = in_slide_units if all(result.joint_type(joint) == "slide" for joint in result.joint_names) else str
     for name, values in result.parameters.items():
         if set(values) == {ALL}:
             text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
@@ -26,13 +25,13 @@ def summary(result: FitResult) -> str:
         step = f"{1e3 * result.physics_dt:g} ms"
         lines.append(f"±: one standard deviation, of noise and of the error of the physics step of {step} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
-    lines.append(whole(error))
+    lines.append(units_for(error, result.joint_types))
     lines.append(
         f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s; "
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
-    lines += [f"note: {whole(note)}" for note in result.notes]
-    lines += [f"warning: {whole(warning)}" for warning in result.warnings]
+    lines += [f"note: {note}" for note in result.notes]
+    lines += [f"warning: {warning}" for warning in result.warnings]
     return "\n".join(lines)
 
 
@@ -43,7 +42,8 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     names = [name for name in names if set(joints) & set(result.parameters[name])]
     unit = {name: next(result.unit_of(name, j) for j in joints if j in result.parameters[name]) for name in names}
     columns = [f"{name} [{unit[name]}]".rjust(26) for name in names]
-    lines = ["  ".join(["joint".ljust(width), *columns, unit_for("train / validation [mrad]", joint_type).rjust(26)])]
+    head = units_for("train / validation [mrad]", [joint_type])
+    lines = ["  ".join(["joint".ljust(width), *columns, head.rjust(26)])]
     for joint in joints:
         cells = [_value(result, name, joint).rjust(26) for name in names]
         lines.append("  ".join([joint.ljust(width), *cells, errors_of(result, joint).rjust(26)]))

@@ -13,6 +13,7 @@ import torch
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
 from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -36,6 +37,9 @@ class TrainingReplay:
     joint_names: tuple[str, ...]
     """The joints, in order."""
 
+    joint_types: tuple[JointType, ...]
+    """Whether each of them turns or slides."""
+
     control_dt: float
     """Control step of the training environment [s]."""
 
@@ -56,16 +60,17 @@ class TrainingReplay:
 
     def __str__(self) -> str:
         """A table: one line per joint."""
-        width = max(len(name) for name in (*self.joint_names, "joint"))
+        width = max(len(name) + len(" [mrad]") for name in (*self.joint_names, "joint"))
         parts = [part for part in ("train", "validation") if self.replayed.get(part)]
         head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>9}" for part in parts)
-        lines = [f"{'RMSE [mrad]':<{width}}{head}"]
-        for name in (*self.joint_names, ALL):
+        lines = [f"{'RMSE ' + units_for('[mrad]', self.joint_types):<{width}}{head}"]
+        labels = [joint_label(*each, self.joint_types) for each in zip(self.joint_names, self.joint_types, strict=True)]
+        for name, label in zip((*self.joint_names, ALL), (*labels, ALL), strict=True):
             cells = ""
             for part in parts:
                 fitted, here = self.fitted[part][name], self.replayed[part][name]
                 cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f}{100 * (here / fitted - 1):>+8.2f}%"
-            lines.append(f"{name:<{width}}{cells}")
+            lines.append(f"{label:<{width}}{cells}")
         lines.append(
             f"control steps: {1e3 * self.fitted_control_dt:g} ms in the fit, {1e3 * self.control_dt:g} ms here"
         )
@@ -112,6 +117,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     residuals = Residuals(error=error[None] * where[None, :, :, None], where=where, step=step)
     return TrainingReplay(
         joint_names=tuple(result.joint_names),
+        joint_types=result.joint_types,
         control_dt=control_dt,
         fitted_control_dt=IdentifiedDrives.load(folder).at.control_dt,
         fitted=result.rmse,

@@ -37,7 +37,7 @@ class ProgressLine:
             phase: What is going on.
             done: Iterations so far in this phase.
             total: Most iterations in this phase.
-            best: Best score so far [rad²].
+            best: Best score so far [rad², of slides m²].
             spread: Widest standard deviation of the search, normalised; ``None`` when there is none.
             steps: Simulated steps so far.
         """
@@ -50,7 +50,7 @@ class ProgressLine:
         left = seconds / max(1, done) * (total - done)
         at_most = f"{left:.0f} s" if left < 600 else f"{left / 60:.0f} min"
         text = (
-            f"{phase} [{'#' * filled}{'.' * (20 - filled)}] {done}/{total}  best {best:.3e} rad²"
+            f"{phase} [{'#' * filled}{'.' * (20 - filled)}] {done}/{total}  best {best:.3e}"
             + ("" if spread is None else f"  spread {spread:.2g}")
             + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s  {elapsed:.0f} s, at most {at_most} left"
         )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.problem.problem import Problem
 from pace_optim.recording.noise import noise_floor
 from pace_optim.terminal.cli import command
@@ -28,7 +31,9 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
     return rmse / noise if rmse and noise > 0 else None
 
 
-def far_end(times: float | None, rmse: float, optimizer: str, searched: bool) -> list[str]:
+def far_end(
+    times: float | None, rmse: float, optimizer: str, searched: bool, joint_types: Sequence[JointType] = ()
+) -> list[str]:
     """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
 
     Args:
@@ -36,13 +41,15 @@ def far_end(times: float | None, rmse: float, optimizer: str, searched: bool) ->
         rmse: Its error [rad].
         optimizer: What ended there.
         searched: Whether other starts were tried, and none ended lower.
+        joint_types: Whether each joint turns or slides; none: all turn.
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
     others = " Other starts ended no lower." if searched else ""
     search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
+    unit = units_for("mrad", joint_types)
     return [
-        f"The error of {1e3 * rmse:.3g} mrad is {times:,.0f} times the measurement noise: physics is missing, a fact "
+        f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: physics is missing, a fact "
         f"of the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
         f"{command('diagnose')} looks for what is missing."
     ]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.joint_units import JointType, units_for
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -46,7 +47,7 @@ def fit_warnings(
     return [
         *problem.contradictions,
         *problem.measured.warnings,
-        *_overfit(rmse, change),
+        *_overfit(rmse, change, problem.joint_types),
         *_sampled_commands(problem, rmse, uncertainty),
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),
@@ -108,7 +109,7 @@ def _of(keys: Sequence[str]) -> str:
     return f" of {len(keys)} joints ({', '.join(keys[:_NAMED])}, …)"
 
 
-def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequence[JointType]) -> list[str]:
     """Whether the error on other data is larger than the fit and the physics step (its change [rad]) make it."""
     train, validation = rmse["train"].get(ALL), rmse["validation"].get(ALL)
     if not train or not validation or validation < _NOTHING:
@@ -116,9 +117,10 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float) -> list[str]:
     of_the_step = change if change <= _OF_THE_STEP[1] * validation else 0.0
     if validation <= math.hypot(_OVERFIT_RATIO * train, of_the_step):
         return []
+    unit = units_for("mrad", joint_types)
     return [
-        f"The error on data kept for validation ({1e3 * validation:.3g} mrad) is {validation / train:.1f} times "
-        f"that on the training data ({1e3 * train:.3g} mrad): the fit does not carry over."
+        f"The error on data kept for validation ({1e3 * validation:.3g} {unit}) is {validation / train:.1f} times "
+        f"that on the training data ({1e3 * train:.3g} {unit}): the fit does not carry over."
     ]
 
 
@@ -153,9 +155,10 @@ def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: fl
     least, most = _OF_THE_STEP
     if not left or not least * left <= change <= most * left:
         return []
+    unit = units_for("mrad", problem.joint_types)
     return [
-        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} mrad, "
-        f"and the error is {1e3 * left:.3g} mrad: part of it may come from the step. Fit with "
+        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} {unit}, "
+        f"and the error is {1e3 * left:.3g} {unit}: part of it may come from the step. Fit with "
         f"--physics_dt {problem.physics_dt / 2:.12g}."
     ]
 

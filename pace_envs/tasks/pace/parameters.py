@@ -13,7 +13,7 @@ import torch
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
-from pace_actuators.joint_units import JointType, unit_for
+from pace_actuators.joint_units import JointType, units_for
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def _type(joint: str, cfg: PaceCfg) -> JointType:
 
 def _units(unit: str, joints: Sequence[str], cfg: PaceCfg) -> tuple[str, ...]:
     """A hinge's unit for each of some joints."""
-    return tuple(unit_for(unit, _type(joint, cfg)) for joint in joints)
+    return tuple(units_for(unit, [_type(joint, cfg)]) for joint in joints)
 
 
 def _apply_effect(

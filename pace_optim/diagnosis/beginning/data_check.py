@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
+from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -58,7 +59,7 @@ def check_data(
             step leaves comes from the step: recordings of a simulation are such.
         cfg: What is at the floor.
     """
-    data, names = problem.dataset, problem.joint_names
+    data, names, types = problem.dataset, problem.joint_names, problem.joint_types
     squares, steps = [], {}
     for recording in data.recordings:
         dt = float(np.median(np.diff(recording.time)))
@@ -70,13 +71,14 @@ def check_data(
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
     numerical = step_error(problem, whole_vector(problem, base.physical), data.validation)
     sentences = [
-        f"Measurement noise: {_span(1e3 * noise)}; halving "
+        f"Measurement noise: {_by_type(noise, types, _span)}; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
-        f"{1e3 * float(numerical.max()):.2g} mrad.",
+        f"{_by_type(numerical, types, _largest)}.",
     ]
     if steps:
         coarse = max(steps, key=lambda name: steps[name])
-        sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} mrad ({coarse}).")
+        unit = units_for("mrad", [types[names.index(coarse)]])
+        sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} {unit} ({coarse}).")
     loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
     gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
     sentences.append(
@@ -107,10 +109,19 @@ def check_data(
     )
 
 
-def _span(values: torch.Tensor) -> str:
-    """Values of all joints [mrad], or the only one."""
+def _by_type(values: torch.Tensor, types: Sequence[JointType], say: Callable[[torch.Tensor, str], str]) -> str:
+    """Values of all joints [rad, of slides m], those that turn and those that slide each for themselves."""
+    own = {kind: torch.tensor([each == kind for each in types]) for kind in JOINT_TYPES if kind in types}
+    return " and ".join(say(1e3 * values[where], units_for("mrad", [kind])) for kind, where in own.items())
+
+
+def _span(values: torch.Tensor, unit: str) -> str:
     lowest, highest = f"{float(values.min()):.2g}", f"{float(values.max()):.2g}"
-    return f"{lowest} mrad" if lowest == highest else f"{lowest} to {highest} mrad by joint"
+    return f"{lowest} {unit}" if lowest == highest else f"{lowest} to {highest} {unit} by joint"
+
+
+def _largest(values: torch.Tensor, unit: str) -> str:
+    return f"{float(values.max()):.2g} {unit}"
 
 
 def _key(*values: object) -> str:

@@ -13,6 +13,7 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_actuators.files import json_text
+from pace_actuators.joint_units import units_for
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
@@ -80,7 +81,9 @@ def told(
         paying=found.paying,
         shares={effect.name: share for effect, share in found.shares.items()},
         free_form=found.free_form,
-        ranking=ranking(found.outcome, problem.joint_names, found.verdict, list(found.shares)),
+        ranking=ranking(
+            found.outcome, problem.joint_names, found.verdict, list(found.shares), joint_types=problem.joint_types
+        ),
         sizes=sizes(fits, found.outcome, problem.joint_names),
         likes=likes(found.outcome),
         joints=by_joint(found, problem),
@@ -91,7 +94,13 @@ def told(
         tried=[effect.name for effect in candidates],
         physics_dt=problem.physics_dt,
         ladder=ladder(found),
-        error_map=error_map(found.curves, problem.joint_names, found.outcome.base_errors, cfg=cfg.verdict),
+        error_map=error_map(
+            found.curves,
+            problem.joint_names,
+            found.outcome.base_errors,
+            joint_types=problem.joint_types,
+            cfg=cfg.verdict,
+        ),
         cfg=json.loads(json_text(asdict(cfg))),
     )
 
@@ -116,34 +125,36 @@ def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     if not math.isclose(run.physics_dt, problem.physics_dt):
         ways.append(f"the physics step is {1e3 * problem.physics_dt:g} instead of {1e3 * run.physics_dt:g} ms")
     ways.append("each joint is simulated alone with a delay of its own, in blocks of up to one second")
+    unit = units_for("mrad", problem.joint_types)
     return [
-        f"The run's own validation error of the base model is {1e3 * own:.3g} mrad, here it is {1e3 * here:.3g} mrad: "
-        f"{', and '.join(ways)}."
+        f"The run's own validation error of the base model is {1e3 * own:.3g} {unit}, here it is "
+        f"{1e3 * here:.3g} {unit}: {', and '.join(ways)}."
     ]
 
 
 def summary_of(found: Findings, problem: Problem) -> str:
     """The verdict in a sentence or two."""
+    unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
     after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
     about = (found.outcome, problem.joint_names, found.data.floor)
     if found.verdict == "nothing_missing":
         return (
-            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} mrad, the "
-            f"floor of noise and numerics {floor:.3g} mrad."
+            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} {unit}, the "
+            f"floor of noise and numerics {floor:.3g} {unit}."
         )
     if found.verdict == "unknown":
         text = (
             f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
-            f"mrad, the floor {floor:.3g} mrad, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
+            f"{unit}, the floor {floor:.3g} {unit}, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
             "what lies between."
         )
         return " ".join([text, *proxies(*about), *varying(*about)])
     all_of_it = "all of it" if found.free_form else "it"
     summary = (
-        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} mrad "
-        f"(floor {floor:.3g} mrad); it explains {100 * found.explained:.0f} % of what lies above the floor."
+        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} {unit} "
+        f"(floor {floor:.3g} {unit}); it explains {100 * found.explained:.0f} % of what lies above the floor."
     )
     if after > found.outcome.cfg.judging.far * floor and not found.free_form:
         summary += " Something else is missing too, which no known effect explains."
@@ -196,6 +207,7 @@ def by_joint(found: Findings, problem: Problem) -> dict[str, dict[str, Any]]:
     outcome, model = found.outcome, found.outcome.final.model
     return {
         name: {
+            "type": problem.joint_types[j],
             "validation_rmse_before": float(outcome.base_errors.mse[j].sqrt()),
             "validation_rmse_after": float(outcome.final_errors.mse[j].sqrt()),
             "floor": float(found.data.floor[j]),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import checked, read_json, write_json
+from pace_actuators.joint_units import JointType
 
 VERSION = 1
 FILE = "diagnosis.json"
@@ -63,6 +65,10 @@ class Diagnosis:
     cfg: dict[str, Any] = field(default_factory=dict)
     """The numbers that it was made with."""
     wall_time_s: float = 0.0
+
+    def joint_types(self, joints: Iterable[str]) -> list[JointType]:
+        """Whether these joints turn or slide; files of earlier versions do not say it."""
+        return [self.joints.get(joint, {}).get("type", "hinge") for joint in joints]
 
     def save(self, folder: str | Path) -> Path:
         """Write ``diagnosis.json`` to a run's folder, atomically."""

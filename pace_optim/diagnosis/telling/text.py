@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from pace_actuators.joint_units import units_for
 from pace_optim.diagnosis.telling.result import Diagnosis
 from pace_optim.report.sizes import size_text
 
@@ -21,11 +22,13 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
         lines.append(f"At its bound: {', '.join(stuck)}.")
     lines += [f"{effect} cannot be told from {_listed(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in diagnosis.advice]
+    names = list(diagnosis.joints)
     for entry in diagnosis.ranking[:_EFFECTS]:
         before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
         mark = "added" if entry["added"] else ("pays" if entry["significant"] else "does not pay")
-        where = f"on {len(entry['joints'])} of {len(diagnosis.joints)} joints" if len(diagnosis.joints) > 1 else ""
-        lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} mrad  {mark:13s}  {where}".rstrip())
+        unit = units_for("mrad", diagnosis.joint_types(entry["joints"]))
+        where = f"on {len(entry['joints'])} of {len(names)} joints" if len(names) > 1 else ""
+        lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} {unit}  {mark:13s}  {where}".rstrip())
     return lines + [f"- {sentence}" for sentence in diagnosis.data]
 
 

@@ -10,6 +10,7 @@ import torch
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
@@ -119,6 +120,7 @@ def error_map(
     joint_names: Sequence[str],
     base_errors: BlockErrors,
     *,
+    joint_types: Sequence[JointType] = (),
     cfg: VerdictCfg = DEFAULT.verdict,
 ) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
@@ -127,6 +129,7 @@ def error_map(
         curves: What was fitted.
         joint_names: The joints.
         base_errors: Of the base model, as everything else in the diagnosis tells them.
+        joint_types: Whether each joint turns or slides; none: all turn.
         cfg: What part explained is worth a word.
     """
     if curves is None:
@@ -136,15 +139,16 @@ def error_map(
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
         before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
+        types, told = joint_types[j : j + 1], part >= 1 - cfg.nearly_all
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,
-            "best_label": f"{effect.variable} [{effect.parameters[-1].unit}]",
+            "best_label": units_for(f"{effect.variable} [{effect.parameters[-1].unit}]", types),
             "kind": "friction" if effect.resists else "missing torque",
             "validation_rmse_before": before,
             "validation_rmse_after": after,
-            "sentence": _sentence(effect, part, 1e3 * before, 1e3 * after) if part >= 1 - cfg.nearly_all else _NONE,
-            "curve": _curve(curves.models[k], effect, j) if part >= 1 - cfg.nearly_all else None,
+            "sentence": units_for(_sentence(effect, part, 1e3 * before, 1e3 * after), types) if told else _NONE,
+            "curve": _curve(curves.models[k], effect, j) if told else None,
         }
     return joints
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect
+from pace_actuators.joint_units import JointType, all_hinges, units_for
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.comparison import least_ratio
 from pace_optim.diagnosis.search.state import Outcome
@@ -119,7 +120,12 @@ def likes(outcome: Outcome) -> dict[str, list[str]]:
 
 
 def ranking(
-    outcome: Outcome, joint_names: Sequence[str], decision: str = "effect", order: Sequence[type[Effect]] = ()
+    outcome: Outcome,
+    joint_names: Sequence[str],
+    decision: str = "effect",
+    order: Sequence[type[Effect]] = (),
+    *,
+    joint_types: Sequence[JointType] = (),
 ) -> list[dict[str, Any]]:
     """Every effect that was refitted, those that the model has in the end first.
 
@@ -130,7 +136,9 @@ def ranking(
         joint_names: The joints.
         decision: The verdict; unless it is ``effect``, nothing counts as added.
         order: Which of those added comes first; none goes round by round.
+        joint_types: Whether each joint turns or slides; none: all turn.
     """
+    types = joint_types or all_hinges(len(joint_names))
     places = {effect.name: place for place, effect in enumerate(order)}
     model = outcome.final.model
     entries: list[tuple[tuple, dict[str, Any]]] = []
@@ -142,7 +150,7 @@ def ranking(
                 "effect": effect.name,
                 "round": depth + 1,
                 "added": bool(added) and decision == "effect",
-                **_told(this, effect, added, joint_names, least_ratio(depth == 0, cfg=outcome.cfg.judging)),
+                **_told(this, effect, added, joint_names, types, least_ratio(depth == 0, cfg=outcome.cfg.judging)),
             }
             is_best = any(own and own[0].effect is effect for own in this.trials)
             ratio = entry["validation_rmse_before"] / max(entry["validation_rmse_after"], 1e-12)
@@ -152,7 +160,12 @@ def ranking(
 
 
 def _told(
-    this: Round, effect: type[Effect], added: Sequence[int], joint_names: Sequence[str], least: float
+    this: Round,
+    effect: type[Effect],
+    added: Sequence[int],
+    joint_names: Sequence[str],
+    types: Sequence[JointType],
+    least: float,
 ) -> dict[str, Any]:
     """What a round tells of an effect: on the joints that have it in the end, or else where it counts, or anywhere."""
     own = [t for trials in this.trials for t in trials if t.effect is effect]
@@ -167,14 +180,14 @@ def _told(
         "validation_rmse_before": _rms(t.mse_before for t in shown),
         "validation_rmse_after": _rms(t.mse_after for t in shown),
         "significant": bool(good),
-        "evidence": _evidence(shown, effect, least),
+        "evidence": _evidence(shown, effect, least, units_for("mrad", [types[t.joint] for t in shown])),
         "confounded_with": sorted(confounded),
         "screen_score": max(t.screen_score for t in own),
         "values": {joint_names[t.joint]: t.values for t in shown},
     }
 
 
-def _evidence(trials: Sequence[Trial], effect: type[Effect], least: float) -> str:
+def _evidence(trials: Sequence[Trial], effect: type[Effect], least: float, unit: str) -> str:
     before, after = 1e3 * _rms(t.mse_before for t in trials), 1e3 * _rms(t.mse_after for t in trials)
     strongest = max(trials, key=lambda t: t.ratio)
     blocks = f"t = {strongest.t:.1f} over blocks of up to one second"
@@ -185,7 +198,7 @@ def _evidence(trials: Sequence[Trial], effect: type[Effect], least: float) -> st
         little = f", less than the {least:g} times that count" if before < least * after else ""
         why = little or f", too unevenly to count ({blocks})"
     return (
-        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} mrad with it{why}. "
+        f"On recordings not used for fitting the error {verb} from {before:.3g} to {after:.3g} {unit} with it{why}. "
         f"Sign: {effect.looks}."
     )
 

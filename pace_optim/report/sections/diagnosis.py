@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from markupsafe import Markup
 
+from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_optim.report.number_text import three_figures
 from pace_optim.report.sizes import size_text
 
@@ -17,8 +19,8 @@ from .verdict import callout
 
 _SHOWN = 10
 """Effects in the chart, at most."""
-_FACTOR, _UNIT = 1e3, "mrad"
-"""Of all errors in the section, as its sentences have them."""
+_FACTOR = 1e3
+"""Of all errors in the section, as its sentences have them: in mrad, of slides mm."""
 _COMMAND = re.compile(r"(?=\b(?:python )?scripts/\w+\.py |\bpace [a-z]+(?:-[a-z]+)? --)")
 
 
@@ -43,6 +45,16 @@ def _floor(content: dict[str, Any]) -> float:
     """Of all joints [rad]."""
     floors = [joint["floor"] for joint in content["joints"].values()]
     return (sum(floor**2 for floor in floors) / max(1, len(floors))) ** 0.5
+
+
+def _types(content: dict[str, Any], joints: Iterable[str]) -> list[JointType]:
+    """Whether joints turn or slide; files of earlier versions do not say it."""
+    return [content["joints"].get(joint, {}).get("type", "hinge") for joint in joints]
+
+
+def _unit(content: dict[str, Any]) -> str:
+    """Of the errors of all joints."""
+    return units_for("mrad", _types(content, content["joints"]))
 
 
 def _sizes(content: dict[str, Any]) -> Markup:
@@ -70,7 +82,7 @@ def _ladder(content: dict[str, Any]) -> Markup:
     if not steps:
         return Markup("")
     floor = _floor(content)
-    factor, unit = _FACTOR, _UNIT
+    factor, unit = _FACTOR, _unit(content)
     rows, before = [], None
     for step in steps:
         error = step["validation_rmse"]
@@ -90,7 +102,7 @@ def _ranking(content: dict[str, Any]) -> Markup:
     )
     if not entries:
         return _titled("Effects", html("<p>No effect was worth a refit.</p>") + tried)
-    factor, unit = _FACTOR, _UNIT
+    factor, unit = _FACTOR, _unit(content)
     chart = _chart(entries[:_SHOWN], _floor(content), factor, unit)
     about = "refitted one at a time, judged on recordings that were not fitted"
     return _titled("Effects", chart + _evidence(entries, factor, unit) + tried, about)
@@ -162,19 +174,19 @@ def _few(names: list[str]) -> str:
 
 def _joints(content: dict[str, Any]) -> Markup:
     joints = content["joints"]
-    factor, unit = _FACTOR, _UNIT
+    factor, types = _FACTOR, _types(content, joints)
     rows = [
         [
-            bold(name),
+            bold(joint_label(name, own, types)),
             *(
                 three_figures(factor * joint[key])
                 for key in ("validation_rmse_before", "validation_rmse_after", "floor")
             ),
             ", ".join(joint["effects"]) or "–",
         ]
-        for name, joint in joints.items()
+        for (name, joint), own in zip(joints.items(), types, strict=True)
     ]
-    return _titled("Joint by joint", table(["joint", f"before [{unit}]", "after", "floor", "effects"], rows))
+    return _titled("Joint by joint", table(["joint", f"before [{_unit(content)}]", "after", "floor", "effects"], rows))
 
 
 def _error_map(content: dict[str, Any]) -> Markup:
@@ -193,10 +205,10 @@ def _error_map(content: dict[str, Any]) -> Markup:
         "on top of the base model"
     )
     shown = table(["joint", *(in_words(curve) for curve in curves)], rows)
-    return _titled("What carries the error", said + _curve(joints) + shown, about)
+    return _titled("What carries the error", said + _curve(content, joints) + shown, about)
 
 
-def _curve(joints: dict[str, dict[str, Any]]) -> Markup:
+def _curve(content: dict[str, Any], joints: dict[str, dict[str, Any]]) -> Markup:
     """The curve that takes most away of the squared error."""
     squares = {
         name: joint["validation_rmse_before"] ** 2 - joint["validation_rmse_after"] ** 2
@@ -206,7 +218,7 @@ def _curve(joints: dict[str, dict[str, Any]]) -> Markup:
     if not squares:
         return Markup("")
     worst = max(squares, key=squares.__getitem__)
-    best = joints[worst]
+    best, unit = joints[worst], units_for("N m", _types(content, [worst]))
     trace = {
         "type": "scatter",
         "mode": "lines+markers",
@@ -214,11 +226,11 @@ def _curve(joints: dict[str, dict[str, Any]]) -> Markup:
         "x": best["curve"]["at"],
         "y": best["curve"]["torque"],
         "line": {"color": "var(--simulated)", "width": 2},
-        "hovertemplate": "%{x:.3g}: %{y:.3g} N m<extra></extra>",
+        "hovertemplate": f"%{{x:.3g}}: %{{y:.3g}} {unit}<extra></extra>",
     }
     layout = {
         "xaxis": {"title": {"text": best["best_label"]}},
-        "yaxis": {"title": {"text": f"{best['kind']} of {worst} [N m]"}},
+        "yaxis": {"title": {"text": f"{best['kind']} of {worst} [{unit}]"}},
         "showlegend": False,
     }
     return figure("error-map", [trace], layout, height=300)

@@ -6,11 +6,12 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pace_optim.report.number_text import angle_unit, three_figures
+from pace_actuators.joint_units import joint_label, units_for
+from pace_optim.report.number_text import position_unit, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, table
 from ..run_data import RunData
-from .failure_figures import FIGURES
+from .failure_figures import FIGURES, types_of
 
 
 def failure(run: RunData) -> Section | None:
@@ -78,13 +79,15 @@ def _places(content: dict[str, Any]) -> Markup:
 def _by_joint(content: dict[str, Any]) -> Markup:
     parts = [part for part in ("train", "validation") if part in content["rmse"]]
     joints = content["joints"]
-    factor, unit = angle_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts])
+    types = [own for joint in joints.values() for own in types_of(joint)]
+    factor, unit = position_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts], ["hinge"])
     rows = []
-    for name, joint in joints.items():
+    for (name, joint), own in zip(joints.items(), types, strict=True):
         share = 100 * joint["share_above_floor"]
+        label = joint_label(name, own, types, unit)
         rows.append(
             [
-                html('<a href="#failure" data-joint="{{ name }}"><b>{{ name }}</b></a>', name=name),
+                html('<a href="#failure" data-joint="{{ name }}"><b>{{ label }}</b></a>', name=name, label=label),
                 *(three_figures(factor * joint["rmse"][part]) for part in parts),
                 three_figures(factor * joint["noise_floor"]),
                 html(
@@ -94,6 +97,6 @@ def _by_joint(content: dict[str, Any]) -> Markup:
                 joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} "),
             ]
         )
-    words = {"train": "training", "validation": "validation"}
+    unit, words = units_for(unit, types), {"train": "training", "validation": "validation"}
     head = ["joint", *(f"{words[part]} [{unit}]" for part in parts), f"noise [{unit}]", "error² above noise", "where"]
     return table(head, rows, "by-joint")

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from pace_optim.report.number_text import angle_text, angle_unit, short_duration
+from pace_actuators.joint_units import JointType, units_for
+from pace_optim.report.number_text import position_text, position_unit, short_duration
 
 _PANELS = ("velocity", "since_reversal", "position", "load", "acceleration", "time")
 _MEASURED, _MODEL, _NOISE = "var(--measured)", "var(--simulated)", "var(--muted)"
@@ -32,6 +33,11 @@ def _line(name: str, color: str, **more: Any) -> dict[str, Any]:
     return {"type": "scatter", "mode": "lines", "name": name, "line": line} | more
 
 
+def types_of(joint: dict[str, Any]) -> list[JointType]:
+    """Whether the joint of comparison.json turns or slides; files of earlier versions do not say it."""
+    return [joint.get("type", "hinge")]
+
+
 def _numbers(values: Sequence[float | None], factor: float = 1.0) -> list[float | None]:
     return [None if value is None else float(f"{factor * value:.4g}") for value in values]
 
@@ -46,9 +52,11 @@ def _title(text: str) -> dict[str, Any]:
 def _over_time(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, Any]:
     one = joint["recordings"][r]
     curve, floor = one["over_time"], one["noise_floor"]
-    factor, unit = angle_unit([*curve["low"], *curve["high"]])
+    factor, unit = position_unit([*curve["low"], *curve["high"]], types_of(joint))
     words = {"train": "training", "validation": "validation"}
-    errors = ", ".join(f"{angle_text(value)} in {words[part]}" for part, value in one["rmse"].items())
+    errors = ", ".join(
+        f"{position_text(value, types_of(joint))} in {words[part]}" for part, value in one["rmse"].items()
+    )
     source = {"repetitions": "from repetitions", "lattice": "the encoder's steps"}.get(one["noise_source"], "estimated")
     time = _numbers(curve["time"])
     band = {"type": "rect", "xref": "paper", "x0": 0, "x1": 1, "line": {"width": 0}, "layer": "below"}
@@ -58,8 +66,8 @@ def _over_time(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str
         for a, b in facts["held_out"]
     ]
     return {
-        "text": f"Error {errors}; noise {angle_text(floor)} ({source}), so {100 * one['share_above_floor']:.0f} % of "
-        "the squared error is above it. Grey: ±2 σ of the noise"
+        "text": f"Error {errors}; noise {position_text(floor, types_of(joint))} ({source}), so "
+        f"{100 * one['share_above_floor']:.0f} % of the squared error is above it. Grey: ±2 σ of the noise"
         + ("; shaded: kept for validation." if shapes[1:] else "."),
         "traces": [{"x": time, "y": _numbers(curve[key], factor)} for key in ("low", "high")],
         "layout": {"yaxis": _title(f"error [{unit}]"), "shapes": shapes},
@@ -148,7 +156,7 @@ def _spectrum(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     bands = joint["recordings"][r]["where"]["frequency"]
     edges = bands["edges"]
     centre = _numbers([(low * high) ** 0.5 if low > 0 else high / 1.26 for low, high in pairwise(edges)])
-    factor, unit = angle_unit(bands["rms"])
+    factor, unit = position_unit(bands["rms"], types_of(joint))
     text = "Nothing is above the noise."
     if bands["most"] is not None:
         text = f"{100 * bands['most_share']:.0f} % of what is above the noise lies {bands['most']}."
@@ -207,20 +215,26 @@ def _loops(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
         return {"text": "The joint hardly moves.", "traces": [{"x": [], "y": []}] * 4, "layout": {}}
     position = _numbers(content["position"])
     offsets = [v for of in ("measured", "model") for way in ("up", "down") for v in content[of][way]]
-    factor, unit = angle_unit(offsets)
-    factor_e, unit_e = angle_unit([*content["error"]["up"], *content["error"]["down"]])
+    factor, unit = position_unit(offsets, types_of(joint))
+    factor_e, unit_e = position_unit([*content["error"]["up"], *content["error"]["down"]], types_of(joint))
     traces = []
     for of in ("measured", "model"):
         loop = [*content[of]["up"], *reversed(content[of]["down"]), content[of]["up"][0]]
         traces.append({"x": [*position, *reversed(position), position[0]], "y": _numbers(loop, factor)})
     for way in ("up", "down"):
         traces.append({"x": position, "y": _numbers(content["error"][way], factor_e)})
-    widths = [angle_text(content[of]["half_width"]) for of in ("measured", "model")]
+    across = units_for("rad", types_of(joint))
+    widths = [position_text(content[of]["half_width"], types_of(joint)) for of in ("measured", "model")]
     return {
         "text": f"Friction opens the loop: half its width is {widths[0]} measured and {widths[1]} in the model. What "
         "leans is gravity, a spring or a gain. Means over the recording, standstill left out.",
         "traces": traces,
-        "layout": {"yaxis": _title(f"target − position [{unit}]"), "yaxis2": _title(f"error [{unit_e}]")},
+        "layout": {
+            "xaxis": _title(f"position [{across}]"),
+            "xaxis2": _title(f"position [{across}]"),
+            "yaxis": _title(f"target − position [{unit}]"),
+            "yaxis2": _title(f"error [{unit_e}]"),
+        },
     }
 
 
@@ -275,8 +289,8 @@ FIGURES: dict[str, FailureFigure] = {
             _line("error on the way down", "var(--fourth)", xaxis="x2", yaxis="y2", hovertemplate="%{y:.3g}"),
         ],
         layout={
-            "xaxis": {"domain": [0, 0.46]} | _title("position [rad]"),
-            "xaxis2": {"domain": [0.56, 1], "anchor": "y2"} | _title("position [rad]"),
+            "xaxis": {"domain": [0, 0.46]},
+            "xaxis2": {"domain": [0.56, 1], "anchor": "y2"},
             "yaxis2": {"anchor": "x2", "zerolinecolor": "var(--muted)"},
         },
         cell=_loops,

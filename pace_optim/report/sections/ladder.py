@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
-from pace_optim.report.number_text import angle_unit, three_figures
+from pace_actuators.joint_units import JointType
+from pace_optim.report.number_text import position_unit, three_figures
 
 from ..markup import Section, bold, figure, table
 from ..run_data import RunData
@@ -24,22 +26,23 @@ def ladder(run: RunData) -> Section | None:
     if not content:
         return None
     steps, floor = content["steps"], content["noise_floor"]
+    types = run.result.joint_types
     parts = [part for part in _PARTS if all(step["rmse"].get(part) for step in steps)]
     if not parts:
         return None
-    factor, unit = angle_unit([step["rmse"][part][ALL] for step in steps for part in parts])
+    factor, unit = position_unit([step["rmse"][part][ALL] for step in steps for part in parts], types)
     return Section(
         id="ladder",
         title="Error ladder",
-        lead=_sentence(steps, parts[0], floor[ALL]),
+        lead=_sentence(steps, parts[0], floor[ALL], types),
         html=figure("error-ladder", _traces(steps, parts, floor, factor, unit), _layout(unit), height=360)
         + _table(steps, parts, floor, factor, unit),
     )
 
 
-def _sentence(steps: list[dict[str, Any]], part: str, floor: float) -> str:
+def _sentence(steps: list[dict[str, Any]], part: str, floor: float, types: Sequence[JointType]) -> str:
     first, last = (step["rmse"][part][ALL] for step in (steps[0], steps[-1]))
-    factor, unit = angle_unit([first])
+    factor, unit = position_unit([first], types)
     change = first / last if last > 0 else 1.0
     size = (
         f"{change:.3g} times less" if change >= 1.005 else "no less" if change > 0.995 else f"{1 / change:.3g} × more"

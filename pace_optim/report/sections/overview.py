@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
-from pace_optim.report.number_text import angle_text, angle_unit, three_figures
+from pace_actuators.joint_units import JointType, joint_label, units_for
+from pace_optim.report.number_text import position_text, position_unit, three_figures
 from pace_optim.run.result import FitResult
 
 from ..markup import Section, bullets, folded, html
@@ -44,8 +46,14 @@ def overview(run: RunData) -> Section:
 def _headline(result: FitResult) -> str:
     error = result.rmse.get("validation", {}).get(ALL)
     if error is not None:
-        return f"The simulation follows the robot to {angle_text(error)} on data it was not fitted to"
-    return f"The simulation follows the robot to {angle_text(result.rmse['train']['all'])} on the data it was fitted to"
+        return f"The simulation follows the robot to {_of_all(result, error)} on data it was not fitted to"
+    return (
+        f"The simulation follows the robot to {_of_all(result, result.rmse['train'][ALL])} on the data it was fitted to"
+    )
+
+
+def _of_all(result: FitResult, error: float | None) -> str:
+    return position_text(error, result.joint_types)
 
 
 def _verdict(run: RunData) -> str:
@@ -57,10 +65,10 @@ def _verdict(run: RunData) -> str:
     if held_out is None:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
     else:
-        sentences.append(f"On the data it was fitted to, it is {angle_text(train)}.")
+        sentences.append(f"On the data it was fitted to, it is {_of_all(run.result, train)}.")
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
-        sentences.append(f"The worst joint is {worst} with {angle_text(where)}.")
+        sentences.append(f"The worst joint is {worst} with {position_text(where, [run.result.joint_type(worst)])}.")
     last = run.result.stop_reasons[-1] if run.result.stop_reasons else ""
     if last.startswith(_STOPPED_EARLY):
         sentences.append(f"The fit was stopped before it had converged ({last}): going on may lower the error.")
@@ -93,17 +101,17 @@ def _figures(result: FitResult) -> Markup:
     """The handful of numbers that everyone asks for."""
     worst, error = _worst_joint(result)
     held_out, train = result.rmse.get("validation", {}).get(ALL), result.rmse["train"].get(ALL)
-    factor, unit = angle_unit([held_out, train, error])
+    factor, unit = position_unit([held_out, train, error], ["hinge"])
 
-    def said(value: float | None) -> str:
-        return "–" if value is None else f"{factor * value:.3g} {unit}"
+    def said(value: float | None, types: Iterable[JointType] = result.joint_types) -> str:
+        return "–" if value is None else units_for(f"{factor * value:.3g} {unit}", types)
 
     figures = [
         ("Validation", said(held_out), "error of all joints"),
         ("Training", said(train), "error of all joints"),
-        ("Worst joint", said(error), worst),
+        ("Worst joint", said(error, [result.joint_type(worst)]), worst),
         ("Delay", f"{1e3 * result.delay_s:.3g} ms", f"of the {result.delay_mode}"),
-        ("Score", f"{result.score:.2e}", "rad², sum over the joints"),
+        ("Score", f"{result.score:.2e}", units_for("rad², sum over the joints", result.joint_types)),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
     return html(
@@ -137,22 +145,24 @@ def _errors_by_joint(result: FitResult) -> Markup:
     """A row of bars per joint; a click shows its curves."""
     parts = [(name, result.rmse[name]) for name in ("train", "validation") if result.rmse.get(name)]
     every = [value for _, errors in parts for joint, value in errors.items() if joint != ALL]
-    factor, unit = angle_unit(every)
+    types = result.joint_types
+    factor, unit = position_unit(every, ["hinge"])
+    labels = [joint_label(j, own, types, unit) for j, own in zip(result.joint_names, types, strict=True)]
     largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
     rows = {
-        joint: [
+        (joint, label): [
             (name, f"{100 * errors[joint] / largest:.1f}", three_figures(factor * errors[joint]))
             for name, errors in parts
         ]
-        for joint in result.joint_names
+        for joint, label in zip(result.joint_names, labels, strict=True)
     }
     return html(
         '<h3>Error of each joint [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
-        '{{ words[name] }}</span>{% endfor %}</h3><div class="errors">{% for joint, bars in rows.items() %}'
-        '<a class="error" href="#trajectories" data-joint="{{ joint }}"><b>{{ joint }}</b><div>'
+        '{{ words[name] }}</span>{% endfor %}</h3><div class="errors">{% for (joint, label), bars in rows.items() %}'
+        '<a class="error" href="#trajectories" data-joint="{{ joint }}"><b>{{ label }}</b><div>'
         '{% for name, width, value in bars %}<div class="bar {{ name }}"><i style="width:{{ width }}%"></i>'
         "<span>{{ value }}</span></div>{% endfor %}</div></a>{% endfor %}</div>",
-        unit=unit,
+        unit=units_for(unit, types),
         names=[name for name, _ in parts],
         words={"train": "training", "validation": "validation"},
         rows=rows,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pace_optim.report.number_text import angle_unit, three_figures
+from pace_optim.report.number_text import position_unit, three_figures
 from pace_optim.report.trajectory_errors import rms
 
 from ..markup import Section, bold, bullets, folded, html, table
@@ -22,7 +22,7 @@ def recordings(run: RunData) -> Section:
     """A row per recording, its notes underneath; then the drives in each."""
     rows, notes = [], list(run.result.notes)
     ordered = by_error(run.recordings)
-    factor, unit = angle_unit([error_of(recording) for recording in ordered])
+    factor, unit = position_unit([error_of(recording) for recording in ordered], run.result.joint_types)
     for recording in ordered:
         own = [note for note in notes if note.startswith(f"{recording.name}: ")]
         notes = [note for note in notes if note not in own]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pace_actuators.joint_units import units_for
+
 from ..markup import Section, figure
 from ..run_data import RunData
 
@@ -23,6 +25,7 @@ def scores(run: RunData) -> Section | None:
         ("refinement, best", history.refine_best, "var(--simulated)", False),
     ]
     curves = [curve for curve in curves if curve[1]]
+    unit = units_for("rad²", run.result.joint_types)
     mode = "lines+markers" if len(search) + len(refine) < 80 else "lines"
     data = [
         {
@@ -33,7 +36,7 @@ def scores(run: RunData) -> Section | None:
             "y": values,
             "line": {"color": color, "width": 2},
             "marker": {"size": 5},
-            "hovertemplate": "%{y:.3e} rad²",
+            "hovertemplate": f"%{{y:.3e}} {unit}",
         }
         for name, values, color, is_search in curves
     ]
@@ -47,7 +50,7 @@ def scores(run: RunData) -> Section | None:
     ]
     layout = {
         "xaxis": {"title": {"text": axes["Iterations"][2]}},
-        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": "score [rad²]"}},
+        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": f"score [{unit}]"}},
         "hovermode": "x unified",
     }
     return Section(

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pace_optim.report.number_text import angle_unit, three_figures
+from pace_actuators.joint_units import JointType, units_for
+from pace_optim.report.number_text import position_unit, three_figures
 from pace_optim.report.trajectory_errors import held_out_spans, rms
 
 from ..markup import Section, choice, html, json_script
@@ -29,7 +30,7 @@ def trajectories(run: RunData) -> Section | None:
     per_curve = min(max(per_curve, _FEWEST_PER_CURVE), _MOST_PER_CURVE)
     content = {
         "joints": list(run.joint_names),
-        "recordings": [_encode(recording, per_curve) for recording in ordered],
+        "recordings": [_encode(recording, per_curve, run.result.joint_types) for recording in ordered],
     }
     r, j = _largest_error(ordered)
     return Section(
@@ -56,21 +57,21 @@ def _largest_error(recordings: Sequence[RecordingData]) -> tuple[int, int]:
     return divmod(int(np.argmax(errors)), recordings[0].error.shape[1])
 
 
-def _encode(recording: RecordingData, per_curve: int) -> dict:
+def _encode(recording: RecordingData, per_curve: int, joint_types: Sequence[JointType]) -> dict:
     """One recording for the page's script: numbers as base64 of little-endian arrays."""
     time = recording.time - recording.time[0]
     return {
         "name": recording.name,
         "time": _base64(time, "<f4"),
         "held_out": held_out_spans(time, recording.train),
-        "joints": [_encode_joint(recording, j, per_curve) for j in range(recording.measured.shape[1])],
+        "joints": [_encode_joint(recording, j, per_curve, own) for j, own in enumerate(joint_types)],
     }
 
 
-def _encode_joint(recording: RecordingData, j: int, per_curve: int) -> dict:
+def _encode_joint(recording: RecordingData, j: int, per_curve: int, joint_type: JointType) -> dict:
     target, measured, error = recording.target[:, j], recording.measured[:, j], recording.error[:, j]
     kept = samples_to_draw((error, measured, target), per_curve)
-    factor, unit = angle_unit([float(np.abs(error).max(initial=0.0))])
+    factor, unit = position_unit([float(np.abs(error).max(initial=0.0))], [joint_type])
     train, held_out = rms(error[recording.train]), rms(error[~recording.train])
     parts = [(name, value) for name, value in (("training", train), ("validation", held_out)) if value is not None]
     words = ", ".join(f"{three_figures(factor * value)} {unit} in {name}" for name, value in parts)
@@ -81,6 +82,7 @@ def _encode_joint(recording: RecordingData, j: int, per_curve: int) -> dict:
         "error": _base64(error[kept], "<f4"),
         "factor": factor,
         "unit": unit,
+        "position_unit": units_for("rad", [joint_type]),
         "text": f"Error: {words}",
     }
 
