@@ -218,7 +218,7 @@ def test_the_gains_around_motors_are_somebody_elses(tmp_path):
     cfg = cfg_of(tmp_path, motors)
     assert cfg.sim2real.assumed_gains == cfg.sim2real.joint_order
     assert min(drive_of(cfg).stiffness) > 0.0 and min(drive_of(cfg).damping) > 0.0
-    assert any(note.startswith("gains: kp = effort limit") for note in cfg.sim2real.notes)
+    assert any(note.startswith("gains, where a recording states none: kp = effort limit") for note in cfg.sim2real.notes)
     assert not drive_of(cfg).implicit and cfg.sim.integrator == "rk4"
 
 

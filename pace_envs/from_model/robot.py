@@ -212,9 +212,9 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     notes = [f"home posture: {f'keyframe {key}' if key else 'all joints at 0, or in the middle of a range without it'}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
-            f"gains: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least {defaults.NATURAL_FREQUENCY:g} Hz "
-            f"with the joint's inertia; kd for a damping ratio of {defaults.DAMPING_RATIO:g}; state the real ones in "
-            "the recording (stiffness, damping)"
+            f"gains, where a recording states none: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
+            f"{defaults.NATURAL_FREQUENCY:g} Hz with the joint's inertia; kd for a damping ratio of "
+            f"{defaults.DAMPING_RATIO:g} (stiffness, damping)"
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:
