@@ -389,3 +389,55 @@ def test_loops_of_a_file_are_simulated_as_a_fit_does(tmp_path):
     assert problem.physics_dt < problem.coarsest_dt
     values = true_parameters(problem.env_cfg.sim2real, problem.space, {"armature": 1e-3})
     assert float(problem.evaluator().residuals(values[None], problem.dataset.sampled).score) < EXACT
+
+
+# --- drives that follow speeds
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory):
+    """Two wheels, and how they are told to be."""
+    inertia = (
+        '<inertial><mass value="0.8"/><inertia ixx="2e-3" iyy="3e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    wheels = [
+        f'<link name="{name}">{inertia}</link><joint name="{name}" type="continuous"><parent link="base"/>'
+        f'<child link="{name}"/><axis xyz="0 1 0"/><limit effort="6" velocity="40"/></joint>'
+        for name in ("left", "right")
+    ]
+    path = tmp_path_factory.mktemp("cart") / "cart.urdf"
+    path.write_text(f'<robot name="cart"><link name="base"/>{"".join(wheels)}</robot>')
+    truth = {"armature": 0.01, "viscous_friction": 0.01, "friction": 0.1, "encoder_bias": 0, "delay": 1}
+    given = (word for name, value in truth.items() for word in ("--parameter", f"{name}={value}"))
+    return ("--task", str(path), *given, "--damping", "0.35", *SHORT)
+
+
+def test_a_drive_without_stiffness_is_told_speeds_and_moves(cart, tmp_path):
+    """It was told positions, which it does not follow, and a recording of a robot at rest was written."""
+    file = tmp_path / "told.csv"
+    recording = record(tmp_path, *cart, "--stiffness", "0", "--export_command", str(file))
+    assert recording.des_dof_pos is None and (np.ptp(recording.dof_pos, axis=0) > 0.1).all()
+    assert next(csv.reader(file.open())) == ["time", "des_dof_vel/left", "des_dof_vel/right"]
+
+
+def test_joints_that_are_named_are_told_speeds_beside_others_with_positions(cart, tmp_path):
+    recording = record(tmp_path, *cart, "--velocity_joints", "l.*")
+    assert np.isnan(recording.des_dof_pos).all(axis=0).tolist() == [True, False]
+    assert np.isnan(recording.des_dof_vel).all(axis=0).tolist() == [False, True]
+    assert (np.ptp(recording.dof_pos, axis=0) > 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--stiffness", "0", "--damping", "0"], "Nothing would move left, right: stiffness and damping are 0"),
+        (["--velocity_joints", "arm"], "'arm' fits no joint. Available: left, right."),
+        (["--velocity_joints", "("], "is no regular expression"),
+        (["--stiffness", "0", "--excitation", "steps"], "steps jumps from target to target, and left, right follow"),
+        (["--stiffness", "0", "--effect", "backlash"], "Leave --effect out"),
+    ],
+)
+def test_what_speeds_cannot_tell_is_refused(cart, tmp_path, capsys, given, told):
+    assert script("data_collection", *cart, *given, "--output", str(tmp_path / "none.npz")) == 2
+    assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

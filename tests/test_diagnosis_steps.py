@@ -21,7 +21,7 @@ from pace_optim.diagnosis.telling.advice import advise, rivals
 from pace_optim.diagnosis.verdict.proxy_effects import proxies
 from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 from pace_optim.experiment_design import telling_apart
-from pace_optim.experiment_design.telling_apart import MenuCfg, distances, menu, next_experiments
+from pace_optim.experiment_design.telling_apart import MenuCfg, Rivals, distances, menu, next_experiments
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.labels import labels
 from pace_optim.single_joint_fits.model import BASE, JointModel
@@ -120,10 +120,26 @@ def test_a_velocity_drive_is_sent_to_another_velocity_gain(bench):
     words = {choice.words for choice in menu(problem, 0, MenuCfg())}
     assert any("the derivative gain" in each for each in words)
     assert not any("proportional" in each for each in words)
+    for choice in menu(problem, 0, MenuCfg()):
+        assert "--velocity_joints '.*'" in choice.arguments and "steps" not in choice.arguments
+        assert choice.recording.des_dof_pos is None and np.ptp(choice.recording.command) == 0
+        assert np.ptp(choice.recording.command_vel) > 0.1
     data = SimpleNamespace(gains=1, loads=2, noise=torch.tensor([1e-4]))
     outcome = outcome_of([1e-3], [2e-4], [STRIBECK])
     sentence = next(each for each in advise(problem, outcome, "effect", data, ()) if "same gains" in each)
     assert "another velocity gain (damping in the recording)" in sentence
+
+
+def test_a_torque_drive_is_sent_to_its_own_controller(bench):
+    problem = bench.problem
+    like = [
+        replace(each, des_dof_pos=None, des_dof_effort=each.des_dof_pos, command_effort=each.command)
+        for each in problem.dataset.recordings
+    ]
+    problem = replace(problem, dataset=replace(problem.dataset, recordings=like))
+    pair = Rivals(names=("payload", "torque_gain"), models=(None, None), joints=[0], hint="Weigh it.")
+    (sentence,) = next_experiments(problem, [pair], torch.tensor([1e-4]))
+    assert sentence.endswith("(servo). Record another motion of your own controller, and what it commands. Weigh it.")
 
 
 def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monkeypatch):

@@ -45,6 +45,8 @@ class CollectionCfg:
     """Proportional gain of all joints [N m/rad]; ``None`` means the robot's."""
     damping: float | None = None
     """Derivative gain of all joints [N m s/rad]; ``None`` means the robot's."""
+    velocity_joints: str | None = None
+    """Joints whose drives follow speeds, a regular expression; ``None``: those without a proportional gain."""
     load: Load = field(default_factory=Load)
     """What the robot carries."""
     delay_mode: str | None = None

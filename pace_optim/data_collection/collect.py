@@ -35,6 +35,7 @@ from .files import Files, plan_files, truth_file
 from .hidden import Hidden, simulate_hidden
 from .plot import plot_motion
 from .simulate import Simulated, simulate
+from .speeds import driven_by_speed, told_speeds
 from .truth import true_parameters
 
 
@@ -95,6 +96,8 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
     env: Any = make_env(cfg.task, cfg=env_cfg, num_envs=count, physics_dt=physics_dt, delay_mode=cfg.delay_mode)
     try:
         limits = _limits_of(env)
+        by_speed = driven_by_speed(env, cfg)
+        trajectories = [told_speeds(trajectory, by_speed, cfg) for trajectory in trajectories]
         design = design_motion(cfg, env, trajectories[0], limits, report) if cfg.optimize else None
         trajectories = trajectories if design is None else [design.trajectory]
         findings = [check_command(trajectory, limits) for trajectory in trajectories]

@@ -85,6 +85,11 @@ def make_collection_parser() -> Parser:
     )
     robot.add_argument("--stiffness", type=number, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
     robot.add_argument("--damping", type=number, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
+    robot.add_argument(
+        "--velocity_joints",
+        metavar="REGEX",
+        help="joints whose drives follow speeds: commanded in des_dof_vel (default: those whose stiffness is 0)",
+    )
     robot.add_argument("--delay_mode", metavar="MODE", help="command or effort: what the delay delays")
     robot.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
     robot.add_argument("--load_mass", type=number, metavar="KG", help="test bench: mass at the end of the arm")

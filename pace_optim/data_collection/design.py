@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -47,7 +48,8 @@ def design_motion(
     delay_mode = next(iter(env_cfg.scene.robot.actuators.values())).delay_mode
 
     def problem_of(trajectories: Sequence[Trajectory]) -> Problem:
-        drafts = draft_recordings(env, trajectories, drive, cfg.load)
+        told = [replace(trajectory, by_speed=unoptimized.by_speed) for trajectory in trajectories]
+        drafts = draft_recordings(env, told, drive, cfg.load)
         return Problem(
             task=cfg.task,
             plain_cfg=env_cfg,

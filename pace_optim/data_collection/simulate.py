@@ -83,7 +83,8 @@ def simulate(
             recording=replace(
                 drafts[r],
                 dof_pos=np.ascontiguousarray(reading[:, r]),
-                des_dof_pos=trajectories[r].des_dof_pos,  # in rows: repeated values side by side make small files
+                des_dof_pos=trajectories[r].told_pos,  # in rows: repeated values side by side make small files
+                des_dof_vel=trajectories[r].told_vel,
                 dof_vel=np.ascontiguousarray(speed[:, r]),
                 drive=drive_in_force,
                 notes=(),
@@ -125,7 +126,8 @@ def _draft(trajectory: Trajectory, drive: Drive, load: Load) -> Recording:
         joint_names=trajectory.joint_names,
         time=trajectory.time,
         dof_pos=np.repeat(target[:1], len(target), axis=0),
-        des_dof_pos=target,
+        des_dof_pos=trajectory.told_pos,
+        des_dof_vel=trajectory.told_vel,
         drive=drive,
         load=load,
     )

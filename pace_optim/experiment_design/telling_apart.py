@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from pace_optim.problem.forked import parallel_map
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
+from pace_optim.run.result import configured_drive
 from pace_optim.terminal.cli import command
 
 _MOTIONS = ("chirp", "multisine", "ramp", "steps")
@@ -90,8 +92,10 @@ def next_experiments(
         cfg: The menu.
     """
     cfg = cfg or MenuCfg()
-    if not pairs or problem.env_cfg.sim2real.excitation is None:
-        return [f"These recordings cannot tell {_named(pair, problem)}. {pair.hint}".rstrip() for pair in pairs]
+    by_torque = _told(problem) == "torque"
+    if not pairs or problem.env_cfg.sim2real.excitation is None or bool(by_torque.any()):
+        own = " Record another motion of your own controller, and what it commands." if bool(by_torque.any()) else ""
+        return [f"These recordings cannot tell {_named(pair, problem)}.{own} {pair.hint}".rstrip() for pair in pairs]
     menus = {joint: list(menu(problem, joint, cfg)) for joint in dict.fromkeys(pair.joints[0] for pair in pairs)}
     recordings = {joint: [choice.recording for choice in choices] for joint, choices in menus.items()}
     apart = distances(problem, pairs, [recordings[pair.joints[0]] for pair in pairs])
@@ -140,25 +144,36 @@ def _range(values: Sequence[float], form: str) -> str:
 
 
 def menu(problem: Problem, joint: int, cfg: MenuCfg) -> Iterator[Choice]:
-    """Every motion as the robot was, with a larger proportional gain, and with more load on a joint."""
-    like = problem.dataset.recordings[problem.dataset.trained()[0]]
+    """Every motion as the robot was, with a larger proportional gain, and with more load on a joint.
+
+    Drives that follow speeds are told speeds.
+    """
+    like, told = _like(problem), _told(problem)
     conditions = [("", "", like), *_other_gain(like, cfg), *_other_load(problem, like, joint, cfg)]
+    by_speed = tuple(np.array(problem.joint_names)[told == "speed"].tolist())
+    pattern = ".*" if bool((told == "speed").all()) else "|".join(map(re.escape, by_speed))
+    also = f" --velocity_joints {shlex.quote(pattern)}" if by_speed else ""
     for motion in _MOTIONS:
         trajectory = make_excitation(
             motion, problem.env_cfg.sim2real, control_dt=problem.control_dt, duration=cfg.duration
         )[0]
-        target = trajectory.des_dof_pos
+        if by_speed and trajectory.has_jumps:
+            continue
+        trajectory = replace(trajectory, by_speed=by_speed)
+        target, speeds = trajectory.des_dof_pos, trajectory.told_vel
         for words, arguments, facts in conditions:
             yield Choice(
                 words=f"Another recording ({motion}, {cfg.duration:g} s{words})",
-                arguments=f"--excitation {motion} --duration {cfg.duration:g}{arguments}",
+                arguments=f"--excitation {motion} --duration {cfg.duration:g}{also}{arguments}",
                 recording=Recording(
                     name=motion,
                     joint_names=problem.joint_names,
                     time=trajectory.time,
                     dof_pos=np.repeat(target[:1], len(target), axis=0),
-                    des_dof_pos=target,
-                    command=target,
+                    des_dof_pos=trajectory.told_pos,
+                    des_dof_vel=speeds,
+                    command=np.where(told == "position", target, target[:1]),
+                    command_vel=None if speeds is None else np.nan_to_num(speeds),
                     drive=facts.drive,
                     load=facts.load,
                 ),
@@ -190,6 +205,20 @@ def _predicted(problem: Problem, model: RobotModel, data: Dataset) -> torch.Tens
     """A model's motion on recordings, less what is written there, (K, R, n) [rad]."""
     own = replace(problem.with_effects(model.effects), dataset=data)
     return own.evaluator().residuals(own.space.from_dict(model.values)[None], data.sampled).error[0]
+
+
+def _like(problem: Problem) -> Recording:
+    """A recording whose drives and loads the next one has too."""
+    return problem.dataset.recordings[problem.dataset.trained()[0]]
+
+
+def _told(problem: Problem) -> np.ndarray:
+    """What each drive follows, (n,): ``position``, ``speed``, or ``torque`` where it has no gains or nothing else."""
+    like, configured = _like(problem), configured_drive(problem)
+    own = {"stiffness": like.drive.stiffness, "damping": like.drive.damping}
+    kp, kd = (np.asarray(configured[name] if value is None else value) for name, value in own.items())
+    position, speed = like.has_position_command & (kp != 0), like.has_position_command | like.has_velocity_command
+    return np.select([position, speed & (kd != 0)], ["position", "speed"], "torque")
 
 
 def _other_gain(like: Recording, cfg: MenuCfg) -> Iterator[tuple[str, str, Recording]]:
