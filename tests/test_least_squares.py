@@ -20,8 +20,7 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from pace_optim.identification.optimization import Optimization
-from pace_optim.optimizers.jacobian import NARROW, WIDE, Colouring, colour
+from pace_optim.optimizers.jacobian import Colouring, colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
@@ -74,7 +73,7 @@ def test_near_the_end_derivatives_are_kept_and_a_step_costs_its_trials_only():
     evaluator.residuals = lambda physical, where=None: (sizes.append(len(physical)), simulate(physical, where))[1]
     best = refine(problem, evaluator=evaluator)[0]
     neighbours = len(colour(problem.space, problem.trees, problem.joint_names).colours)
-    assert sizes.count(4) >= 2 and sizes[-1] == 4 and sizes[0] == 1 + neighbours
+    assert sizes.count(4) >= 2 and sizes[-1] == 4 and sizes[0] == 2 + neighbours  # one tells whether it is rough
     again = refine(problem, best.x)[0]  # its derivatives are those at the end
     assert again.score > (1 - LeastSquaresCfg().creep_tolerance) * best.score  # what a descent leaves
 
@@ -219,35 +218,6 @@ def dense(size):
     return Colouring(colours=tuple((i,) for i in range(size)), joints=tuple((0,) for _ in range(size)))
 
 
-def test_wide_derivatives_lead_on_where_a_rattle_makes_the_error_rough():
-    """Its size is a thousandth of the error at the start, and its slope hundreds of times the valley's."""
-    generator = torch.Generator().manual_seed(0)
-    slope, phase = torch.randn(200, 2, dtype=torch.float64, generator=generator), torch.arange(200)
-    target = torch.tensor([0.3, -0.2], dtype=torch.float64)
-
-    def valley(x):
-        return slope @ (x - target) + 1e-3 * torch.sin(1e6 * x.sum() + phase)
-
-    start = torch.tensor([-0.5, 0.4], dtype=torch.float64)
-    narrow, wide = (
-        least_squares(Fake(valley), dataclasses.replace(dense(2), step=step), [start])[0] for step in (NARROW, WIDE)
-    )
-    assert (narrow.x - target).abs().max() > 0.05
-    assert (wide.x - target).abs().max() < 2e-3
-
-
-def test_a_descent_that_creeps_goes_on_over_wide_steps_and_its_error_bars_too(monkeypatch):
-    crept = Descent(x=torch.zeros(2, dtype=torch.float64), score=1.0, stop_reason="max_iteration 40")
-    better, worse = (dataclasses.replace(crept, score=score, stop_reason="converged") for score in (0.1, 2.0))
-    run = SimpleNamespace(colouring=dense(2), evaluator=None, progress=SimpleNamespace(say=lambda _: None))
-    for found, ends, taken, step in (
-        (dataclasses.replace(crept, stop_reason="converged"), better, None, NARROW), (crept, worse, None, NARROW),
-        (crept, better, better, WIDE),
-    ):  # fmt: skip
-        monkeypatch.setattr("pace_optim.identification.optimization.least_squares", lambda *_, ends=ends: [ends])
-        assert Optimization._over_wide_steps(run, found) is (taken or found) and run.colouring.step == step
-
-
 def test_trials_that_diverge_do_not_break_a_descent():
     target = torch.tensor([0.3, -0.2], dtype=torch.float64)
 
@@ -317,7 +287,7 @@ def test_all_starts_and_trials_of_an_iteration_share_one_batch():
     starts = [torch.tensor([value, -value], dtype=torch.float64) for value in (0.5, -0.7, 0.9)]
     descents = least_squares(fake, dense(2), starts)
     assert len(fake.batches) == max(d.iteration for d in descents)
-    assert len(fake.batches[0]) == 3 * (1 + 2)  # x and two perturbed vectors
+    assert len(fake.batches[0]) == 3 * (1 + 2 + 1)  # x, two perturbed vectors, one that tells whether it is rough
 
 
 def test_the_score_never_rises_and_the_reported_one_is_that_of_x():

@@ -10,7 +10,7 @@ import torch
 
 from pace_optim.excitation import Trajectory
 from pace_optim.experiment_design.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
-from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.optimizers.jacobian import Colouring, colour, perturbed
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.assessment import Probes, make_probes
 
@@ -63,7 +63,7 @@ def information_of(
     """
     problem = problem_of(trajectories[:1])
     colouring = colour(problem.space, problem.trees, problem.joint_names)
-    probes = make_probes(x, colouring, problem.trees, problem.joint_names)
+    probes = make_probes(x, perturbed(x, colouring), problem.trees, problem.joint_names)
     at_once = max(1, _MEMORY // (len(probes.vectors) * trajectories[0].des_dof_pos.nbytes))
     result: list[Information] = []
     for start in range(0, len(trajectories), at_once):

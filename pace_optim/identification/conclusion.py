@@ -24,7 +24,7 @@ from pace_optim.uncertainty.other_solutions import with_other_solutions
 from pace_optim.uncertainty.step_share import change_without_step, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without_delay
-from pace_optim.uncertainty.warnings import fit_warnings
+from pace_optim.uncertainty.warnings import fit_warnings, rough_motion
 
 _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
@@ -131,6 +131,7 @@ def _result(
         std_means_nothing=end.is_far,
         warnings=[
             *far_end(end.times, end.train_rmse, settings.optimizer, run.searched, problem.joint_types),
+            *rough_motion(end.jacobian),
             *fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure),
             *consistency.sentences,
         ],
@@ -154,7 +155,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
 
 
 def _known_at(run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
-    return assess(run.problem, run.assessor, run.colouring, x, held)
+    return assess(run.problem, run.assessor, run.colouring, x, held, run.descents[0] if run.descents else None)
 
 
 def _told_of_step(run: Optimization, end: _End) -> _End:

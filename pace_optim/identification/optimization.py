@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from pace_optim.identification.beginning import make_optimizer, make_searcher
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.jacobian import WIDE, colour
+from pace_optim.optimizers.jacobian import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.other_starts import other_valleys, scattered
 from pace_optim.optimizers.refine import COARSE, refine
@@ -87,6 +87,7 @@ class Optimization:
         self._search_stop: list[str] = []
         self.searched = False
         """Whether other starts were tried and none ended lower."""
+        self._is_rough = False
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
@@ -131,7 +132,6 @@ class Optimization:
             self.processes.agree(None)
         else:
             self.descents = [found] = self._refine([found])
-            self.descents = [found] = [self._over_wide_steps(found)]
             others = self._elsewhere(found)
         if others:
             self._try_others(found, others)
@@ -141,22 +141,6 @@ class Optimization:
         """Refine a known vector: it needs no coarse stage, and few steps."""
         self.descents = least_squares(self.evaluator, self.colouring, [x], NEAR, self._after_iteration)
         return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
-
-    def _over_wide_steps(self, found: Descent) -> Descent:
-        """The descent, or where wide derivatives lead from it, if it still crept at its last iteration.
-
-        Links that rattle against their stops make the motion rough on a small scale: the derivative over a small step
-        is then that of the rattling. A resumed run does this anew.
-        """
-        if found.stop_reason is None or not found.stop_reason.startswith("max_iteration"):
-            return found
-        self.progress.say("the descent creeps: going on with derivatives over wider steps")
-        wide = replace(self.colouring, step=WIDE)
-        best = least_squares(self.evaluator, wide, [found.x])[0]
-        if not best.score < found.score:
-            return found
-        self.colouring = wide  # of the error bars too
-        return best
 
     def _elsewhere(self, found: Descent) -> list[Descent]:
         """Other starts, where a descent ended far above the noise: it may be in a wrong valley."""
@@ -242,6 +226,9 @@ class Optimization:
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         best = min(d.score for d in descents)
         self.refuse_divergence(best)
+        if not self._is_rough and any(descent.directions is not None for descent in descents):
+            self._is_rough = True
+            self.progress.say("the motion is rough: going on with derivatives over wider steps")
         self.descents = list(descents)
         self.history.refine_best.append(best)
         self.history.refine_steps.append(self.steps)

@@ -10,8 +10,8 @@ import torch
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 
-NARROW, WIDE = 1e-5, 1e-2
-"""Normalised steps of the derivatives: as small as rounding allows, and over what rattles."""
+_STEP = 1e-5
+"""Normalised step of the derivatives: as small as rounding allows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +22,6 @@ class Colouring:
     """Entries perturbed together."""
     joints: tuple[tuple[int, ...], ...]
     """For each entry of the vector, the indices of the joints that it moves."""
-    step: float = NARROW
-    """How far an entry is perturbed."""
 
 
 def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
@@ -63,7 +61,7 @@ def perturbed(x: torch.Tensor, colouring: Colouring) -> tuple[torch.Tensor, torc
     Returns:
         Normalised vectors (colours, size) and the signed step of every entry (size,); steps point into the bounds.
     """
-    step = torch.where(x > 0, -colouring.step, colouring.step).to(x.dtype)
+    step = torch.where(x > 0, -_STEP, _STEP).to(x.dtype)
     vectors = x.repeat(len(colouring.colours), 1)
     for row, entries in zip(vectors, colouring.colours, strict=True):
         row[list(entries)] += step[list(entries)]
@@ -79,6 +77,8 @@ class Jacobian:
     columns: torch.Tensor
     """Derivative by each colour's entries, (colours, K, R, n) [rad per normalised unit]."""
     colouring: Colouring
+    is_wide: bool = False
+    """Whether the derivatives are taken over steps that are as wide as the error (``wide_derivatives``)."""
 
     def column(self, entry: int) -> torch.Tensor:
         """Derivative of the error by an entry, (K, R, n); zero for joints that the entry does not move."""

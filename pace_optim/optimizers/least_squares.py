@@ -18,6 +18,14 @@ from pace_optim.optimizers.levenberg_marquardt import (
     rows_of,
     trial_rows,
 )
+from pace_optim.optimizers.wide_derivatives import (
+    first_directions,
+    is_rough,
+    jacobian_over,
+    moved_along,
+    principal_directions,
+    probe,
+)
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
 _STALLED = 3
@@ -69,6 +77,10 @@ class Descent:
     """Residuals at x, and derivatives at ``jacobian_x``; ``None`` until they are known."""
     jacobian_x: torch.Tensor | None = None
     """Where the derivatives were taken, normalised (size,)."""
+    directions: torch.Tensor | None = None
+    """Where the motion is rough, the wide steps over which its next derivatives are taken, (size, size)."""
+    jacobian_directions: torch.Tensor | None = None
+    """Those over which the present ones were."""
     stop_reason: str | None = None
     iteration: int = 0
     stalled: int = 0
@@ -81,6 +93,10 @@ class Descent:
     def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
         """Descents as a run's checkpoint has them; their Jacobians are computed again."""
         scores = json.loads(str(checkpoint["descent_scores"]))
+        known = [
+            tuple(torch.as_tensor(one) if one.any() else None for one in both)
+            for both in checkpoint["descent_directions"]
+        ]
         return [
             cls(
                 x=torch.as_tensor(x),
@@ -91,14 +107,20 @@ class Descent:
                 stalled=int(stalled),
                 scores=history,
                 jacobian_x=torch.as_tensor(jacobian_x),
-                lost_jacobian=bool(known) and not stop,
+                directions=directions,
+                jacobian_directions=jacobian_directions,
+                lost_jacobian=bool(has_jacobian) and not stop,
             )
-            for x, jacobian_x, (score, damping, iteration, stalled, known), stop, history in zip(
+            for x, jacobian_x, (score, damping, iteration, stalled, has_jacobian), stop, history, (
+                directions,
+                jacobian_directions,
+            ) in zip(
                 checkpoint["descent_x"],
                 checkpoint["descent_jacobian_x"],
                 checkpoint["descent_state"],
                 checkpoint["descent_stop"],
                 scores,
+                known,
                 strict=True,
             )
         ]
@@ -112,9 +134,31 @@ class Descent:
         """Whether the derivatives at a trial step are worth simulating beside it: where much is expected of it."""
         return self.jacobian is None or (self.stalled == 0 and self.expected_gain(trial) >= _NEAR * self.score)
 
+    def around(self, x: torch.Tensor, colouring: Colouring) -> tuple[torch.Tensor, torch.Tensor]:
+        """Neighbours of x, (m, size), that tell its derivatives and whether the motion is rough, and their steps."""
+        if self.directions is not None:
+            return moved_along(x, self.directions, colouring)
+        neighbours, step = perturbed(x, colouring)
+        return torch.cat([neighbours, (x + probe(x))[None]]), step
+
     def look(self, x: torch.Tensor, residuals: Residuals, step: torch.Tensor, colouring: Colouring) -> None:
-        """Take the derivatives at x from its residuals (row 0) and its neighbours'."""
-        self.jacobian, self.jacobian_x = jacobian(residuals, step, colouring), x.clone()
+        """Take the derivatives at x from its residuals (row 0) and its neighbours'; none where the motion is rough.
+
+        Then its neighbours are further away from there on.
+        """
+        self.jacobian_x, self.jacobian_directions = x.clone(), self.directions
+        if self.directions is not None:
+            self.jacobian = jacobian_over(residuals, step, colouring)
+            self.directions = principal_directions(self.jacobian, x)
+            return
+        self.jacobian = jacobian(residuals, step, colouring)
+        if is_rough(self.jacobian, residuals.error[1 + len(colouring.colours)], probe(x)):
+            self.go_over_wide_steps(first_directions(len(x)))
+
+    def go_over_wide_steps(self, directions: torch.Tensor) -> None:
+        """Begin anew from here, with derivatives over wide steps."""
+        self.jacobian, self.directions = None, directions
+        self.damping, self.stalled, self.scores = FIRST_DAMPING, 0, [self.score]
 
     def trials(self) -> torch.Tensor:
         """Steps at several dampings, the favoured first, (trials, size)."""
@@ -165,7 +209,7 @@ def least_squares(
         batches, steps = [], []
         for descent in running:
             trials = descent.trials()
-            neighbours, step = perturbed(trials[0], colouring)
+            neighbours, step = descent.around(trials[0], colouring)
             if not descent.looks_around(trials[0], cfg):
                 neighbours = neighbours[:0]
             batches.append(rows_of(trials, neighbours))
@@ -184,12 +228,14 @@ def least_squares(
 def _find_jacobian(descent: Descent, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None) -> None:
     """Compute the Jacobian again, beside the descent's iterations."""
     seen = descent.x if descent.jacobian_x is None else descent.jacobian_x
-    neighbours, step = perturbed(seen, colouring)
+    descent.directions = descent.jacobian_directions
+    neighbours, step = descent.around(seen, colouring)
     batch = torch.cat([seen[None], neighbours, descent.x[None]])
     residuals = evaluator.residuals(evaluator.space.to_physical(batch), where)
-    there = jacobian(residuals.rows(0, len(batch) - 1), step, colouring)
-    descent.jacobian = replace(there, residuals=residuals.rows(len(batch) - 1, len(batch)))
-    descent.jacobian_x, descent.lost_jacobian = seen, False
+    descent.look(seen, residuals.rows(0, len(batch) - 1), step, colouring)
+    if descent.jacobian is not None:
+        descent.jacobian = replace(descent.jacobian, residuals=residuals.rows(len(batch) - 1, len(batch)))
+    descent.lost_jacobian = False
 
 
 def _advance(
@@ -224,6 +270,7 @@ def _advance(
         expected = descent.expected_gain(batch[0])
         descent.stalled = 0 if gain > cfg.score_tolerance * descent.score else descent.stalled + 1
         fresh, looked = descent.is_fresh, len(batch) > len(DAMPING_TRIALS)
+        was_narrow = descent.directions is None
         if gain > 0:
             moved = float((batch[rows[best]] - descent.x).abs().max())
             descent.x, descent.score = batch[rows[best]].clone(), float(scores[rows[best]])
@@ -242,7 +289,10 @@ def _advance(
             descent.jacobian = None  # the derivatives are those of elsewhere: look around
         stands = expected < cfg.score_tolerance * descent.score or descent.stalled >= _STALLED
         descent.scores.append(descent.score)
-        if stands or _creeps(descent.scores, cfg.creep_tolerance):
+        turned_rough = was_narrow and descent.directions is not None
+        if turned_rough:
+            descent.stop_reason = None
+        elif stands or _creeps(descent.scores, cfg.creep_tolerance):
             if fresh:
                 descent.stop_reason = "converged"
             else:  # look around before it ends

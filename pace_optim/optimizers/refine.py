@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from pace_optim.optimizers.jacobian import Colouring, perturbed
+from pace_optim.optimizers.jacobian import Colouring
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
 
@@ -64,9 +64,11 @@ def _near_their_valleys(
     Ends that are far worse than the best, or next to it, are left out.
     """
     where = coarse.dataset.beginning(BEGINNING)
-    ends = [d.x for d in least_squares(coarse, colouring, starts, COARSE, on_iteration, where)]
+    ended = least_squares(coarse, colouring, starts, COARSE, on_iteration, where)
+    ends, directions = [d.x for d in ended], ended[0].directions
     candidates = torch.stack([*ends, *starts])
-    neighbours, step = perturbed(ends[0], colouring)  # most likely the best: its derivatives come in the same batch
+    likely = Descent(x=ends[0], directions=directions)  # the best: its derivatives come in the same batch
+    neighbours, step = likely.around(ends[0], colouring)
     residuals = evaluator.residuals(evaluator.space.to_physical(torch.cat([candidates, neighbours])))
     scores = residuals.score[: len(candidates)]
     kept: list[Descent] = []
@@ -75,7 +77,8 @@ def _near_their_valleys(
         if kept and not scores[i] < _MUCH_WORSE * scores.min():
             break
         if all(float((x - other.x).abs().max()) > _ANOTHER_VALLEY for other in kept):
-            kept.append(Descent(x=x, score=float(scores[i]), damping=_DAMPING_AFTER_COARSE, iteration=1))
+            damping = _DAMPING_AFTER_COARSE
+            kept.append(Descent(x=x, score=float(scores[i]), damping=damping, iteration=1, directions=directions))
     for descent in kept:
         if torch.equal(descent.x, ends[0]):
             around = torch.cat([residuals.error[:1], residuals.error[len(candidates) :]])

@@ -55,6 +55,7 @@ _CHECKPOINT = {
     "descent_state": ("f", 2),
     "descent_stop": ("U", 1),
     "descent_scores": ("U", 0),
+    "descent_directions": ("f", 4),
     "scores": ("U", 0),
 }
 """Kind of number and number of axes of each array of a checkpoint."""
@@ -153,6 +154,7 @@ class RunFolder:
             ).reshape(-1, 5),
             "descent_stop": np.array([d.stop_reason or "" for d in descents], dtype=str),
             "descent_scores": np.array(json.dumps([d.scores for d in descents])),
+            "descent_directions": _directions_of(descents),
             "scores": np.array(json.dumps(scores.to_dict())),
         }
         files: dict[Path, Writer] = {
@@ -172,6 +174,8 @@ class RunFolder:
         if not path.exists():
             raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. {_ANEW}")
         arrays = read_arrays(path, _ANEW)
+        before = np.zeros((len(arrays.get("descent_x", ())), 2, 0, 0))  # of a run that knew of no wide steps
+        arrays.setdefault("descent_directions", before)
         for name, (kind, axes) in _CHECKPOINT.items():
             if name not in arrays:
                 refuse(path, f"{name} is missing", _ANEW)
@@ -179,10 +183,8 @@ class RunFolder:
                 refuse(path, f"{name} is of another type or shape", _ANEW)
             if kind == "f" and np.isnan(arrays[name]).any():
                 refuse(path, f"{name} holds values that are no numbers", _ANEW)
-        if (
-            len({len(arrays[name]) for name in ("descent_x", "descent_jacobian_x", "descent_state", "descent_stop")})
-            > 1
-        ):
+        each = ("descent_x", "descent_jacobian_x", "descent_state", "descent_stop", "descent_directions")
+        if len({len(arrays[name]) for name in each}) > 1:
             refuse(path, "its descents are not of one number", _ANEW)
         if arrays["descent_state"].shape[1] != 5:
             refuse(path, "descent_state is of another shape", _ANEW)
@@ -212,3 +214,17 @@ class RunFolder:
     def write_json(self, name: str, content: Any) -> None:
         """A JSON file."""
         write_json(self.path / name, content)
+
+
+def _directions_of(descents: Sequence[Descent]) -> np.ndarray:
+    """Wide steps of descents, those to come and the present ones, (descents, 2, size, size); zero where there are none.
+
+    The size is 0 where no descent has any.
+    """
+    size = max((len(d.x) for d in descents if d.directions is not None), default=0)
+    result = np.zeros((len(descents), 2, size, size))
+    for row, descent in zip(result, descents, strict=True):
+        for each, directions in zip(row, (descent.directions, descent.jacobian_directions), strict=True):
+            if directions is not None:
+                each[:] = directions.numpy()
+    return result

@@ -10,6 +10,7 @@ import torch
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, units_for
 from pace_envs.tasks.pace import GLOBAL
+from pace_optim.optimizers.jacobian import Jacobian
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, times_noise
@@ -139,6 +140,17 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
         f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between; "
         "with a delay of 0 they still come too late. If the drive got more of them than were logged, this log cannot "
         "tell its parameters: log every command, on its own clock (des_time)."
+    ]
+
+
+def rough_motion(there: Jacobian) -> list[str]:
+    """Whether derivatives had to be taken over wide steps."""
+    if not there.is_wide:
+        return []
+    return [
+        "The motion is rough: a tiny change of a parameter changes it as much as a small one does, as where links "
+        "rattle against their stops. Derivatives and error bars are over steps as wide as the error that is left; what "
+        "rattles is left in it."
     ]
 
 
