@@ -25,6 +25,8 @@ _NOTHING = 1e-10
 _NOTHING_KNOWN = 1e6
 """Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
+HARDLY_KNOWN = 0.5
+"""A standard deviation above this part of the bound range leaves a parameter open, at a bound as anywhere."""
 SURE = 2.0
 """Standard deviations that tell a value from another."""
 ANYWHERE = 1 / 3
@@ -125,6 +127,10 @@ def uncertainty_of(
         told = np.zeros(size, dtype=bool)
         told[free] = SURE * np.sqrt(_covariance(hessian, middle, samples, free).diagonal().clip(0)) < inside[free]
         bound &= ~(near & told)
+    for entry in np.flatnonzero(bound & ~silent):
+        beside = np.flatnonzero(~(bound | silent | fixed) | (np.arange(size) == entry))
+        variance = _covariance(hessian, middle, samples, beside).diagonal()[np.searchsorted(beside, entry)]
+        bound[entry] = variance <= (2 * HARDLY_KNOWN) ** 2  # else it is there by chance
     free = np.flatnonzero(~(bound | silent | fixed))
     std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
     groups: dict[tuple[str, ...], bool] = {}

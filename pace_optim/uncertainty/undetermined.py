@@ -20,11 +20,7 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.uncertainty.other_solutions import AS_GOOD
-from pace_optim.uncertainty.uncertainty import SURE, Uncertainty
-
-HARDLY_KNOWN = 0.5
-"""A standard deviation above this part of the bound range leaves a parameter open."""
-
+from pace_optim.uncertainty.uncertainty import HARDLY_KNOWN, SURE, Uncertainty
 
 DELAY = f"delay/{GLOBAL}"
 """Label of the delay."""
