@@ -25,10 +25,10 @@ _NOTHING = 1e-10
 _NOTHING_KNOWN = 1e6
 """Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
-HARDLY_KNOWN = 0.5
-"""A standard deviation above this part of the bound range leaves a parameter open, at a bound as anywhere."""
 SURE = 2.0
 """Standard deviations that tell a value from another."""
+HARDLY_KNOWN = 1 / (2 * SURE)
+"""A standard deviation above this part of the bound range leaves a parameter open: it tells no value from the middle."""
 ANYWHERE = 1 / 3
 """Variance of a value that may be anywhere between its bounds, normalised to -1 and 1."""
 
