@@ -76,7 +76,7 @@ class Plant:
         data.qpos[:] = self.home
         mujoco.mj_forward(self.model, data)
         mujoco.mj_fullM(self.model, data, full)
-        return np.diag(full)[self.dofs]
+        return 1 / np.diag(np.linalg.inv(full))[self.dofs]  # that a torque meets; a loop on more oscillates
 
     def transmission(self, i: int) -> tuple[int, float]:
         """The joint that an actuator moves, of a tendon the first, and its length per radian."""

@@ -28,7 +28,7 @@ _WEAK_SHARE = 0.3
 SURE = 2.0
 """Standard deviations that tell a value from another."""
 HARDLY_KNOWN = 1 / (2 * SURE)
-"""A standard deviation above this part of the bound range leaves a parameter open: it tells no value from the middle."""
+"""A standard deviation above this part of the bound range leaves a parameter open: no value is told from the middle."""
 ANYWHERE = 1 / 3
 """Variance of a value that may be anywhere between its bounds, normalised to -1 and 1."""
 
