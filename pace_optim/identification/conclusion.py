@@ -21,7 +21,7 @@ from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.uncertainty.other_solutions import with_other_solutions
-from pace_optim.uncertainty.step_share import change_without_step, step_share
+from pace_optim.uncertainty.step_share import change_without_step, change_without_steps, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without_delay
 from pace_optim.uncertainty.warnings import fit_warnings, rough_motion
@@ -47,8 +47,8 @@ class _End:
     """Where the optimizers ended [rad]."""
     times: float | None
     """The same as a multiple of the noise."""
-    without_step: torch.Tensor | None = None
-    """How the motion would change without a physics step, (K, R, n) [rad]; ``None``: not known."""
+    without_steps: tuple[torch.Tensor, ...] = ()
+    """How the motion would change without a physics step, and if drives held no torque either, (K, R, n) [rad]."""
 
     @property
     def is_far(self) -> bool:
@@ -62,11 +62,11 @@ class _End:
         return end.with_step_share(run.problem.space)
 
     def with_step_share(self, space: ParameterSpace) -> _End:
-        """With error bars that know what comes from the physics step, where that is known."""
-        if self.without_step is None:
-            return self
-        share = step_share(self.jacobian, self.without_step, space, self.x, ~np.isnan(self.uncertainty.std))
-        return replace(self, uncertainty=self.uncertainty.with_step(share))
+        """With error bars that know what comes from the steps, where that is known."""
+        known, result = ~np.isnan(self.uncertainty.std), self.uncertainty
+        for change in self.without_steps:
+            result = result.with_step(step_share(self.jacobian, change, space, self.x, known))
+        return replace(self, uncertainty=result)
 
 
 def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> FitResult:
@@ -159,11 +159,12 @@ def _known_at(run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> A
 
 
 def _told_of_step(run: Optimization, end: _End) -> _End:
-    """What of each value comes from the physics step."""
+    """What of each value comes from the physics step, and from that of the drives' loops where nobody stated it."""
     run.progress.say("simulating with a finer step, to tell what comes from the step")
     space = run.problem.space
-    change = change_without_step(run.problem, space.to_physical(end.x), end.jacobian.residuals)
-    return replace(end, without_step=change).with_step_share(space)
+    physical, there = space.to_physical(end.x), end.jacobian.residuals
+    changes = [look(run.problem, physical, there) for look in (change_without_step, change_without_steps)]
+    return replace(end, without_steps=tuple(c for c in changes if c is not None)).with_step_share(space)
 
 
 def _with_prior(run: Optimization, outcome: Outcome, end: _End, left_open: list[str]) -> _End:

@@ -14,6 +14,7 @@ import torch
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.measured_effort import MeasuredDrives, read_drives
@@ -116,6 +117,27 @@ class Problem:
     def with_physics_dt(self, physics_dt: float) -> Problem:
         """The same with another physics step [s]."""
         return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
+
+    def with_drive_dt(self, drive_dt: float) -> Problem:
+        """The same with another step of the drives' own loops, and a physics step that is no longer [s]."""
+        plain = copy.deepcopy(self.plain_cfg)
+        for drive in plain.scene.robot.actuators.values():
+            drive.drive_dt = drive_dt
+        set_physics_dt(plain, min(plain.sim.dt, drive_dt), "drive_dt")
+        physics_dt = min(self.physics_dt, drive_dt)
+        return replace(self, plain_cfg=plain, env_cfg=_configured(plain, physics_dt, self.env_cfg.sim2real.effects))
+
+    @property
+    def assumes_loop_rate(self) -> bool:
+        """Whether drives hold their torque over a control step that nobody has stated as their loops'.
+
+        So are servos of a model file with gains, for which MuJoCo knows no loop but its own step, where ``drive_dt`` is
+        not told.
+        """
+        drives = self.plain_cfg.scene.robot.actuators.values()
+        stated = any(drive.implicit or drive.drive_dt is not None for drive in drives)
+        of_file = is_model_file(self.task) and not self.plain_cfg.sim2real.assumed_gains
+        return of_file and not stated and all(r.drive.stiffness is None for r in self.dataset.recordings)
 
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""

@@ -47,6 +47,9 @@ class FitResult(DriveResult):
     """The training error as a multiple of the measurement noise."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
     """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
+    assumes_loop_rate: bool = False
+    """Whether that is so of the drives' loops too, as nobody stated their rate: they hold their torque as commands
+    come."""
     std_means_nothing: bool = False
     """Whether the fit ended so far above the noise that its error bars say nothing."""
     measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -189,6 +192,7 @@ def make_result(
         parameters=values,
         delay_s=float(physical[space["delay"]]) * problem.control_dt,
         std=std,
+        assumes_loop_rate=problem.assumes_loop_rate,
         step_error={} if uncertainty.step is None else by_parameter(space, uncertainty.step),
         units=space.units,
         at_bound=list(uncertainty.at_bound),

@@ -22,8 +22,10 @@ def summary(result: FitResult) -> str:
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
     if result.step_error and not result.std_means_nothing:
-        step = f"{1e3 * result.physics_dt:g} ms"
-        lines.append(f"±: one standard deviation, of noise and of the error of the physics step of {step} together")
+        of = f"the physics step of {1e3 * result.physics_dt:g} ms"
+        if result.assumes_loop_rate:
+            of += " and of a loop whose rate nobody stated"
+        lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))
     lines.append(

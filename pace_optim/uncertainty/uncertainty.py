@@ -50,14 +50,16 @@ class Uncertainty:
     combinations: tuple[tuple[str, ...], ...] = ()
     """Those of them of which a combination moves nothing at all."""
     step: np.ndarray | None = None
-    """What of each value comes from the physics step, (size,), which ``std`` and ``correlation`` then know of."""
+    """What of each value comes from the steps of physics and drives, (size,), which ``std`` and ``correlation`` then
+    know of."""
 
     def with_step(self, share: np.ndarray) -> Uncertainty:
-        """The same, knowing what of each value comes from the physics step, (size,): an error of one size for all."""
+        """The same, knowing what of each value comes from a step, (size,): an error of one size for all."""
         std = np.hypot(self.std, share)
         scale = np.where(std > 0, std, 1.0)
         covariance = self.correlation * np.outer(self.std, self.std) + np.outer(share, share)
-        return replace(self, std=std, correlation=covariance / np.outer(scale, scale), step=share)
+        step = share if self.step is None else np.hypot(self.step, share)
+        return replace(self, std=std, correlation=covariance / np.outer(scale, scale), step=step)
 
 
 def estimate_uncertainty(
