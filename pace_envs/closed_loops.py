@@ -16,6 +16,8 @@ _LARGEST_STEP = 0.3
 """Largest change of a passive joint in a Newton step [rad or m]."""
 _CLOSED = 1e-9
 """A loop is closed when its constraints are met within this [m or rad]."""
+_FOLLOWS = 1e-6
+"""Speeds follow when their constraints are met within this part of the driven joints' speed."""
 _ON_THE_WAY = 20
 """Intermediate postures between a closed one and one that Newton's method does not reach at once."""
 
@@ -116,11 +118,17 @@ class ClosedLoops:
     def following(self, qpos: np.ndarray) -> np.ndarray:
         """How all speeds follow from those of the driven joints at a posture (nq,): v = T v_d, (nv, nv).
 
-        Columns of passive joints are of no meaning; one that nothing ties stands still.
+        Columns of passive joints are of no meaning; one that nothing ties stands still, and so does one that leans on
+        its stop where the others can follow without it.
         """
         jacobian, _ = self._constraints(qpos)
-        result = np.eye(self.model.nv)
-        result[self.passive] = -np.linalg.lstsq(jacobian[:, self.passive], jacobian, rcond=1e-9)[0]
+        driven, loose = np.setdiff1d(np.arange(self.model.nv), self.passive), self._off_their_stops(qpos)
+        for free in (loose, self.passive):
+            result = np.eye(self.model.nv)
+            result[self.passive] = 0.0
+            result[free] = -np.linalg.lstsq(jacobian[:, free], jacobian, rcond=1e-9)[0]
+            if np.abs(jacobian @ result[:, driven]).max(initial=0.0) <= _FOLLOWS or len(free) == len(self.passive):
+                break
         return result
 
     def gap(self, qpos: np.ndarray) -> tuple[float, str]:

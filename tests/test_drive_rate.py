@@ -58,3 +58,14 @@ def test_the_armature_is_sought_where_the_loop_is_stable(tmp_path, damping, rais
         assert (damping * 0.0025 + 0.5 * 200.0 * 0.0025**2) / (inertia + lower) == pytest.approx(2.0, rel=1e-3)
     else:
         assert lower == float(plain.lower[0])
+
+
+def test_the_longest_step_is_no_longer_than_a_drives_loop_whatever_step_is_asked_for():
+    """A diagnosis asks for half of the fit's: its first stage, at the longest, was refused."""
+    told = {"env_cfg": env_cfg(), "drive_dt": 0.0005}
+    for asked in (None, 0.0005, 0.00025):
+        problem = load_problem(BENCH, physics_dt=asked, **told)
+        assert problem.coarsest_dt == 0.0005 and problem.physics_dt == (asked or 0.0005)
+        problem.with_physics_dt(problem.coarsest_dt).make_env(1).close()
+    with pytest.raises(ValueError, match="expected a whole number of physics steps in drive_dt"):
+        load_problem(BENCH, physics_dt=0.00125, **told)

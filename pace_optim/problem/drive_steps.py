@@ -44,8 +44,21 @@ def set_control_step(cfg: PaceSim2realEnvCfg) -> None:
         drive.control_decimation = cfg.decimation
 
 
+def set_drive_rate(cfg: PaceSim2realEnvCfg, physics_dt: float | None) -> None:
+    """Make the longest physics step as fine as the drives' own rates.
+
+    Args:
+        cfg: The environment; it is changed.
+        physics_dt: The physics step that is asked for [s]; one that is longer than that is refused where drives are
+            built, and changes nothing here.
+    """
+    own = [drive.drive_dt for drive in cfg.scene.robot.actuators.values() if drive.drive_dt is not None]
+    if own and min(own) < cfg.sim.dt * (1 - 1e-9) and (physics_dt is None or physics_dt < min(own) * (1 + 1e-9)):
+        set_physics_dt(cfg, min(own), "drive_dt")
+
+
 def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
-    """Make the physics step as fine as the drives' own rates.
+    """Make the physics step as fine as drives that run continuously ask for.
 
     Args:
         cfg: The environment; it is changed.
@@ -54,9 +67,6 @@ def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
         The physics step at which drives that run continuously are simulated well [s]; ``None`` if the present one is
         fine enough, with Runge-Kutta's steps. A search may take the present one: it is stable.
     """
-    own = [drive.drive_dt for drive in cfg.scene.robot.actuators.values() if drive.drive_dt is not None]
-    if own and min(own) < cfg.sim.dt * (1 - 1e-9):
-        set_physics_dt(cfg, min(own), "drive_dt")
     if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
         cfg.scene.num_envs = 1
         env = ManagerBasedRLEnv(cfg)

@@ -19,7 +19,14 @@ from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
-from pace_optim.problem.drive_steps import check_loops, least_armature, of_joints, set_control_step, set_drive_step
+from pace_optim.problem.drive_steps import (
+    check_loops,
+    least_armature,
+    of_joints,
+    set_control_step,
+    set_drive_rate,
+    set_drive_step,
+)
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
@@ -210,6 +217,7 @@ def load_problem(
                 f"{drive.max_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
     cfg.scene.num_envs = 1
+    set_drive_rate(cfg, physics_dt)
     physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
