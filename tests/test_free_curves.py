@@ -215,7 +215,11 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     ):
         monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result, **__: result)
     robot = SimpleNamespace(
-        joint_names=("a", "b", "c", "d"), joint_types=all_hinges(4), dataset=run.problem.dataset, control_dt=0.0025
+        joint_names=("a", "b", "c", "d"),
+        joint_types=all_hinges(4),
+        trees=(),
+        dataset=run.problem.dataset,
+        control_dt=0.0025,
     )
     found = search_effects(robot, None, [spring], 3)
     assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]

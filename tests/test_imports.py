@@ -47,6 +47,7 @@ FLOORS = {
     "pace_optim/diagnosis/search": (
         ["state"],
         ["one_round", "pooling", "replace_effect"],
+        ["carried_links"],
         ["grow"],
         ["look_ahead"],
         ["search"],

@@ -141,7 +141,11 @@ def test_where_nothing_is_missing_no_effect_is_kept(run, monkeypatch):
     ):
         monkeypatch.setattr(module, name, lambda *_, made=made, **__: made)
     joints = SimpleNamespace(
-        joint_names=("a", "b", "c", "d"), joint_types=all_hinges(4), dataset=run.problem.dataset, control_dt=DT
+        joint_names=("a", "b", "c", "d"),
+        joint_types=all_hinges(4),
+        trees=(),
+        dataset=run.problem.dataset,
+        control_dt=DT,
     )
     found = search_effects(joints, None, [SPRING], 3)
     assert (found.verdict, found.paying, found.added) == ("nothing_missing", [], [])

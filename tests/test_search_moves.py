@@ -18,8 +18,8 @@ from pace_optim.diagnosis.search.state import Branch, Search
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import BASE, JointModel
 
-ELASTICITY, MOUNT, GAIN, SPRING = (
-    get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring")
+ELASTICITY, MOUNT, GAIN, SPRING, PAYLOAD = (
+    get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring", "payload")
 )
 FLOOR = 1e-4
 
@@ -103,14 +103,17 @@ def some(joints):
     return SimpleNamespace(joints=joints.nonzero()[:, 0].tolist())
 
 
-def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
+def searched(*joints, follow=stays, say=lambda _: None, log=unlogged, trees=()):
     """Where a search ends, and in which world."""
     world, n = World(*joints), len(joints)
     fits = InWorld(world.errors)
     cfg = DiagnosisCfg(off=("replace", "trim", "wide_steps"))
     model = base_model(n)
     floor = torch.full((n,), FLOOR, dtype=torch.float64)
-    base, candidates = Fitted.start(model, 0 * model.upper), [ELASTICITY, MOUNT, GAIN, SPRING]
+    base, candidates = (
+        Fitted.start(model, 0 * model.upper),
+        [ELASTICITY, MOUNT, GAIN, SPRING, *([PAYLOAD] if trees else [])],
+    )
     problem = SimpleNamespace(on_joints=some)
     search = Search(
         effects=candidates,
@@ -119,6 +122,7 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
         max_effects=3,
         fits=fits,
         cfg=cfg,
+        trees=trees,
         follow=follow,
         say=say,
         log=log,
@@ -129,9 +133,9 @@ def searched(*joints, follow=stays, say=lambda _: None, log=unlogged):
     return outcome, world
 
 
-def found(*joints, follow=stays):
+def found(*joints, follow=stays, trees=()):
     """The effects of each joint where a search ends, and how many rounds it tried."""
-    outcome, world = searched(*joints, follow=follow)
+    outcome, world = searched(*joints, follow=follow, trees=trees)
     return [{e.name for e in effects} for effects in world.effects_of(outcome.final)], world.rounds
 
 
@@ -248,6 +252,28 @@ def test_a_joint_that_nothing_explains_is_tried_no_more_than_twice():
 def test_near_the_floor_nothing_is_sought_a_second_time():
     hidden = after_the_neighbour(constant(0.25), {**constant(0.25), **mrad({(GAIN,): 0.1})})
     assert found(NEIGHBOUR, hidden) == ([{"joint_elasticity"}, set()], 1)
+
+
+CARRIED = constant(1.0) | mrad({(PAYLOAD,): 0.11, (GAIN,): 0.15, (PAYLOAD, GAIN): 0.11})
+
+
+@pytest.mark.parametrize(
+    ("own", "without", "with_it", "effects"),
+    [
+        (CARRIED, 0.1, 0.1, {"payload"}),
+        (CARRIED, 0.1, 2.0, {"torque_gain"}),  # the next best, which the joint above does not feel
+        (constant(1.0) | mrad({(PAYLOAD,): 0.11}), 0.1, 2.0, set()),
+        (CARRIED, 2.0, 0.1, {"payload"}),
+    ],
+)
+def test_an_effect_on_a_link_is_judged_by_all_joints_that_carry_it(own, without, with_it, effects):
+    """A payload of a joint whose neighbours were not explained yet took the joints above it from 0.1 to 10 mrad."""
+
+    def above(everyone):
+        return constant(with_it if everyone and PAYLOAD in everyone[1] else without)
+
+    assert found(above, own, trees=[[0, 1]])[0] == [set(), effects]
+    assert found(above, own, trees=[[0], [1]])[0] == [set(), {"payload"}]
 
 
 @pytest.mark.parametrize(

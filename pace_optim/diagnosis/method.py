@@ -82,6 +82,7 @@ def search_effects(
         fits=fits,
         try_effects=try_effects,
         cfg=cfg,
+        trees=[[problem.joint_names.index(name) for name in tree] for tree in problem.trees],
         follow=reference.follow,
         say=say,
         log=log,

@@ -43,15 +43,22 @@ class ReferenceUpdate:
         """
         self.say("motion of the robot with what was found")
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
+        made: list[tuple[TwinProblem, Fitted]] = []
         for _ in range(cfg.rounds):
             if alone and self.away(twins, now) < cfg.near:  # gravity is linear there
                 break
             before = now.score
             twins = self.along(self.path(now))
             now = self.fits.side_by_side(twins.in_windows(), [now], cfg.again)[0]
+            made.append((twins, now))
             if bool(((now.score <= self.enough**2) | (now.score > cfg.gain * before)).all()):
                 break
-        return twins, now
+        # joints that move each other may drive each other away
+        return (twins, now) if alone else min(made, key=lambda each: self._left(each[1]))
+
+    def _left(self, now: Fitted) -> float:
+        """Logarithm of what the joints' squared errors are above the floor together."""
+        return float((now.score / self.enough**2).clamp(min=1.0).log().sum())
 
     def away(self, twins: TwinProblem, now: Fitted) -> float:
         """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -15,6 +16,7 @@ from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.decisions import Decision
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fitted import Fitted
 
 
@@ -37,26 +39,49 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
         fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), search.say)
     models = dict(zip(begun, fitted, strict=True))
     after = dict(zip(begun, fits.validation_errors(problem, fitted), strict=True))
-    tried = search.tried_over_joints
     trials: list[list[Trial]] = [[] for _ in range(now.model.num_joints)]
     for effect, fitted_with in models.items():
         for j in now.model.allowed_joints(effect).nonzero()[:, 0].tolist():
             own = fitted_with.physical[j, fitted_with.model.columns(effect)].tolist()
             values = dict(zip([p.name for p in effect.parameters], own, strict=True))
             score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
-            trial = Trial(effect=effect, joint=j, screen_score=score, values=values)
-            trials[j].append(trial.judged(errors, after[effect], tried, first, cfg=cfg.judging))
-    found = replace(choose(trials, cfg=cfg.judging), models=models)
+            trials[j].append(Trial(effect=effect, joint=j, screen_score=score, values=values))
+    return replace(round_of(search, trials, errors, after, first), models=models)
+
+
+def round_of(
+    search: Search,
+    trials: Sequence[Sequence[Trial]],
+    before: BlockErrors,
+    after: Mapping[type[Effect], BlockErrors],
+    first: bool,
+    **facts: Any,
+) -> Round:
+    """What each joint takes of what was tried on it, and the decision in the log.
+
+    Args:
+        search: What is looked for.
+        trials: Of each joint.
+        before: The present model's errors.
+        after: The errors with each effect.
+        first: Whether the present model has no effect yet.
+        facts: What the log needs beside.
+    """
+    tried, cfg = search.tried_over_joints, search.cfg.judging
+    found = choose([[t.judged(before, after[t.effect], tried, first, cfg=cfg) for t in own] for own in trials], cfg=cfg)
+    joints = [j for j, own in enumerate(trials) if own]
     made = Decision.of(
         "add",
-        range(len(trials)),
-        errors,
+        joints,
+        before,
         {effect.name: own for effect, own in after.items()},
         {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
         candidates=tried,
         first=first,
+        **facts,
     )
-    search.log(replace(made, taken=[None if effect is None else effect.name for effect in found.chosen]))
+    chosen = (found.chosen[j] for j in joints)
+    search.log(replace(made, taken=[None if effect is None else effect.name for effect in chosen]))
     return found
 
 

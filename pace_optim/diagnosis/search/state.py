@@ -56,6 +56,8 @@ class Search:
     """Shows how far it is."""
     log: Log = unlogged
     """Gets every decision."""
+    trees: Sequence[Sequence[int]] = ()
+    """Joints that move each other, by index; none: each moves itself alone."""
     follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]] = lambda problem, now: (problem, now)
     """Gives the joints along the motion of the robot with a model, and the model fitted there."""
 
