@@ -16,6 +16,8 @@ _LARGEST_STEP = 0.3
 """Largest change of a passive joint in a Newton step [rad or m]."""
 _CLOSED = 1e-9
 """A loop is closed when its constraints are met within this [m or rad]."""
+_RATTLES = 0.01
+"""A joint that the loops leave free leans on its stop on average, if it is nearer to it than this part of its range."""
 _FOLLOWS = 1e-6
 """Speeds follow when their constraints are met within this part of the driven joints' speed."""
 _ON_THE_WAY = 20
@@ -106,23 +108,29 @@ class ClosedLoops:
             there, other = self._newton(there, self.passive)
         return there if other < gap else here
 
-    def _off_their_stops(self, qpos: np.ndarray) -> np.ndarray:
-        """Passive degrees of freedom without those of joints that lean on a stop: they stay there if loops let them."""
+    def _off_their_stops(self, qpos: np.ndarray, near: float = 0.0) -> np.ndarray:
+        """Passive degrees of freedom without those of joints that lean on a stop: they stay there if loops let them.
+
+        Args:
+            qpos: A posture, (nq,).
+            near: The part of its range by which a joint may be off its stop.
+        """
         model = self.model
         joints = model.dof_jntid[self.passive]
         place, (low, high) = qpos[model.jnt_qposadr[joints]], model.jnt_range[joints].T
         single = model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_BALL
-        leans = model.jnt_limited[joints].astype(bool) & single & ((place <= low) | (place >= high))
+        slack = near * (high - low)
+        leans = model.jnt_limited[joints].astype(bool) & single & ((place <= low + slack) | (place >= high - slack))
         return self.passive[~leans]
 
     def following(self, qpos: np.ndarray) -> np.ndarray:
         """How all speeds follow from those of the driven joints at a posture (nq,): v = T v_d, (nv, nv).
 
         Columns of passive joints are of no meaning; one that nothing ties stands still, and so does one that leans on
-        its stop where the others can follow without it.
+        its stop, or rattles there, where the others can follow without it.
         """
         jacobian, _ = self._constraints(qpos)
-        driven, loose = np.setdiff1d(np.arange(self.model.nv), self.passive), self._off_their_stops(qpos)
+        driven, loose = np.setdiff1d(np.arange(self.model.nv), self.passive), self._off_their_stops(qpos, _RATTLES)
         for free in (loose, self.passive):
             result = np.eye(self.model.nv)
             result[self.passive] = 0.0

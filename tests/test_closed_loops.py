@@ -71,6 +71,13 @@ def test_what_a_spring_holds_against_a_stop_is_there_wherever_the_crank_is(tmp_p
         robot.write_joint_state_to_sim(torch.tensor([[position]]), torch.zeros(1, 1))
         assert robot.closed_loops.gap(sim.qpos[0].numpy())[0] < 1e-8
         assert float(sim.qpos[0, tip]) == pytest.approx(0.0, abs=1e-2)  # it was at -0.64
+    resting = robot.closed_loops.following(sim.qpos[0].numpy())[:, 0]
+    assert resting[tip] == 0.0 and np.abs(resting[1:]).max() > 0.1
+    for off, still in ((-0.004, True), (-0.1, False)):  # it rattles; it has been pushed away
+        moved = sim.qpos[0].numpy().copy()
+        moved[tip] = off
+        there = robot.closed_loops.following(robot.closed_loops.close(moved))[:, 0]
+        assert (there[tip] == 0.0) == still and np.abs(there - resting).max() < (0.02 if still else 1.0)
     env.close()
 
 
