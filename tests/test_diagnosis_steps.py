@@ -44,6 +44,13 @@ def test_the_effects_of_joints_that_they_do_not_explain_are_not_kept():
     assert verdict(outcome_of([0.1, 1.0], [0.06, 1.0], [STRIBECK], [[True, False]]), floor[:2])[0] == "unknown"
 
 
+@pytest.mark.parametrize(("trees", "expected"), [([[0, 1]], "unknown"), ([[0], [1]], "effect")])
+def test_an_effect_that_harms_another_joint_as_much_is_not_what_is_missing(trees, expected):
+    """A backlash stood in for a filter of commands, and took the joint beside it from 0.07 to 0.36 mrad."""
+    outcome = replace(outcome_of([0.56, 0.07], [0.38, 0.36], [STRIBECK], [[True, False]]), trees=trees)
+    assert verdict(outcome, torch.full((2,), 0.05, dtype=torch.float64))[0] == expected
+
+
 @pytest.mark.parametrize(
     ("effect", "own", "stuck"),
     [

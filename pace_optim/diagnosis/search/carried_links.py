@@ -91,11 +91,15 @@ def _options(found: Round, joint: int) -> list[Trial]:
 
 
 def _other_rivals(found: Round, again: Round, joint: int) -> list[type[Effect]]:
-    """Rivals that were not judged again, of an effect that is not on the link either."""
-    chosen, judged_again = again.chosen[joint], [trial.effect for trial in again.trials[joint]]
+    """Rivals of an effect that is not on the link: those not judged again, and those on the link that pay there too.
+
+    What a mass does to other joints depends on where it sits, which its own joint does not tell.
+    """
+    chosen, trials = again.chosen[joint], again.trials[joint]
     if again is found or chosen is None or _on_link(chosen):
         return []
-    return [effect for effect in found.rivals[joint] if effect not in judged_again]
+    refuted = [trial.effect for trial in trials if not trial.significant or trial.effect in again.rivals[joint]]
+    return [effect for effect in _best(found, joint) if effect is not chosen and effect not in refuted]
 
 
 def _over_tree(search: Search, errors: BlockErrors, without: BlockErrors, joint: int) -> BlockErrors:

@@ -13,6 +13,7 @@ from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
+from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -37,7 +38,7 @@ def add_effects(
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
-    branch = without_idle(search, branch)
+    branch = without_idle(search, without_echoes(search, branch, errors))
     return Outcome(
         problem=branch.problem,
         base=base,
@@ -45,6 +46,7 @@ def add_effects(
         final=branch.now,
         final_errors=branch.errors,
         unevenness=size_consistency(branch.now),
+        trees=search.trees,
         rounds=[*branch.rounds, *([] if found is None else [found])],
         cfg=cfg,
     )
@@ -57,6 +59,35 @@ def added(search: Search, branch: Branch, found: Round) -> tuple[Branch, Round |
     if branch.rounds or ahead is None or not search.cfg.has("look_ahead"):
         return end, ahead
     return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)
+
+
+def without_echoes(search: Search, branch: Branch, base: BlockErrors) -> Branch:
+    """The branch with an effect on one alone of joints that move each other, where that is as good along its motion.
+
+    What one joint lacks moves the others too, which then seem to lack the same.
+
+    Args:
+        search: What is looked for.
+        branch: Where the search ended.
+        base: Errors of the base model.
+    """
+    for effect in branch.now.model.effects:
+        has = branch.now.model.has[branch.now.model.effects.index(effect)]
+        echoes = torch.zeros_like(has)
+        for tree in map(list, search.trees):
+            own = [j for j in tree if bool(has[j])]
+            echoes[[j for j in own if j != max(own, key=lambda j: float(base.mse[j]))]] = True
+        if effect.shared or not bool(echoes.any()) or not search.cfg.has("idle"):
+            continue
+        now = branch.now
+        start = Fitted.start(now.model.without_effect(effect, echoes), now.physical, tried=effect)
+        start = search.fits.side_by_side(branch.problem.in_windows(), [start], search.fits.cfg.again)[0]
+        without = search.along_own_motion(branch, start)
+        joints = [j for tree in search.trees for j in tree if bool(echoes[list(tree)].any())]
+        after = {effect.name: without.errors}
+        if len(decide("idle", joints, branch.errors, after, cfg=search.cfg, log=search.log)) == len(joints):
+            branch = without
+    return branch
 
 
 def without_idle(search: Search, branch: Branch) -> Branch:

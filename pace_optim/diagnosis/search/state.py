@@ -147,6 +147,8 @@ class Outcome:
     final_errors: BlockErrors
     unevenness: torch.Tensor
     """Of the final model's effects, before joints share values, (effects, n)."""
+    trees: Sequence[Sequence[int]] = ()
+    """Joints that move each other, by index; none: each moves itself alone."""
     rounds: Sequence[Round] = ()
     cfg: DiagnosisCfg = DEFAULT
     """The numbers that it was found with, and is judged by."""

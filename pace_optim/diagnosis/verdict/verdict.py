@@ -60,17 +60,26 @@ def final_verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float, Ou
 def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
     """Joints on which the effects found are what is missing, (n,) bool.
 
-    They explain at least half of the error above the floor, and not all of them are proxies. Near the
-    floor it does not matter how. How friction is smoothed at standstill is not missing where it makes less of an error
-    than would be a finding of its own.
+    They explain at least half of the error above the floor, less what they do to other joints of their tree, and not
+    all of them are proxies. Near the floor it does not matter how. How friction is smoothed at standstill is not
+    missing where it makes less of an error than would be a finding of its own.
 
     Args:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
     """
     excess, left = above_floor(outcome, floor)
+    left = left + _done_to_others(outcome, (left - excess).clamp(min=0.0))
     enough = (left <= (1 - outcome.cfg.verdict.most) * excess) & real_effects(outcome, floor).any(dim=0)
     return counts_as_missing(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
+
+
+def _done_to_others(outcome: Outcome, worse: torch.Tensor) -> torch.Tensor:
+    """By how much the other joints of each joint's tree are worse, (n,), of each joint's own, (n,) [rad²]."""
+    result = torch.zeros_like(worse)
+    for tree in map(list, outcome.trees):
+        result[tree] = worse[tree].sum() - worse[tree]
+    return result
 
 
 def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:
