@@ -110,6 +110,28 @@ def test_derivatives_over_directions_are_those_of_each_entry_for_trees_side_by_s
     assert not directions[4].any() and directions[1].count_nonzero() == 1  # fixed; at its bound: alone
 
 
+@pytest.mark.parametrize(
+    ("joints", "colours"),
+    [
+        (((0, 1), (2, 3), (0, 1), (2, 3)), ((0, 1), (2, 3))),  # legs alike, and nothing moves all: a fault on a Go2
+        (((0,), (1,), (2,), (0, 1), (0, 1, 2)), ((0, 1, 2), (3,), (4,))),  # one moves some of the trees
+    ],
+)
+def test_derivatives_over_directions_are_right_whatever_moves_what(joints, colours):
+    n, size = 1 + max(max(moved) for moved in joints), len(joints)
+    slope = torch.randn(50, n, size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for entry, moved in enumerate(joints):
+        slope[:, sorted(set(range(n)) - set(moved)), entry] = 0.0
+    colouring, residuals = linear(joints, colours, slope)
+    x, directions = torch.linspace(-0.4, 0.4, size).double(), 1e-2 * torch.eye(size, dtype=torch.float64)
+    for _ in range(2):
+        vectors, steps = moved_along(x, directions, colouring)
+        there = jacobian_over(residuals(torch.cat([x[None], vectors])), steps, colouring)
+        directions = principal_directions(there, x)
+        for entry, moved in enumerate(joints):
+            torch.testing.assert_close(there.column(entry)[:, 0, list(moved)], slope[:, list(moved), entry])
+
+
 def test_a_rough_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
     whole = least_squares(Rattling(), DENSE, [start()])[0]
     for stop in range(1, whole.iteration):

@@ -62,8 +62,7 @@ def principal_directions(there: Jacobian, x: torch.Tensor) -> torch.Tensor:
         if joints[i]:  # an entry without joints is fixed
             result[i, i] = 1.0 if float(hessian[i, i]) <= 0 else (score / float(hessian[i, i])) ** 0.5
     trees = {joints[i] for i in inner}
-    widest = max((len(tree) for tree in trees), default=0)
-    shared = [i for i in inner if len(joints[i]) == widest] if len(trees) > 1 else []
+    shared = [i for i in inner if any(set(tree) < set(joints[i]) for tree in trees)]
     own = [i for i in inner if i not in shared]
     for tree in trees:
         at = torch.tensor([i for i in own if joints[i] == tree], dtype=torch.long)
