@@ -47,6 +47,8 @@ class Uncertainty:
     """Labels of parameters that do not move the joints."""
     indistinguishable: tuple[tuple[str, ...], ...]
     """Sets of labels that the recording cannot tell apart."""
+    by_chance: tuple[str, ...] = ()
+    """Labels of those at a bound that could be anywhere between their bounds."""
     combinations: tuple[tuple[str, ...], ...] = ()
     """Those of them of which a combination moves nothing at all."""
     step: np.ndarray | None = None
@@ -129,11 +131,12 @@ def uncertainty_of(
         told = np.zeros(size, dtype=bool)
         told[free] = SURE * np.sqrt(_covariance(hessian, middle, samples, free).diagonal().clip(0)) < inside[free]
         bound &= ~(near & told)
-    for entry in np.flatnonzero(bound & ~silent):
-        beside = np.flatnonzero(~(bound | silent | fixed) | (np.arange(size) == entry))
-        variance = _covariance(hessian, middle, samples, beside).diagonal()[np.searchsorted(beside, entry)]
-        bound[entry] = variance <= (2 * HARDLY_KNOWN) ** 2  # else it is there by chance
     free = np.flatnonzero(~(bound | silent | fixed))
+    by_chance = []
+    for entry in np.flatnonzero(bound & ~silent):
+        beside = np.sort(np.append(free, entry))
+        variance = _covariance(hessian, middle, samples, beside).diagonal()[np.searchsorted(beside, entry)]
+        by_chance += [space.labels[entry]] if variance > (2 * HARDLY_KNOWN) ** 2 else []
     std, correlation = np.full(size, np.nan), np.full((size, size), np.nan)
     groups: dict[tuple[str, ...], bool] = {}
     if len(free):
@@ -151,6 +154,7 @@ def uncertainty_of(
         std=std,
         correlation=correlation,
         at_bound=tuple(labels[i] for i in np.flatnonzero(bound)),
+        by_chance=tuple(by_chance),
         no_influence=tuple(labels[i] for i in np.flatnonzero(silent)),
         indistinguishable=tuple(groups),
         combinations=tuple(group for group, nothing in groups.items() if nothing),

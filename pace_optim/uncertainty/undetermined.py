@@ -50,9 +50,9 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
 
 
 def _wide(space: ParameterSpace, uncertainty: Uncertainty) -> set[str]:
-    """Labels of what has an error bar as wide as its bounds."""
+    """Labels of what has an error bar as wide as its bounds, or would have one but for being at a bound."""
     wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
-    return {label for label, yes in zip(space.labels, wide, strict=True) if yes}
+    return {label for label, yes in zip(space.labels, wide, strict=True) if yes} | set(uncertainty.by_chance)
 
 
 def _origins(uncertainty: Uncertainty) -> set[str]:
