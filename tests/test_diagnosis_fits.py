@@ -10,7 +10,7 @@ from diagnoses import FITS, joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis.beginning.data_check import check_data
+from pace_optim.diagnosis.beginning.data_check import check_data, unstamped
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.single_joint_fits import base_fit
@@ -158,6 +158,12 @@ def test_what_only_another_physics_step_leaves_counts_as_noise(bench):
             assert float(check.floor) < 0.5 * float(left) and not said
         else:
             assert check.floor == pytest.approx(floor) and "2.5 ms" in said[0] and "on servo" in said[0]
+
+
+@pytest.mark.parametrize(("began", "said"), [([0.0, 0.0], 1), ([1.7e9, 1.7e9 + 60], 0), ([0.0], 0)])
+def test_recordings_that_nothing_places_in_time_are_said_to_count_in_their_order(began, said):
+    """An arm's friction was cold anew in each: "unknown", and no word of why one recording alone would show it."""
+    assert len(unstamped([SimpleNamespace(start_stamp=start, duration=10.0) for start in began])) == said
 
 
 def test_a_fit_that_starts_at_the_truth_stays_there(bench):

@@ -13,6 +13,7 @@ from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
+from pace_optim.recording import Recording
 from pace_optim.recording.noise import lattice_step, noise_floor
 from pace_optim.recording.sessions import session_starts
 from pace_optim.run.result import FitResult
@@ -86,11 +87,7 @@ def check_data(
         f"{_count(len(data.recordings), 'recording')} with {_count(len(loads), 'load')} and "
         f"{_count(len(gains), 'set')} of gains."
     )
-    if len(data.recordings) > 1 and not any(session_starts(data.recordings)[1]):
-        sentences.append(
-            "No time stamps say when they were made: they count as made one after another, in this order. A friction "
-            "that falls anew in each, from cold, shows in one of them alone."
-        )
+    sentences += unstamped(data.recordings)
     floor = (noise**2 + numerical**2).sqrt()
     if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
         by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
@@ -113,6 +110,16 @@ def check_data(
         loads=len(loads),
         gains=len(gains),
     )
+
+
+def unstamped(recordings: Sequence[Recording]) -> list[str]:
+    """What is assumed of when recordings were made, where nothing says it."""
+    if len(recordings) < 2 or any(session_starts(recordings)[1]):
+        return []
+    return [
+        "No time stamps say when they were made: they count as made one after another, in this order. A friction that "
+        "falls anew in each, from cold, shows in one of them alone."
+    ]
 
 
 def _by_type(values: torch.Tensor, types: Sequence[JointType], say: Callable[[torch.Tensor, str], str]) -> str:
