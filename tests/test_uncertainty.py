@@ -11,7 +11,8 @@ from pace_optim.optimizers.least_squares import least_squares
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.uncertainty import autocovariance, estimate_uncertainty
+from pace_optim.uncertainty.uncertainty import Uncertainty, autocovariance, estimate_uncertainty
+from pace_optim.uncertainty.undetermined import _wide
 
 
 def linear(columns, error, names=None):
@@ -236,6 +237,16 @@ def test_a_value_that_could_be_anywhere_is_at_its_bound_by_chance(shown, told):
     jacobian, space = linear(columns, 2e-3 * rng.standard_normal(4000))
     found = estimate_uncertainty(jacobian, space, torch.tensor([-1.0, 0.0], dtype=torch.float64))
     assert found.at_bound == ("p0/j",) and found.by_chance == (() if told else ("p0/j",))
+
+
+@pytest.mark.parametrize(
+    ("std", "by_chance", "is_open"), [(0.49, (), False), (0.51, (), True), (np.nan, ("p0/j",), True)]
+)
+def test_what_two_error_bars_spread_over_its_bounds_is_open_and_so_is_what_is_at_one_by_chance(std, by_chance, is_open):
+    _, space = linear(np.ones((1, 4)), np.ones(4))  # bounds -1 and 1
+    known = {"correlation": np.eye(1), "at_bound": by_chance, "no_influence": (), "indistinguishable": ()}
+    uncertainty = Uncertainty(std=np.array([std]), by_chance=by_chance, **known)
+    assert _wide(space, uncertainty) == ({"p0/j"} if is_open else set())
 
 
 def test_everything_at_its_bound_is_survived():
