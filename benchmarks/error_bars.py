@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import least_squares
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording.dataset import make_dataset

@@ -22,21 +22,17 @@ from drive_problem import DriveProblem, drive_problem
 from solver_trace import Trace, machine, table, write_json
 from sysid_peer import Peer
 
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.least_squares import Descent
-from pace_optim.optimizers.refine import refine
-from pace_optim.optimizers.search import RefiningPays, search
+from pace_optim.optimizers.way_down import WayDown
 from pace_optim.terminal.cli import run_cli
 
 OURS = "pace least_squares"
 LEVELS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
-HYBRID_POPULATION = 48
 
 
-def run_ours(case: DriveProblem, hybrid: bool = False) -> Trace:
-    """Identify with our least squares from the centre of the bounds, or with the hybrid."""
+def run_ours(case: DriveProblem) -> Trace:
+    """Identify with our least squares from the centre of the bounds."""
     problem = case.problem
-    trace = Trace(solver="pace hybrid" if hybrid else OURS)
+    trace = Trace(solver=OURS)
     evaluator = problem.evaluator()
     iterations = 0
 
@@ -50,22 +46,8 @@ def run_ours(case: DriveProblem, hybrid: bool = False) -> Trace:
         best = min(descents, key=lambda d: d.score)
         note(best.x, best.score)
 
-    starts = [torch.zeros(problem.space.size, dtype=torch.float64)]
-    if hybrid:
-        optimizer = CMAESOptimizer(
-            problem.space, HYBRID_POPULATION, problem.env_cfg.sim2real.cmaes, trees=problem.trees
-        )
-        probe = RefiningPays(evaluator, case.colouring)
-
-        def after_generation(searching: CMAESOptimizer) -> None:
-            nonlocal iterations
-            iterations += 1
-            note(searching.best, searching.best_score)
-            probe(searching)
-
-        search(optimizer, evaluator.rollout(HYBRID_POPULATION), after_generation)
-        starts.insert(0, optimizer.best if probe.refined is None else probe.refined)
-    refine(evaluator, case.colouring, [Descent(x=start) for start in starts], after_iteration)
+    start = torch.zeros(problem.space.size, dtype=torch.float64)
+    WayDown(evaluator, case.colouring, on_iteration=after_iteration).run([start])
     trace.end(iterations, evaluator.simulated_steps)
     return trace
 
@@ -164,7 +146,6 @@ def main() -> int:
     parser.add_argument("--repetitions", type=int, default=3, help="runs of each solver, in turns")
     parser.add_argument("--optimizers", nargs="+", default=["mujoco"], help="of mujoco.sysid: mujoco, scipy, ...")
     parser.add_argument("--x_scale", default=None, choices=["jac"], help="the peer's scaling of parameters")
-    parser.add_argument("--hybrid", action="store_true", help="run our hybrid too")
     parser.add_argument("--output", type=Path, default=Path("logs/benchmarks"), help="folder of the plot and the JSON")
     parser.add_argument("--at_least", type=float, default=0.0, help="ratio to the lowest common score to be reached")
     args = parser.parse_args()
@@ -176,8 +157,6 @@ def main() -> int:
     print(f"{len(case.fitted)} parameters, {args.steps} steps, both simulators replay the truth to {off:.1e} rad\n")
     options = {} if args.x_scale is None else {"x_scale": args.x_scale}
     runners: list[Callable[[], Trace]] = [lambda: run_ours(case)]
-    if args.hybrid:
-        runners.append(lambda: run_ours(case, hybrid=True))
     runners += [lambda name=name: peer.run(name, **options) for name in args.optimizers]
     traces = median_runs(runners, args.repetitions)
     ratios = speed_ups(traces)

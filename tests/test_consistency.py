@@ -9,13 +9,13 @@ from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.tasks.pace import Parameter
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
 from pace_optim.uncertainty import consistency
-from pace_optim.uncertainty.assessment import assess, error_bars
+from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.consistency import check_consistency
 
 GAINS = {"soft": (60.0, 1.0), "middle": (85.0, 2.0), "stiff": (120.0, 4.0)}
@@ -117,13 +117,3 @@ def test_recordings_are_fitted_alone_from_the_derivatives_that_are_known(recordi
             assert (error is None) == (again is None)
             if error is not None and again is not None:
                 assert abs(one - other) < 0.5 * error and again == pytest.approx(error, rel=0.1)
-
-
-def test_error_bars_of_known_derivatives_are_those_of_a_whole_assessment(recordings):
-    problem = make_problem(recordings[:1])
-    evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
-    best = least_squares(evaluator, colouring, [torch.zeros(problem.space.size, dtype=torch.float64)])[0]
-    whole = assess(problem, evaluator, colouring, best.x)
-    again = error_bars(problem, evaluator, whole.jacobian, best.x)
-    assert np.allclose(again.std, whole.uncertainty.std, rtol=1e-6, equal_nan=True)
-    assert again.indistinguishable == whole.uncertainty.indistinguishable

@@ -15,7 +15,7 @@ from pace_optim.excitation import make_excitation
 from pace_optim.experiment_design import DesignCfg, optimize_motion
 from pace_optim.experiment_design.joint_motion import slowed
 from pace_optim.experiment_design.motion_check import MotionLimits, check_command
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import Recording, load_recording

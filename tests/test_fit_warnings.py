@@ -19,7 +19,7 @@ from problems import (
 )
 from scipy.optimize import brentq
 
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.recording import Load
 from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.uncertainty import Uncertainty

@@ -20,10 +20,12 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from pace_optim.optimizers.jacobian import Colouring, colour
+from pace_optim.optimizers.derivatives import Colouring, colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.optimizers.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.run.folder import RunFolder
+from pace_optim.run.history import History
 
 
 def refine(problem, *starts, cfg=None, **options):
@@ -65,17 +67,20 @@ def test_the_last_digits_are_reached_whatever_the_size_of_the_gradient():
     assert best.score <= 1e-18
 
 
-def test_near_the_end_derivatives_are_kept_and_a_step_costs_its_trials_only():
+def test_a_descent_ends_where_another_from_there_gains_nothing():
     told = record()
     problem = make_problem(dataclasses.replace(told, dof_pos=np.roll(told.dof_pos, 5, axis=0)))  # fits nothing exactly
-    evaluator, sizes = problem.evaluator(), []
-    simulate = evaluator.residuals
-    evaluator.residuals = lambda physical, where=None: (sizes.append(len(physical)), simulate(physical, where))[1]
-    best = refine(problem, evaluator=evaluator)[0]
-    neighbours = len(colour(problem.space, problem.trees, problem.joint_names).colours)
-    assert sizes.count(4) >= 2 and sizes[-1] == 4 and sizes[0] == 2 + neighbours  # one tells whether it is rough
-    again = refine(problem, best.x)[0]  # its derivatives are those at the end
-    assert again.score > (1 - LeastSquaresCfg().creep_tolerance) * best.score  # what a descent leaves
+    best = refine(problem)[0]
+    again = refine(problem, best.x)[0]
+    assert best.stop_reason == "converged"
+    assert again.score > (1 - LeastSquaresCfg().creep_tolerance) * best.score
+
+
+@pytest.mark.parametrize(("times", "part"), [(0.5, 1e-6), (3.0, 9e-6), (1e3, 5e-3)])
+def test_what_may_be_left_to_gain_grows_with_what_is_missing(times, part):
+    cfg = LeastSquaresCfg(noise_score=1e-8)
+    assert cfg.tolerance(times**2 * 1e-8) == pytest.approx(part)
+    assert LeastSquaresCfg().tolerance(1.0) == 1e-6  # the noise is unknown
 
 
 class Curved:
@@ -130,10 +135,10 @@ def test_a_truth_beyond_a_bound_ends_at_the_bound_with_the_others_optimal(name, 
     scores = problem.evaluator().residuals(problem.space.to_physical(torch.stack(moved))).score
     assert float(scores.min()) > best.score
     inside = [i for i in others if abs(float(best.x[i])) < 0.999]
-    gradient = best.jacobian.normal_equations()[1] if best.jacobian else None
-    if gradient is not None:
-        assert float(gradient[inside].abs().max()) < 1e-2 * float(gradient[entry].abs())
-        assert side * float(gradient[entry]) < 0  # downhill is outwards
+    best.gradient = None
+    _, gradient = best.look(problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names))
+    assert float(gradient[inside].abs().max()) < 1e-2 * float(gradient[entry].abs())
+    assert side * float(gradient[entry]) < 0  # downhill is outwards
 
 
 @pytest.mark.parametrize("corner", [-1.0, 1.0])
@@ -264,30 +269,21 @@ def test_of_several_starts_the_hopeless_are_dropped_and_the_best_comes_first():
         good, bad = torch.sin(3 * (x - 0.5)) / 3, 0.5 + 0 * x
         return torch.cat([good, torch.where(x < 0, bad + (x + 0.5) ** 2, 0 * x)])
 
-    cfg = LeastSquaresCfg(target_score=0.0, score_tolerance=0.0, step_tolerance=0.0)
-    starts = [torch.tensor([-0.9], dtype=torch.float64), torch.tensor([0.2], dtype=torch.float64)]
+    cfg = LeastSquaresCfg(target_score=1e-20, score_tolerance=1e-12, creep_tolerance=0.0)
+    starts = [torch.tensor([0.2], dtype=torch.float64), torch.tensor([-0.9], dtype=torch.float64)]
     best, worst = least_squares(Fake(two_valleys), dense(1), starts, cfg)
     assert float(best.x) == pytest.approx(0.5, abs=1e-6)
-    assert worst.stop_reason == "another start is far better" and worst.iteration <= 6 < best.iteration
+    assert worst.stop_reason == "another start is far better"
 
 
 def test_a_start_that_comes_down_beside_a_better_one_is_dropped():
     def one_valley(x):
         return torch.cat([torch.sinh(x - 0.2), torch.ones_like(x)])
 
-    cfg = LeastSquaresCfg(target_score=0.0, score_tolerance=-1.0, step_tolerance=-1.0, max_iteration=12)
     starts = [torch.tensor([value], dtype=torch.float64) for value in (0.5, -0.7)]
-    best, second = least_squares(Fake(one_valley), dense(1), starts, cfg)
+    best, second = least_squares(Fake(one_valley), dense(1), starts)
     assert second.stop_reason == "another start is in the same valley"
     assert float(best.x) == pytest.approx(0.2, abs=1e-6)
-
-
-def test_all_starts_and_trials_of_an_iteration_share_one_batch():
-    fake = Fake(lambda x: torch.sinh(x - 0.2))
-    starts = [torch.tensor([value, -value], dtype=torch.float64) for value in (0.5, -0.7, 0.9)]
-    descents = least_squares(fake, dense(2), starts)
-    assert len(fake.batches) == max(d.iteration for d in descents)
-    assert len(fake.batches[0]) == 3 * (1 + 2 + 1)  # x, two perturbed vectors, one that tells whether it is rough
 
 
 def test_the_score_never_rises_and_the_reported_one_is_that_of_x():
@@ -314,3 +310,71 @@ def test_starts_are_not_changed():
     refine(problem, start, cfg=LeastSquaresCfg(max_iteration=4))
     assert not start.any()
     assert dataclasses.is_dataclass(Descent)
+
+
+# ---------------------------------------------------------------- rattling, and going on
+
+
+SAMPLES, NOISE, RATTLE = 400, 0.1, 0.02
+TARGET = torch.tensor([-0.5, 0.3, 0.1], dtype=torch.float64)
+
+
+class Rattling:
+    """Residuals that are linear, with noise, and with a rattle of a fifth of it that a millionth changes.
+
+    A rotor's inertia, a delay that is nearly the same, and something else: one combination hardly moves anything.
+    """
+
+    def __init__(self, seed=0, rattle=RATTLE):
+        generator = torch.Generator().manual_seed(seed)
+
+        def draw(*shape):
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        self.slope = draw(SAMPLES, 3)
+        self.slope[:, 1] = 10 * self.slope[:, 0] + 3 * self.slope[:, 1]
+        self.noise, self.phase, self.wave = NOISE * draw(SAMPLES), 6 * draw(SAMPLES), 1e6 * draw(SAMPLES, 3)
+        self.rattle, self.space, self.rows = rattle, SimpleNamespace(to_physical=lambda x: x), 0
+
+    def residuals(self, x, where=None):
+        self.rows += len(x)
+        error = (x - TARGET) @ self.slope.T + self.noise + self.rattle * torch.sin(x @ self.wave.T + self.phase)
+        where = torch.ones(SAMPLES, 1, dtype=torch.bool)
+        return Residuals(error=error[..., None, None], where=where, step=torch.arange(SAMPLES))
+
+
+def rattling_start():
+    return torch.tensor([0.5, 0.0, -0.5], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_weak_combination_is_found_and_its_error_bars_are_those_without_the_rattle(seed):
+    """Over narrow steps its derivative was the rattle's: it hardly moved, with error bars near zero."""
+    rattling, calm = Rattling(seed), Rattling(seed, rattle=0.0)
+    best, right = (least_squares(each, dense(3), [rattling_start()])[0] for each in (rattling, calm))
+    bars = []
+    for end, on in ((best, rattling), (right, calm)):
+        end.gradient = None
+        hessian, _ = end.look(on, dense(3))
+        bars.append((torch.linalg.inv(hessian) * end.score / SAMPLES).diagonal().sqrt())
+    assert torch.allclose(bars[0], bars[1], rtol=0.25)
+    assert ((best.x - TARGET).abs() < 3 * bars[0]).all()
+    assert best.score < 1.1 * (right.score + RATTLE**2 / 2)
+    assert best.iteration < 20 and rattling.rows < 200
+
+
+def test_a_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
+    whole = least_squares(Rattling(), dense(3), [rattling_start()])[0]
+    for stop in range(1, whole.iteration):
+
+        def interrupt(descents, stop=stop):
+            if descents[0].iteration == stop:
+                raise KeyboardInterrupt
+
+        descents = [Descent(x=rattling_start())]
+        with pytest.raises(KeyboardInterrupt):
+            least_squares(Rattling(), dense(3), descents, on_iteration=interrupt)
+        folder = RunFolder(tmp_path)
+        folder.write_checkpoint(None, descents, [], 0, History())
+        on = least_squares(Rattling(), dense(3), Descent.restore(folder.read_checkpoint()))[0]
+        assert torch.equal(on.x, whole.x) and on.scores == whole.scores and on.iteration == whole.iteration

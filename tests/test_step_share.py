@@ -9,7 +9,7 @@ from problems import CALM, chirp, env_cfg, make_problem, record
 from test_uncertainty import linear
 
 from pace_envs import set_physics_dt
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.step_share import change_without_step, change_without_steps, step_share

@@ -6,7 +6,7 @@ import torch
 from problems import TRUTH, chirp, env_cfg, make_problem, normalised, physical, record
 
 from pace_envs.tasks.pace import Parameter
-from pace_optim.optimizers.jacobian import Colouring, Jacobian, colour
+from pace_optim.optimizers.derivatives import Colouring, Jacobian, colour
 from pace_optim.optimizers.least_squares import least_squares
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import Uncertainty, uncertainty_of
 

@@ -10,7 +10,7 @@ import torch
 
 from pace_optim.excitation import Trajectory
 from pace_optim.experiment_design.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
-from pace_optim.optimizers.jacobian import Colouring, colour, perturbed
+from pace_optim.optimizers.derivatives import NARROW, Colouring, colour, stencil
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.assessment import Probes, make_probes
 
@@ -63,17 +63,24 @@ def information_of(
     """
     problem = problem_of(trajectories[:1])
     colouring = colour(problem.space, problem.trees, problem.joint_names)
-    probes = make_probes(x, perturbed(x, colouring), problem.trees, problem.joint_names)
+    around = stencil(x, colouring, first=NARROW)
+    probes = make_probes(x, around, problem.trees, problem.joint_names)
+    steps = around.steps.diagonal()
     at_once = max(1, _MEMORY // (len(probes.vectors) * trajectories[0].des_dof_pos.nbytes))
     result: list[Information] = []
     for start in range(0, len(trajectories), at_once):
         part = trajectories[start : start + at_once]
-        result += _simulated(problem_of(part), part, limits, probes, colouring)
+        result += _simulated(problem_of(part), part, limits, probes, steps, colouring)
     return result
 
 
 def _simulated(
-    problem: Problem, trajectories: Sequence[Trajectory], limits: MotionLimits, probes: Probes, colouring: Colouring
+    problem: Problem,
+    trajectories: Sequence[Trajectory],
+    limits: MotionLimits,
+    probes: Probes,
+    steps: torch.Tensor,
+    colouring: Colouring,
 ) -> list[Information]:
     encoder, torque = _positions(problem, probes)
     bias = problem.space.to_physical(probes.vectors[0])[problem.space["encoder_bias"]].numpy()
@@ -84,7 +91,7 @@ def _simulated(
         position = encoder[0, :, r].numpy() + bias
         initial = probes.initial(encoder[:, :, r])
         derivatives = encoder[1 : 1 + len(colouring.colours), :, r] - encoder[0, :, r]
-        blocks = [_block(derivatives, initial, tree, probes.step, colouring) for tree in trees]
+        blocks = [_block(derivatives, initial, tree, steps, colouring) for tree in trees]
         findings = [
             *check_command(trajectory, limits),
             *check_simulated(trajectory.time, position, torque[1:, r].numpy(), limits),

@@ -9,7 +9,7 @@ from typing import Any
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
 from pace_envs.model_file.read import is_model_file
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.refine import BEGINNING
+from pace_optim.optimizers.way_down import WayDownCfg
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.processes import Processes
@@ -101,5 +101,5 @@ def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes
 def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
     """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
     if settings.optimizer == "hybrid":
-        problem = problem.on_beginnings(BEGINNING)
+        problem = problem.on_beginnings(WayDownCfg().part)
     return problem.training_evaluator()

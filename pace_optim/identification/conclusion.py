@@ -12,7 +12,7 @@ from pace_actuators.drive_result import ALL
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
-from pace_optim.optimizers.jacobian import Jacobian
+from pace_optim.optimizers.derivatives import Jacobian
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
@@ -20,7 +20,6 @@ from pace_optim.run.summary import summary
 from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
-from pace_optim.uncertainty.other_solutions import with_other_solutions
 from pace_optim.uncertainty.step_share import change_without_step, change_without_steps, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without_delay
@@ -41,6 +40,8 @@ class _End:
     """On all samples."""
     jacobian: Jacobian
     """On the training samples of the recordings that are trained on."""
+    noise: float
+    """The simulation's own noise [rad]."""
     left_open: list[str]
     """Labels of what the recordings leave open: it is at its prior."""
     train_rmse: float
@@ -106,7 +107,7 @@ def _result(
     every, consistency = end.residuals, consistency or Consistency()
     where = {"train": data.train[every.step], "validation": data.validation[every.step]}
     rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
-    uncertainty = with_other_solutions(end.uncertainty, run.descents, problem.space)
+    uncertainty = end.uncertainty
     physical = problem.space.to_physical(end.x)
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
     unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
@@ -130,8 +131,8 @@ def _result(
         times_noise=end.times,
         std_means_nothing=end.is_far,
         warnings=[
-            *far_end(end.times, end.train_rmse, settings.optimizer, run.searched, problem.joint_types),
-            *rough_motion(end.jacobian),
+            *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
+            *rough_motion(end.noise, float(end.jacobian.residuals.score[0])),
             *fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure),
             *consistency.sentences,
         ],
@@ -148,6 +149,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
         uncertainty=known.uncertainty,
         residuals=known.residuals,
         jacobian=known.jacobian,
+        noise=known.noise,
         left_open=[],
         train_rmse=train,
         times=times_noise(problem, train),
@@ -155,7 +157,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
 
 
 def _known_at(run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
-    return assess(run.problem, run.assessor, run.colouring, x, held, run.descents[0] if run.descents else None)
+    return assess(run.problem, run.assessor, run.colouring, x, held, run.descents[-1] if run.descents else None)
 
 
 def _told_of_step(run: Optimization, end: _End) -> _End:

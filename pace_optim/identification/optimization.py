@@ -1,20 +1,19 @@
-"""A fit's optimizers at work: search, refinement, other starts; every step can be resumed from."""
+"""A fit's optimizers at work; every step can be resumed from."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from pace_optim.identification.beginning import make_optimizer, make_searcher
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.jacobian import colour
-from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.optimizers.other_starts import other_valleys, scattered
-from pace_optim.optimizers.refine import COARSE, refine
-from pace_optim.optimizers.search import RefiningPays, agree_to_stop, search
+from pace_optim.optimizers.derivatives import colour
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg
+from pace_optim.optimizers.search import agree_to_stop, search
+from pace_optim.optimizers.way_down import PIECES, WayDown
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.problem.processes import Processes
@@ -23,14 +22,14 @@ from pace_optim.run.history import History
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, times_noise
-
-_SCATTERED = 2
-"""Of the other starts that are tried where the first one ended far above the noise, those anywhere in the bounds."""
+from pace_optim.uncertainty.honest_end import noise_score
+from pace_optim.uncertainty.undetermined import at_prior
 
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 _INTERRUPTED = "interrupted"
+_FEWEST_GENERATIONS = 10
+"""Of a search, whatever its budget."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -82,14 +81,23 @@ class Optimization:
         self.optimizer = (
             make_optimizer(problem, settings, self.processes) if settings.optimizer != "least_squares" else None
         )
-        self.descents: list[Descent] = []
+        self.way = WayDown(
+            self.evaluator,
+            self.colouring,
+            coarse=self.coarse,
+            noise_score=noise_score(problem),
+            on_iteration=self._after_iteration,
+        )
         self._steps_before = 0
         self._search_stop: list[str] = []
-        self.searched = False
-        """Whether other starts were tried and none ended lower."""
-        self._is_rough = False
+        self._searched = False
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
+
+    @property
+    def descents(self) -> list[Descent]:
+        """All descents so far, in the order in which they began."""
+        return self.way.descents
 
     @property
     def steps(self) -> int:
@@ -104,7 +112,7 @@ class Optimization:
         if self.optimizer is not None and checkpoint["history"].size:
             self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process)
             self._search_stop = checkpoint["search_stop"].tolist()
-        self.descents = Descent.restore(checkpoint)
+        self.way.descents = Descent.restore(checkpoint)
 
     def run(self, keep_interrupted: bool = True) -> Outcome:
         """Search and refine; interrupted, the best so far is kept, or the interruption is passed on."""
@@ -117,58 +125,33 @@ class Optimization:
             return Outcome(x=self._best_so_far(), stop_reasons=[_INTERRUPTED])
 
     def _optimize(self) -> Outcome:
-        """Least squares from the prior; where that ends far above the noise, from elsewhere: the hybrid searches."""
+        """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
         if self.optimizer is not None and self.settings.optimizer == "cmaes":
             self._search(self.optimizer)
             return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
         if self.settings.start is not None:
-            self.processes.agree(None)  # there is nothing to share: the others may go; so below
-            return self._refine_from(as_vector(self.problem, self.settings.start))
-        if not self.descents:
-            self.descents = [Descent(x=self.problem.space.start)]
-            self._write_checkpoint()
-        found, *others = self.descents
-        if others:  # resumed
-            self.processes.agree(None)
+            end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
-            self.descents = [found] = self._refine([found])
-            others = self._elsewhere(found)
-        if others:
-            self._try_others(found, others)
-        return Outcome(x=self.descents[0].x, stop_reasons=[*self._search_stop, str(self.descents[0].stop_reason)])
+            end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within)
+        if not self._searched:
+            self.processes.agree(None)  # there was nothing to share: the others may go
+        return Outcome(x=end.x, stop_reasons=[*self._search_stop, end.stop_reason])
 
-    def _refine_from(self, x: torch.Tensor) -> Outcome:
-        """Refine a known vector: it needs no coarse stage, and few steps."""
-        self.descents = least_squares(self.evaluator, self.colouring, [x], NEAR, self._after_iteration)
-        return Outcome(x=self.descents[0].x, stop_reasons=[str(self.descents[0].stop_reason)])
-
-    def _elsewhere(self, found: Descent) -> list[Descent]:
-        """Other starts, where a descent ended far above the noise: it may be in a wrong valley."""
-        rmse = (found.score / len(self.problem.joint_names)) ** 0.5
-        times = times_noise(self.problem, rmse)
-        if times is None or times < FAR_ABOVE_NOISE:
-            self.processes.agree(None)
-            return []
-        self.progress.say(f"{times:,.0f} times the noise: looking for other starts (Ctrl-C keeps what is found)")
+    def _starts(self) -> list[torch.Tensor]:
+        """The start of the parameters, and the same without the effects."""
         space = self.problem.space
-        if self.optimizer is None:
-            self.processes.agree(None)
-            vectors = [*other_valleys(space, found.x), *scattered(space, _SCATTERED, self.settings.seed)]
-        else:
-            vectors = [self._search(self.optimizer), *other_valleys(space, self.optimizer.best)]
-        return [Descent(x=x) for x in vectors]
+        added = [label for label in space.labels if "." in label]
+        return [space.start, at_prior(self.problem, space.start, added)] if added else [space.start]
 
-    def _try_others(self, found: Descent, others: Sequence[Descent]) -> None:
-        """Refine other starts, as far as an interrupted run had not done it yet."""
-        self.descents = [found, *others]
-        self._write_checkpoint()
-        self.descents = self._refine(others, [found])
-        self.searched = self.descents[0] is found
-
-    def _refine(self, starts: Sequence[Descent], found: Sequence[Descent] = ()) -> list[Descent]:
-        return refine(
-            self.evaluator, self.colouring, starts, self._after_iteration, found, self._on_beginning, self.coarse
-        )
+    def _search_within(self, budget: int) -> torch.Tensor:
+        """The best of a search of the pieces with a budget of simulations."""
+        optimizer = self.optimizer
+        if optimizer is None:
+            raise ValueError("This fit has no search.")
+        generations = max(_FEWEST_GENERATIONS, budget // optimizer.population_size)
+        optimizer.cfg = replace(optimizer.cfg, max_iteration=min(optimizer.cfg.max_iteration, generations))
+        self.progress.say("far above the noise: searching (Ctrl-C keeps what is found)")
+        return self._search(optimizer)
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
@@ -177,25 +160,20 @@ class Optimization:
         self.folder.write_mean(optimizer.generation, self.problem.space.to_physical(optimizer.mean))
 
     def _search(self, optimizer: CMAESOptimizer) -> torch.Tensor:
-        """Run CMA-ES; for the hybrid, until refining pays. Returns the best, which the hybrid has refined a little."""
-        probe = RefiningPays(self.searcher, self.colouring) if self.settings.optimizer == "hybrid" else None
+        """Run CMA-ES as far as an interrupted run had not; returns the best."""
 
         def after_generation(_: CMAESOptimizer) -> None:
-            if probe is not None:
-                probe(optimizer)
             self._after_generation(optimizer)
             agree_to_stop(optimizer, self.processes)
 
-        if probe is not None and optimizer.generation:  # resumed: perhaps right after the look that ended the search
-            with self.searcher.again():
-                probe(optimizer)
+        self._searched = True
         self.processes.agree((self.settings, optimizer.history, optimizer.line_generation))
         self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
         self._search_stop = optimizer.stop_reasons
         self._write_mean(optimizer)
-        return optimizer.best if probe is None or probe.refined is None else probe.refined
+        return optimizer.best
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history
@@ -218,24 +196,18 @@ class Optimization:
             self._saved["params"].append(optimizer.candidates)
             self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
 
-    def _on_beginning(self, descents: Sequence[Descent]) -> None:
-        """A descent on the beginnings of the recordings, which a resumed fit makes anew, says that it goes on."""
-        best, iteration = min(d.score for d in descents), max(d.iteration for d in descents)
-        self.progress.show("begin", iteration, COARSE.max_iteration, best, None, self.steps)
-
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
-        best = min(d.score for d in descents)
-        self.refuse_divergence(best)
-        if not self._is_rough and any(descent.directions is not None for descent in descents):
-            self._is_rough = True
-            self.progress.say("the motion is rough: going on with derivatives over wider steps")
-        self.descents = list(descents)
-        self.history.refine_best.append(best)
-        self.history.refine_steps.append(self.steps)
-        self.history.refine_time_s.append(self.progress.elapsed)
-        iteration = max(d.iteration for d in descents)
-        self.log.log_refinement(iteration, best)
-        self.progress.show("refine", iteration, LeastSquaresCfg().max_iteration, best, None, self.steps)
+        now = next((d for d in descents if not d.stop_reason), descents[-1])
+        best, on_pieces = min(d.score for d in descents), now.stage == PIECES
+        cfg = self.way.cfg.on_pieces if on_pieces else self.way.cfg.on_whole
+        if not on_pieces:
+            self.refuse_divergence(best)
+            self.history.refine_best.append(best)
+            self.history.refine_steps.append(self.steps)
+            self.history.refine_time_s.append(self.progress.elapsed)
+            self.log.log_refinement(now.iteration, best)
+        name = "begin" if on_pieces else "refine"
+        self.progress.show(name, now.iteration, cfg.max_iteration, best, None, self.steps)
         self._write_checkpoint()
 
     def refuse_divergence(self, score: float) -> None:
@@ -251,9 +223,11 @@ class Optimization:
             )
 
     def _best_so_far(self) -> torch.Tensor:
-        known = [d for d in self.descents if np.isfinite(d.score)]
-        if known:
-            return min(known, key=lambda d: d.score).x
+        stages = [[d for d in self.descents if (d.stage == PIECES) == on_pieces] for on_pieces in (False, True)]
+        for descents in stages:
+            known = [d for d in descents if np.isfinite(d.score)]
+            if known:
+                return min(known, key=lambda d: d.score).x
         if self.optimizer is not None and self.optimizer.generation:
             return self.optimizer.best
         return self.problem.space.start

@@ -15,6 +15,7 @@ import torch
 from pace_actuators.files import checked, json_text, refuse, write_atomically, write_json, write_tensors, writing
 from pace_actuators.files.writing import Writer
 from pace_envs.task_source import file_digest
+from pace_optim.optimizers.least_squares import Descent, checkpoint_of
 from pace_optim.run.history import History
 from pace_optim.run.resolved import resolved, write_model
 from pace_optim.terminal.arrays import read_arrays
@@ -22,7 +23,6 @@ from pace_optim.terminal.cli import command
 
 if TYPE_CHECKING:
     from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-    from pace_optim.optimizers.least_squares import Descent
     from pace_optim.problem.problem import Problem
 
 _README = """Identification of {robot} with {task}, started {started}.
@@ -50,12 +50,10 @@ _CHECKPOINT = {
     "line_generation": ("i", 0),
     "search_stop": ("U", 1),
     "simulated_steps": ("i", 0),
+    "descents": ("U", 0),
     "descent_x": ("f", 2),
-    "descent_jacobian_x": ("f", 2),
-    "descent_state": ("f", 2),
-    "descent_stop": ("U", 1),
-    "descent_scores": ("U", 0),
-    "descent_directions": ("f", 4),
+    "descent_hessian": ("f", 3),
+    "descent_gradient": ("f", 2),
     "scores": ("U", 0),
 }
 """Kind of number and number of axes of each array of a checkpoint."""
@@ -145,16 +143,7 @@ class RunFolder:
             "line_generation": np.array(optimizer.line_generation if optimizer else -1),
             "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),
-            "descent_x": np.stack([d.x.numpy() for d in descents]) if descents else np.zeros((0, 0)),
-            "descent_jacobian_x": np.stack([(d.x if d.jacobian_x is None else d.jacobian_x).numpy() for d in descents])
-            if descents
-            else np.zeros((0, 0)),
-            "descent_state": np.array(
-                [[d.score, d.damping, d.iteration, d.stalled, d.jacobian is not None] for d in descents]
-            ).reshape(-1, 5),
-            "descent_stop": np.array([d.stop_reason or "" for d in descents], dtype=str),
-            "descent_scores": np.array(json.dumps([d.scores for d in descents])),
-            "descent_directions": _directions_of(descents),
+            **checkpoint_of(descents),
             "scores": np.array(json.dumps(scores.to_dict())),
         }
         files: dict[Path, Writer] = {
@@ -174,20 +163,17 @@ class RunFolder:
         if not path.exists():
             raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. {_ANEW}")
         arrays = read_arrays(path, _ANEW)
-        before = np.zeros((len(arrays.get("descent_x", ())), 2, 0, 0))  # of a run that knew of no wide steps
-        arrays.setdefault("descent_directions", before)
         for name, (kind, axes) in _CHECKPOINT.items():
             if name not in arrays:
                 refuse(path, f"{name} is missing", _ANEW)
             if arrays[name].dtype.kind != kind or arrays[name].ndim != axes:
                 refuse(path, f"{name} is of another type or shape", _ANEW)
-            if kind == "f" and np.isnan(arrays[name]).any():
+            if kind == "f" and name != "descent_gradient" and np.isnan(arrays[name]).any():
                 refuse(path, f"{name} holds values that are no numbers", _ANEW)
-        each = ("descent_x", "descent_jacobian_x", "descent_state", "descent_stop", "descent_directions")
-        if len({len(arrays[name]) for name in each}) > 1:
-            refuse(path, "its descents are not of one number", _ANEW)
-        if arrays["descent_state"].shape[1] != 5:
-            refuse(path, "descent_state is of another shape", _ANEW)
+        try:
+            Descent.restore(arrays)
+        except (ValueError, TypeError, AttributeError, RecursionError):
+            refuse(path, "its descents do not fit together", _ANEW)
         return arrays
 
     def history_of(self, checkpoint: dict[str, np.ndarray]) -> History:
@@ -214,17 +200,3 @@ class RunFolder:
     def write_json(self, name: str, content: Any) -> None:
         """A JSON file."""
         write_json(self.path / name, content)
-
-
-def _directions_of(descents: Sequence[Descent]) -> np.ndarray:
-    """Wide steps of descents, those to come and the present ones, (descents, 2, size, size); zero where there are none.
-
-    The size is 0 where no descent has any.
-    """
-    size = max((len(d.x) for d in descents if d.directions is not None), default=0)
-    result = np.zeros((len(descents), 2, size, size))
-    for row, descent in zip(result, descents, strict=True):
-        for each, directions in zip(row, (descent.directions, descent.jacobian_directions), strict=True):
-            if directions is not None:
-                each[:] = directions.numpy()
-    return result

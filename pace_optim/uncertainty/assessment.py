@@ -8,16 +8,14 @@ from typing import Any
 
 import torch
 
-from pace_optim.optimizers.jacobian import Colouring, Jacobian
+from pace_optim.optimizers.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
 from pace_optim.optimizers.least_squares import Descent
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 
 _INITIAL_STEP = 1e-5
-"""Change of the first position for its derivative [rad]; where the motion is rough, the error that is left."""
-_LOOKS = 3
-"""Times that derivatives are taken where the motion turns out rough, the last over steps as wide as the error."""
+"""Change of the first position for its derivative [rad]; more where the simulation's own noise is more than that."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +28,8 @@ class Assessment:
     """On all samples, m = 1."""
     jacobian: Jacobian
     """On the training samples of the recordings that are trained on."""
+    noise: float
+    """The simulation's own noise [rad]."""
 
 
 def assess(
@@ -48,48 +48,25 @@ def assess(
         colouring: Which entries are perturbed together.
         x: Normalised, (size,).
         held: Labels of what is held where it is.
-        ended: What ended there or near it: where it found the motion rough, its wide steps are good there too.
+        ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
     """
-    data, here = problem.dataset, Descent(x=x)
-    if ended is not None:
-        here.directions, here.score = ended.directions, ended.score
-    looks = 1 if here.directions is not None else 1 + _LOOKS
-    for _ in range(looks):
-        shake = _INITIAL_STEP if here.directions is None else (here.score / len(problem.joint_names)) ** 0.5
-        around = here.around(x, colouring)
+    data, recordings = problem.dataset, problem.dataset.trained()
+    hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
+    for _ in range(2 if hessian is None else 1):
+        around = stencil(x, colouring, hessian, noise, score)
+        shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
         every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
-        recordings = data.trained()
         train = data.train[every.step][:, recordings]
         steps = train.any(dim=1)
         error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
         trained = Residuals(error=error, where=train[steps], step=every.step[steps])
-        here.score = float(trained.rows(0, 1).score[0])
-        here.look(x, trained, probes.step, colouring)
-        if here.directions is None:
-            break
-    assert here.jacobian is not None  # over wide steps it always is
-    initial = probes.initial(trained.error)
-    uncertainty = estimate_uncertainty(here.jacobian, problem.space, x, initial, probes.initial_joints, held)
+        there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
+        hessian, _ = there.normal_equations()
+    initial = probes.initial(error)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held)
     residuals = Residuals(error=every.error[:1], where=every.where, step=every.step)
-    return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=here.jacobian)
-
-
-def error_bars(problem: Problem, evaluator: Evaluator, there: Jacobian, x: torch.Tensor) -> Uncertainty:
-    """Error bars at x from derivatives that are known: only first positions are moved once more.
-
-    Args:
-        problem: What was fitted.
-        evaluator: Simulates the recordings that are trained on.
-        there: Residuals at x and derivatives there or near it, on the training samples.
-        x: Normalised, (size,).
-    """
-    residuals = there.residuals
-    shake = (float(residuals.score[0]) / len(problem.joint_names)) ** 0.5 if there.is_wide else _INITIAL_STEP
-    offset, joints = _shaken(problem.trees, problem.joint_names, shake)
-    shaken = evaluator.residuals(problem.space.to_physical(x.repeat(len(joints), 1)), initial_offset=offset)
-    initial = (shaken.error - residuals.error) / shake
-    return estimate_uncertainty(there, problem.space, x, initial, joints)
+    return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,11 +74,9 @@ class Probes:
     """The simulations that say how the residuals depend on the parameters and on the first positions."""
 
     vectors: torch.Tensor
-    """Normalised: x, its neighbours for the derivatives, then x once per set of joints, (m, size)."""
+    """Normalised: x, those around it, then x once per set of joints, (m, size)."""
     offset: torch.Tensor
     """Added to the first positions, (m, n) [rad]."""
-    step: torch.Tensor
-    """Of the neighbours, (size,) or, over wide steps, (size, size)."""
     initial_joints: tuple[tuple[int, ...], ...]
     """Joints whose first position is moved together: the i-th of each tree."""
     shake: float
@@ -114,7 +89,7 @@ class Probes:
 
 def make_probes(
     x: torch.Tensor,
-    around: tuple[torch.Tensor, torch.Tensor],
+    around: Stencil,
     trees: Sequence[Sequence[str]],
     joint_names: Sequence[str],
     shake: float = _INITIAL_STEP,
@@ -123,16 +98,15 @@ def make_probes(
 
     Args:
         x: Normalised vector, (size,).
-        around: Neighbours of x, (k, size), and their steps.
+        around: Vectors around x that tell the derivatives.
         trees: Groups of joints that do not influence each other.
         joint_names: All joints, in order.
         shake: How far first positions are moved [rad].
     """
-    neighbours, step = around
     moved, joints = _shaken(trees, joint_names, shake)
-    vectors = torch.cat([x[None], neighbours, x.repeat(len(joints), 1)])
+    vectors = torch.cat([x[None], around.vectors, x.repeat(len(joints), 1)])
     offset = torch.cat([torch.zeros(len(vectors) - len(joints), len(joint_names), dtype=torch.float64), moved])
-    return Probes(vectors=vectors, offset=offset, step=step, initial_joints=joints, shake=shake)
+    return Probes(vectors=vectors, offset=offset, initial_joints=joints, shake=shake)
 
 
 def _shaken(

@@ -10,12 +10,12 @@ import torch
 
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
-from pace_optim.optimizers.jacobian import Jacobian, colour, jacobian, perturbed
+from pace_optim.optimizers.derivatives import Jacobian, colour, stencil
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
-from pace_optim.uncertainty.assessment import assess, error_bars
+from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 DISAGREEMENT = 4.0
@@ -111,14 +111,10 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
     colouring = colour(problem.space, problem.trees, problem.joint_names)
     start = Descent(x=x.clamp(-1.0, 1.0).clone())
     if there is not None:
-        start.jacobian, start.jacobian_x, start.score = there, start.x.clone(), float(there.residuals.score[0])
-        start.scores, start.iteration = [start.score], 1
+        start.hessian, start.gradient = there.normal_equations()
+        start.scores = [float(there.residuals.score[0])]
     best = least_squares(evaluator, colouring, [start], _REFINE)[0]
-    uncertainty = (
-        assess(problem, evaluator, colouring, best.x).uncertainty
-        if best.jacobian is None
-        else error_bars(problem, evaluator, best.jacobian, best.x)
-    )
+    uncertainty = assess(problem, evaluator, colouring, best.x, ended=best).uncertainty
     return _Fit(score=best.score, x=best.x, uncertainty=uncertainty, simulated_steps=evaluator.simulated_steps)
 
 
@@ -241,9 +237,8 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
     problem, x = _with_gains(problem, x, range(problem.dataset.num_recordings))
     evaluator = problem.training_evaluator()
     colouring = colour(problem.space, problem.trees, problem.joint_names)
-    neighbours, step = perturbed(x, colouring)
-    residuals = evaluator.residuals(problem.space.to_physical(torch.cat([x[None], neighbours])))
-    there = jacobian(residuals, step, colouring)
+    around = stencil(x, colouring)
+    there = around.jacobian(evaluator.residuals(problem.space.to_physical(torch.cat([x[None], around.vectors]))))
     gains = {problem.space.slices[name].start for name in _GAINS.values()}
     rows = [c for c, entries in enumerate(colouring.colours) if gains & set(entries)]
     falls = []

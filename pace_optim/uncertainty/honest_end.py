@@ -22,34 +22,35 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
         problem: What was fitted.
         rmse: Of all joints [rad].
     """
+    noise = (noise_score(problem) / len(problem.joint_names)) ** 0.5
+    return rmse / noise if rmse and noise > 0 else None
+
+
+def noise_score(problem: Problem) -> float:
+    """The score that the recordings' noise alone leaves, Σ_joints of its mean variance [rad²]."""
     squares = [
         noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
         for recording in problem.dataset.recordings
         for j in range(recording.dof_pos.shape[1])
     ]
-    noise = float(np.sqrt(np.mean(squares)))
-    return rmse / noise if rmse and noise > 0 else None
+    return float(np.mean(squares)) * len(problem.joint_names)
 
 
-def far_end(
-    times: float | None, rmse: float, optimizer: str, searched: bool, joint_types: Sequence[JointType] = ()
-) -> list[str]:
+def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Sequence[JointType] = ()) -> list[str]:
     """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
 
     Args:
         times: Its error as a multiple of the noise.
         rmse: Its error [rad].
         optimizer: What ended there.
-        searched: Whether other starts were tried, and none ended lower.
         joint_types: Whether each joint turns or slides; none: all turn.
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
-    others = " Other starts ended no lower." if searched else ""
     search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
     unit = units_for("mrad", joint_types)
     return [
         f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: physics is missing, a fact "
-        f"of the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{others}{search} "
+        f"of the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{search} "
         f"{command('diagnose')} looks for what is missing."
     ]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim.optimizers.jacobian import Colouring, Jacobian
+from pace_optim.optimizers.derivatives import Colouring, Jacobian
 from pace_optim.problem.parameter_space import ParameterSpace
 
 AT_BOUND = 1e-3

@@ -14,16 +14,17 @@ from pace_actuators.drive_result import NOT_NEGATIVE
 from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace import GLOBAL
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
-from pace_optim.uncertainty.other_solutions import AS_GOOD
 from pace_optim.uncertainty.uncertainty import HARDLY_KNOWN, SURE, Uncertainty
 
 DELAY = f"delay/{GLOBAL}"
 """Label of the delay."""
+AS_GOOD = 1e-3
+"""A score within this part of another is as good."""
 BIAS = "encoder_bias"
 """Name of the biases."""
 

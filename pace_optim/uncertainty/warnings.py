@@ -10,7 +10,6 @@ import torch
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, units_for
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.optimizers.jacobian import Jacobian
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, times_noise
@@ -18,6 +17,8 @@ from pace_optim.uncertainty.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
 _NAMED = 3
+_ROUGH = 0.05
+"""Part of the error that is worth a word if the simulation's own noise makes it."""
 """Joints that a sentence names, at most."""
 _NOTHING = 1e-6
 """Errors below this are nothing to speak of [rad]."""
@@ -143,14 +144,13 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
     ]
 
 
-def rough_motion(there: Jacobian) -> list[str]:
-    """Whether derivatives had to be taken over wide steps."""
-    if not there.is_wide:
+def rough_motion(noise: float, score: float) -> list[str]:
+    """Whether the simulation's own noise [rad] is a part of the error (score [rad²]) that is worth a word."""
+    if noise < _ROUGH * score**0.5:
         return []
     return [
-        "The motion is rough: a tiny change of a parameter changes it as much as a small one does, as where links "
-        "rattle against their stops. Derivatives and error bars are over steps as wide as the error that is left; what "
-        "rattles is left in it."
+        "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
+        f"{100 * noise / score**0.5:.0f} % of the error. Derivatives use larger steps; error bars are less accurate."
     ]
 
 

@@ -1,4 +1,4 @@
-"""Finite differences: coloured as uncoloured, in agreement with central differences, never out of the bounds."""
+"""Finite differences: coloured as uncoloured, as central differences have them, and as wide as the noise asks."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from problems import (
     record,
 )
 
-from pace_optim.optimizers.jacobian import Colouring, Jacobian, colour, jacobian, perturbed
+from pace_optim.optimizers.derivatives import NARROW, Colouring, Jacobian, colour, stencil
 from pace_optim.problem.evaluator import Residuals
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}
@@ -33,9 +33,9 @@ def anymal():
 
 
 def differentiate(problem, x, colouring):
-    neighbours, step = perturbed(x, colouring)
-    residuals = problem.evaluator().residuals(problem.space.to_physical(torch.cat([x[None], neighbours])))
-    return jacobian(residuals, step, colouring)
+    around = stencil(x, colouring, first=NARROW)
+    vectors = torch.cat([x[None], around.vectors])
+    return around.jacobian(problem.evaluator().residuals(problem.space.to_physical(vectors)))
 
 
 def coloured(problem):
@@ -109,9 +109,9 @@ def test_normal_equations_are_those_of_the_dense_jacobian(pendulums):
 def test_steps_at_the_bounds_point_inwards(pendulums):
     x = torch.ones(pendulums.space.size, dtype=torch.float64)
     for corner in (x, -x):
-        neighbours, step = perturbed(corner, coloured(pendulums))
-        assert neighbours.abs().max() <= 1.0
-        assert torch.equal(step.sign(), -corner)
+        around = stencil(corner, coloured(pendulums))
+        assert around.vectors.abs().max() <= 1.0
+        assert torch.equal(around.steps.diagonal().sign(), -corner)
     at_lower = normalised(pendulums, PENDULUMS_TRUTH)
     at_lower[pendulums.space["friction"]] = -1.0
     column = differentiate(pendulums, at_lower, coloured(pendulums)).column(pendulums.space["friction"].start)
@@ -142,3 +142,85 @@ def test_the_normal_equations_are_the_same_however_the_residuals_lie_in_memory(s
     ]
     (hessian, gradient), *others = [each.normal_equations() for each in found]
     assert all(torch.equal(hessian, h) and torch.equal(gradient, g) for h, g in others)
+
+
+# ---------------------------------------------------------------- along principal directions, as wide as the noise asks
+
+
+def linear(joints, colours, slope):
+    """A colouring, and the residuals of rows of x by a slope (T, n, size)."""
+
+    def residuals(x):
+        error = torch.einsum("tns,ms->mtn", slope, x)[:, :, None] + 0.1
+        where = torch.ones(len(slope), 1, dtype=torch.bool)
+        return Residuals(error=error, where=where, step=torch.arange(len(slope)))
+
+    return Colouring(colours=colours, joints=joints), residuals
+
+
+def slope_of(joints, seed):
+    n, size = 1 + max(max(moved) for moved in joints if moved), len(joints)
+    slope = torch.randn(50, n, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    for entry, moved in enumerate(joints):
+        slope[:, sorted(set(range(n)) - set(moved)), entry] = 0.0
+    return slope
+
+
+@pytest.mark.parametrize(
+    ("joints", "colours", "at"),
+    [
+        # entries 0 and 2 move the first tree, 1 and 3 the second, 4 is fixed, 5 moves both
+        (((0,), (1, 2), (0,), (1, 2), (), (0, 1, 2)), ((0, 1), (2, 3), (5,)), (0.2, -0.9999, 0.3, 0.4, 0.0, -0.1)),
+        (((0, 1), (2, 3), (0, 1), (2, 3)), ((0, 1), (2, 3)), (-0.4, 0.0, 0.2, 0.4)),  # nothing moves all: a Go2
+        (
+            ((0,), (1,), (2,), (0, 1), (0, 1, 2)),
+            ((0, 1, 2), (3,), (4,)),
+            (-0.4, 0.0, 0.2, 0.4, 0.1),
+        ),
+        (((0,), (0,), (0,)), ((0,), (1,), (2,)), (1.0, -1.0, 0.3)),  # one at its upper and one at its lower bound
+        (((0,), (0,)), ((0,), (1,)), (1.0, -1.0)),
+    ],
+)
+@pytest.mark.parametrize("noise", [0.0, 0.01, 1.0])
+def test_derivatives_along_principal_directions_are_those_of_each_entry(joints, colours, at, noise):
+    slope, x = slope_of(joints, 0), torch.tensor(at, dtype=torch.float64)
+    colouring, residuals = linear(joints, colours, slope)
+    hessian, score = None, 0.0
+    for _ in range(3):
+        around = stencil(x, colouring, hessian, noise, score)
+        assert around.vectors.abs().max() <= 1.0
+        every = residuals(torch.cat([x[None], around.vectors]))
+        there = around.jacobian(every)
+        for entry, moved in enumerate(joints):
+            for joint in moved:
+                torch.testing.assert_close(
+                    there.column(entry)[:, 0, joint], slope[:, joint, entry], rtol=1e-4, atol=1e-6
+                )
+        (hessian, _), score = there.normal_equations(), float(every.score[0])
+        assert around.noise(every) < 1e-12
+
+
+def test_a_step_changes_the_motion_by_ten_times_the_noise_and_at_most_by_the_error():
+    joints, colours = ((0,),) * 3, ((0,), (1,), (2,))
+    slope = slope_of(joints, 1)
+    slope[..., 1] = 10 * slope[..., 0] + 0.3 * slope[..., 1]  # one combination hardly moves anything
+    hessian = torch.einsum("tni,tnj->ij", slope, slope) / len(slope)
+    x, colouring = torch.zeros(3, dtype=torch.float64), Colouring(colours=colours, joints=joints)
+    for noise, error, expected in ((1e-4, 1.0, 1e-3), (1.0, 0.02, 0.02)):
+        steps = stencil(x, colouring, hessian, noise, error**2).steps
+        changes = ((steps @ hessian) * steps).sum(dim=1).sqrt()
+        furthest = steps.abs().amax(dim=1) > 0.499  # as far as a step may go
+        assert furthest.sum() <= 1 and bool((changes <= expected * (1 + 1e-9)).all())
+        assert changes[~furthest].tolist() == pytest.approx([expected] * int((~furthest).sum()))
+
+
+def test_the_noise_of_a_rattle_is_measured():
+    wave = 1e7 * torch.randn(2000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def residuals(x):
+        error = (x.sum(dim=1)[:, None] + 0.02 * torch.sin(x @ wave.T))[..., None, None]
+        return Residuals(error=error, where=torch.ones(2000, 1, dtype=torch.bool), step=torch.arange(2000))
+
+    x, colouring = torch.tensor([0.3, -0.2], dtype=torch.float64), Colouring(colours=((0,), (1,)), joints=((0,),) * 2)
+    around = stencil(x, colouring)
+    assert around.noise(residuals(torch.cat([x[None], around.vectors]))) == pytest.approx(0.02 / 2**0.5, rel=0.1)

@@ -1,0 +1,132 @@
+"""The way of a fit from its starts to its result.
+
+1. Descend on short pieces: the first part of each recording, at the longest stable physics step.
+2. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
+   simulate a stated multiple of what the descents took. Descend again from its best.
+3. Descend on the whole recordings from the end that is best there.
+
+A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
+physics is missing, the fit ends early.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from pace_optim.optimizers.derivatives import Colouring
+from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.evaluator import Evaluator
+
+PIECES, WHOLE = "pieces", "whole"
+
+
+@dataclass(kw_only=True)
+class WayDownCfg:
+    """Numbers of the stages."""
+
+    part: float = 0.25
+    """Part of each recording that is a piece."""
+
+    on_pieces: LeastSquaresCfg = field(
+        default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
+    )
+    """Descents on pieces."""
+
+    on_whole: LeastSquaresCfg = field(default_factory=LeastSquaresCfg)
+    """Descents on the whole recordings."""
+
+    far: float = 3.0
+    """Times the noise above which the end of a descent on pieces may be a wrong valley."""
+
+    search_budget: float = 3.0
+    """Simulations of the search, in multiples of what the descents on pieces took."""
+
+
+class WayDown:
+    """The stages of one fit; its descents are all that it goes on from when it is resumed."""
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        colouring: Colouring,
+        *,
+        coarse: Evaluator | None = None,
+        noise_score: float = 0.0,
+        cfg: WayDownCfg | None = None,
+        on_iteration: Callable[[Sequence[Descent]], None] | None = None,
+    ):
+        """Prepare the stages.
+
+        Args:
+            evaluator: Simulates the whole recordings.
+            colouring: Which entries are perturbed together.
+            coarse: Simulates the pieces, at a longer physics step; ``None``: as the whole.
+            noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
+            cfg: Numbers of the stages.
+            on_iteration: Called with the stage's descents after each iteration.
+        """
+        self.cfg = cfg or WayDownCfg()
+        self.evaluator = evaluator
+        self.coarse = coarse or evaluator
+        self.colouring = colouring
+        self.noise_score = noise_score
+        self.descents: list[Descent] = []
+        """All so far, in the order in which they began."""
+        self._on_iteration = on_iteration or (lambda _: None)
+
+    def run(self, starts: Sequence[torch.Tensor], search: Callable[[int], torch.Tensor] | None = None) -> Descent:
+        """Go all the way; returns the best descent on the whole recordings.
+
+        Args:
+            starts: Normalised vectors, (size,).
+            search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
+        """
+        if not any(d.stage == WHOLE for d in self.descents):
+            starts = list(starts)
+            self._descend(PIECES, starts)
+            best = min(self.descents, key=lambda d: d.score)
+            if search is not None and self.is_far(best.score):
+                spent = sum(d.simulations for d in self.descents)
+                starts.append(search(round(self.cfg.search_budget * spent)))
+                self._descend(PIECES, starts)
+            self.descents.append(self._best_on_whole(starts))
+        return self._descend(WHOLE, [])
+
+    def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
+        """Descend on the whole recordings from a vector that is known to be near the best."""
+        if not self.descents:
+            self.descents = [Descent(x=x, stage=WHOLE)]
+        return self._descend(WHOLE, [], cfg)
+
+    def is_far(self, score: float) -> bool:
+        """Whether a score is above the noise by more than what a wrong valley may leave."""
+        return score > self.cfg.far**2 * self.noise_score and score > self.cfg.on_pieces.target_score
+
+    def _descend(self, stage: str, starts: Sequence[torch.Tensor], cfg: LeastSquaresCfg | None = None) -> Descent:
+        """Let a stage's descents end, the new ones among its starts too; returns the best."""
+        own = [d for d in self.descents if d.stage == stage]
+        added = [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=stage) for x in starts[len(own) :]]
+        own, self.descents = [*own, *added], [*self.descents, *added]
+        on_pieces = stage == PIECES
+        cfg = cfg or (self.cfg.on_pieces if on_pieces else self.cfg.on_whole)
+        evaluator = self.coarse if on_pieces else self.evaluator
+        where = evaluator.dataset.beginning(self.cfg.part) if on_pieces else None
+        cfg = replace(cfg, noise_score=self.noise_score)
+        return least_squares(evaluator, self.colouring, own, cfg, self._on_iteration, where)[0]
+
+    def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
+        """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""
+        ends = [d for d in self.descents if d.stage == PIECES]
+        vectors = torch.stack([*(d.x for d in ends), *starts])
+        scores = self.evaluator.residuals(self.evaluator.space.to_physical(vectors)).score
+        best = int(scores.argmin())
+        hessian = ends[best].hessian if best < len(ends) else None
+        known = [float(scores[best])] if bool(scores[best].isfinite()) else []
+        return Descent(x=vectors[best].clone(), stage=WHOLE, hessian=hessian, damping=_DAMPING, scores=known)
+
+
+_DAMPING = 1e-5
+"""Where a descent on the whole recordings begins: near its valley."""
