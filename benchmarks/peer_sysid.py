@@ -22,7 +22,7 @@ from drive_problem import DriveProblem, drive_problem
 from solver_trace import Trace, machine, table, write_json
 from sysid_peer import Peer
 
-from pace_optim.optimizers.way_down import WayDown
+from pace_optim.optimizers.way_down import WHOLE, WayDown, WayDownCfg
 from pace_optim.terminal.cli import run_cli
 
 OURS = "pace least_squares"
@@ -33,22 +33,22 @@ def run_ours(case: DriveProblem) -> Trace:
     """Identify with our least squares from the centre of the bounds."""
     problem = case.problem
     trace = Trace(solver=OURS)
-    evaluator = problem.evaluator()
+    evaluator, pieces = problem.evaluator(), problem.on_pieces(WayDownCfg().share).training_evaluator()
     iterations = 0
 
     def note(x: torch.Tensor, score: float) -> None:
         error = case.relative_error(problem.space.to_physical(x)[case.fitted])
-        trace.add(score, error, evaluator.simulated_steps)
+        trace.add(score, error, evaluator.simulated_steps + pieces.simulated_steps)
 
     def after_iteration(descents: list[Any]) -> None:
         nonlocal iterations
         iterations += 1
-        best = min(descents, key=lambda d: d.score)
-        note(best.x, best.score)
+        if descents[0].stage == WHOLE:
+            note(descents[0].x, descents[0].score)
 
     start = torch.zeros(problem.space.size, dtype=torch.float64)
-    WayDown(evaluator, case.colouring, on_iteration=after_iteration).run([start])
-    trace.end(iterations, evaluator.simulated_steps)
+    WayDown(evaluator, case.colouring, pieces=pieces, on_iteration=after_iteration).run([start])
+    trace.end(iterations, evaluator.simulated_steps + pieces.simulated_steps)
     return trace
 
 

@@ -2,7 +2,6 @@
 
 import os
 import sys
-from dataclasses import replace
 
 import torch
 
@@ -24,9 +23,8 @@ def main() -> None:
 
 def searched(task: str, processes: Processes) -> list:
     """All scores, where the search is and its best scores."""
-    problem = load_problem(task)
+    problem = load_problem(task).on_pieces(0.1)
     evaluator = problem.training_evaluator()
-    where = evaluator.dataset.beginning(0.1)
     optimizer = CMAESOptimizer(
         problem.space, 9, problem.env_cfg.sim2real.cmaes, trees=problem.trees, processes=processes
     )
@@ -37,7 +35,6 @@ def searched(task: str, processes: Processes) -> list:
         if optimizer.generation == GENERATIONS:
             optimizer.stop("enough")
 
-    evaluator.dataset = replace(evaluator.dataset, train=where)
     search(optimizer, evaluator.rollout(optimizer.num_shown), after_generation)
     where_it_is = [each.tolist() for each in (optimizer.best, optimizer.mean, optimizer.spread)]
     return [[scores.tolist() for scores in optimizer.history], where_it_is, optimizer.best_scores]

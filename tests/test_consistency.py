@@ -108,7 +108,7 @@ def test_recordings_are_fitted_alone_from_the_derivatives_that_are_known(recordi
     best = least_squares(evaluator, colouring, [start])[0]
     there = assess(problem, evaluator, colouring, best.x).jacobian
     anew, known = (check_consistency(problem, best.x, best.score, there=given) for given in (None, there))
-    assert known.simulated_steps < 0.95 * anew.simulated_steps
+    assert known.simulated_steps < anew.simulated_steps
     assert [text[:60] for text in known.sentences] == [text[:60] for text in anew.sentences]
     for label, std in anew.std.items():
         for one, other, error, again in zip(

@@ -281,7 +281,7 @@ def same_result(resumed, whole):
         ("hybrid", "_after_generation", 3),
         ("hybrid", "_after_iteration", 1),
         ("hybrid", "_after_iteration", 4),
-        ("hybrid", "_after_iteration", 20),
+        ("hybrid", "_after_iteration", 8),
         ("least_squares", "_after_iteration", 1),
         ("least_squares", "_after_iteration", 4),
     ],
@@ -403,5 +403,5 @@ def test_a_descent_begins_at_the_longest_step_that_the_drives_allow(tmp_path):
     run = Optimization(
         settings, load_for_fit(settings, load_env_cfg(settings.task)), RunFolder(tmp_path), ProgressLine()
     )
-    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.coarse))
+    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.pieces))
     assert fine < coarse == 0.0025

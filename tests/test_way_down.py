@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from problems import make_problem, normalised
+from problems import chirp, make_problem, normalised, record
 
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, checkpoint_of, least_squares
 from pace_optim.optimizers.way_down import PIECES, WHOLE, WayDown, WayDownCfg
-from pace_optim.recording.dataset import make_dataset
 
 
 @pytest.fixture(scope="module")
@@ -24,23 +23,18 @@ def centre(problem):
     return torch.zeros(problem.space.size, dtype=torch.float64)
 
 
-def test_the_beginning_is_the_first_quarter_of_the_training_samples(problem):
-    dataset = make_dataset(problem.dataset.recordings, train_fraction=0.7)
-    chosen, count = dataset.beginning(WayDownCfg().part), int(dataset.train.sum())
-    assert not bool((chosen & ~dataset.train).any())
-    assert int(chosen.sum()) == -(-count // 4)
-    assert bool(chosen[: int(chosen.sum())].all())
-
-
-def test_the_beginning_of_a_long_recording_is_no_longer_than_is_enough(problem, monkeypatch):
-    dataset = make_dataset(problem.dataset.recordings, train_fraction=0.7)
-    monkeypatch.setattr("pace_optim.recording.dataset._ENOUGH", 50)
-    chosen = dataset.beginning(WayDownCfg().part)
-    assert int(chosen.sum()) == 50 and bool((chosen[:50] & dataset.train[:50]).all())
+def test_pieces_are_a_share_of_the_windows_of_each_recording():
+    problem = make_problem([record(chirp(20.0)), record(chirp(3.0))])
+    pieces = problem.on_pieces(0.25).dataset
+    own = [sum(recording is each for each in pieces.recordings) for recording in problem.dataset.recordings]
+    seconds = problem.dataset.train.sum(dim=0) * problem.control_dt
+    assert own[1] == 1 and own[0] * 2.0 == pytest.approx(0.25 * float(seconds[0]), abs=2.0)
+    assert all(bool(each) for each in pieces.train.any(dim=0))
 
 
 def way(problem, colouring, **options):
-    return WayDown(problem.training_evaluator(), colouring, **options)
+    pieces = problem.on_pieces(0.25).training_evaluator()
+    return WayDown(problem.training_evaluator(), colouring, **{"pieces": pieces, **options})
 
 
 def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem, colouring):
@@ -61,11 +55,11 @@ def test_a_start_that_is_better_than_its_end_on_pieces_is_kept(problem, colourin
 
 
 def test_most_of_the_way_is_gone_at_the_longer_step(problem, colouring):
-    fine, coarse = problem.with_physics_dt(problem.physics_dt / 4), problem.training_evaluator()
-    staged, alone = way(fine, colouring, coarse=coarse), way(fine, colouring)
-    best, expected = staged.run([centre(problem)]), alone.run([centre(problem)])
+    fine, pieces = problem.with_physics_dt(problem.physics_dt / 4), problem.on_pieces(1.0).training_evaluator()
+    staged, plain = way(fine, colouring, pieces=pieces), fine.training_evaluator()
+    best, expected = staged.run([centre(problem)]), least_squares(plain, colouring, [centre(problem)])[0]
     torch.testing.assert_close(best.x, expected.x, atol=1e-4, rtol=0)
-    assert coarse.simulated_steps > 0 and staged.evaluator.simulated_steps < alone.evaluator.simulated_steps
+    assert pieces.simulated_steps > 0 and staged.evaluator.simulated_steps < plain.simulated_steps
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

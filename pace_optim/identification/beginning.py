@@ -101,5 +101,5 @@ def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes
 def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
     """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
     if settings.optimizer == "hybrid":
-        problem = problem.on_beginnings(WayDownCfg().part)
+        problem = problem.on_pieces(WayDownCfg().share)
     return problem.training_evaluator()

@@ -13,7 +13,7 @@ from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg
 from pace_optim.optimizers.search import agree_to_stop, search
-from pace_optim.optimizers.way_down import PIECES, WayDown
+from pace_optim.optimizers.way_down import PIECES, WayDown, WayDownCfg
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.problem.processes import Processes
@@ -28,7 +28,7 @@ from pace_optim.uncertainty.undetermined import at_prior
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 _INTERRUPTED = "interrupted"
-_FEWEST_GENERATIONS = 10
+_FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
 
@@ -72,8 +72,8 @@ class Optimization:
         self.progress = progress
         self.history = History()
         self.evaluator: Evaluator = problem.training_evaluator()
-        longest = problem.for_search()
-        self.coarse = longest.training_evaluator() if longest.physics_dt > problem.physics_dt else self.evaluator
+        pieces = problem.for_search().on_pieces(WayDownCfg().share)
+        self.pieces = pieces.training_evaluator()
         self.searcher = make_searcher(problem.for_search(settings.device), settings)
         self.assessor: Evaluator = problem.evaluator()
         self.processes = processes or Processes()
@@ -84,7 +84,7 @@ class Optimization:
         self.way = WayDown(
             self.evaluator,
             self.colouring,
-            coarse=self.coarse,
+            pieces=self.pieces,
             noise_score=noise_score(problem),
             on_iteration=self._after_iteration,
         )
@@ -102,7 +102,7 @@ class Optimization:
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        every = {self.searcher, self.coarse, self.evaluator, self.assessor}
+        every = {self.searcher, self.pieces, self.evaluator, self.assessor}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
@@ -135,7 +135,7 @@ class Optimization:
             end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
-        return Outcome(x=end.x, stop_reasons=[*self._search_stop, end.stop_reason])
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
 
     def _starts(self) -> list[torch.Tensor]:
         """The start of the parameters, and the same without the effects."""

@@ -20,7 +20,7 @@ from pace_optim.optimizers.derivatives import Colouring, stencil
 from pace_optim.optimizers.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
 from pace_optim.problem.evaluator import Evaluator
 
-_CREEPING = 4
+_CREEPING = 3
 _REFUSED = 2
 
 
@@ -39,7 +39,7 @@ class LeastSquaresCfg:
     """The largest such part."""
 
     creep_tolerance: float = 1e-4
-    """Stop when the score fell by less than this part of it in each of the last four iterations, on average."""
+    """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""

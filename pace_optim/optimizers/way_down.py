@@ -1,6 +1,7 @@
 """The way of a fit from its starts to its result.
 
-1. Descend on short pieces: the first part of each recording, at the longest stable physics step.
+1. Descend on pieces: windows of two seconds, a share of each recording, at the longest stable physics step. Over a
+   short time the error bends less, and has fewer valleys.
 2. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
    simulate a stated multiple of what the descents took. Descend again from its best.
 3. Descend on the whole recordings from the end that is best there.
@@ -27,8 +28,8 @@ PIECES, WHOLE = "pieces", "whole"
 class WayDownCfg:
     """Numbers of the stages."""
 
-    part: float = 0.25
-    """Part of each recording that is a piece."""
+    share: float = 0.25
+    """Share of each recording that the pieces make."""
 
     on_pieces: LeastSquaresCfg = field(
         default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
@@ -41,7 +42,7 @@ class WayDownCfg:
     far: float = 3.0
     """Times the noise above which the end of a descent on pieces may be a wrong valley."""
 
-    search_budget: float = 3.0
+    search_budget: float = 2.0
     """Simulations of the search, in multiples of what the descents on pieces took."""
 
 
@@ -53,7 +54,7 @@ class WayDown:
         evaluator: Evaluator,
         colouring: Colouring,
         *,
-        coarse: Evaluator | None = None,
+        pieces: Evaluator | None = None,
         noise_score: float = 0.0,
         cfg: WayDownCfg | None = None,
         on_iteration: Callable[[Sequence[Descent]], None] | None = None,
@@ -63,14 +64,14 @@ class WayDown:
         Args:
             evaluator: Simulates the whole recordings.
             colouring: Which entries are perturbed together.
-            coarse: Simulates the pieces, at a longer physics step; ``None``: as the whole.
+            pieces: Simulates the pieces; ``None``: the whole recordings are the pieces.
             noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
             cfg: Numbers of the stages.
             on_iteration: Called with the stage's descents after each iteration.
         """
         self.cfg = cfg or WayDownCfg()
         self.evaluator = evaluator
-        self.coarse = coarse or evaluator
+        self.pieces = pieces or evaluator
         self.colouring = colouring
         self.noise_score = noise_score
         self.descents: list[Descent] = []
@@ -112,10 +113,9 @@ class WayDown:
         own, self.descents = [*own, *added], [*self.descents, *added]
         on_pieces = stage == PIECES
         cfg = cfg or (self.cfg.on_pieces if on_pieces else self.cfg.on_whole)
-        evaluator = self.coarse if on_pieces else self.evaluator
-        where = evaluator.dataset.beginning(self.cfg.part) if on_pieces else None
+        evaluator = self.pieces if on_pieces else self.evaluator
         cfg = replace(cfg, noise_score=self.noise_score)
-        return least_squares(evaluator, self.colouring, own, cfg, self._on_iteration, where)[0]
+        return least_squares(evaluator, self.colouring, own, cfg, self._on_iteration)[0]
 
     def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
         """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""

@@ -37,6 +37,7 @@ from pace_optim.problem.unknown_facts import lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
+from pace_optim.recording.windows import Windows
 from pace_optim.terminal.choices import DELAY_MODES
 
 
@@ -154,9 +155,10 @@ class Problem:
         """An evaluator of candidates on the recordings that are trained on."""
         return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space)
 
-    def on_beginnings(self, part: float) -> Problem:
-        """The same, trained on the first part of what each recording trains on."""
-        return replace(self, dataset=replace(self.dataset, train=self.dataset.beginning(part)))
+    def on_pieces(self, share: float) -> Problem:
+        """The same, trained on windows of what the recordings train on, a share of each."""
+        windows = Windows.of(self.dataset, self.control_dt).with_samples(self.dataset.train).part(share)
+        return replace(self, dataset=windows.cut(self.dataset))
 
 
 def load_problem(

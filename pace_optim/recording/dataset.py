@@ -11,9 +11,6 @@ import torch
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.sessions import session_starts
 
-_ENOUGH = 20_000
-"""Samples of a beginning at most, 20 s at 1 kHz: the descent on everything that follows finds the rest."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
@@ -110,11 +107,6 @@ class Dataset:
     def trained(self) -> list[int]:
         """Indices of the recordings that have samples to train on."""
         return self.train.any(dim=0).nonzero()[:, 0].tolist()
-
-    def beginning(self, part: float) -> torch.Tensor:
-        """The first part of each recording's training samples, and no more of them than are enough, (T, R) bool."""
-        order = self.train.cumsum(dim=0)
-        return self.train & (order <= (part * self.train.sum(dim=0)).ceil().clamp(max=_ENOUGH))
 
     def last_step(self, where: torch.Tensor) -> int:
         """Control steps up to and including the last true entry of a (T, R) mask."""

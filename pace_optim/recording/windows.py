@@ -8,6 +8,7 @@ instance, begins anew: good enough to lead a fit, not to judge by.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +52,15 @@ class Windows:
     def with_samples(self, where: torch.Tensor) -> Windows:
         """Those that have samples that count, of (T, R)."""
         kept = self.mask(where).any(dim=0)
+        return replace(self, recording=self.recording[kept], step=self.step[:, kept], counts=self.counts[:, kept])
+
+    def part(self, share: float) -> Windows:
+        """A share of each recording's windows, at least one, evenly spread."""
+        kept = torch.zeros(len(self.recording), dtype=torch.bool)
+        for r in self.recording.unique().tolist():
+            own = (self.recording == r).nonzero()[:, 0]
+            count = math.ceil(share * len(own))
+            kept[own[((torch.arange(count) + 0.5) * len(own) / count).long()]] = True
         return replace(self, recording=self.recording[kept], step=self.step[:, kept], counts=self.counts[:, kept])
 
     def mask(self, where: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.assessment import assess
+from pace_optim.uncertainty.honest_end import noise_score
 from pace_optim.uncertainty.uncertainty import Uncertainty
 
 DISAGREEMENT = 4.0
@@ -113,7 +114,8 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
     if there is not None:
         start.hessian, start.gradient = there.normal_equations()
         start.scores = [float(there.residuals.score[0])]
-    best = least_squares(evaluator, colouring, [start], _REFINE)[0]
+    cfg = replace(_REFINE, noise_score=noise_score(problem))
+    best = least_squares(evaluator, colouring, [start], cfg)[0]
     uncertainty = assess(problem, evaluator, colouring, best.x, ended=best).uncertainty
     return _Fit(score=best.score, x=best.x, uncertainty=uncertainty, simulated_steps=evaluator.simulated_steps)
 

@@ -19,6 +19,7 @@ from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
+from pace_optim.uncertainty.honest_end import noise_score
 from pace_optim.uncertainty.uncertainty import HARDLY_KNOWN, SURE, Uncertainty
 
 DELAY = f"delay/{GLOBAL}"
@@ -142,7 +143,8 @@ def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: Le
     physical = problem.space.to_physical(at_prior(problem, x, labels))
     held = replace(problem, space=problem.space.holding(labels, physical))
     evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
-    cfg = replace(cfg, score_tolerance=min(cfg.score_tolerance, AS_GOOD))  # as finely as it is judged
+    tolerance = min(cfg.score_tolerance, AS_GOOD)  # as finely as it is judged
+    cfg = replace(cfg, score_tolerance=tolerance, noise_score=noise_score(problem))
     before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
     best = least_squares(evaluator, colouring, [held.space.to_normalised(physical)], cfg)[0]
     if best.score > (1 + AS_GOOD) * before:
