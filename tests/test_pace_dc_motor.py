@@ -520,13 +520,8 @@ def test_gradients_flow_back_through_a_delay(fields):
 def test_what_has_not_a_row_per_environment_and_a_column_per_joint_is_refused(what, bad):
     """One column of targets was spread over all joints without a word."""
     values = {"target": 0.0, "pos": 0.0, "vel": 0.0} | {what: torch.zeros(bad, dtype=torch.float64)}
-    name = {"target": "joint_positions", "target_vel": "joint_velocities", "effort": "joint_efforts"}.get(
-        what, "joint_"
-    )
-    said = rf"{name}.* has shape .*, expected a tensor of shape \(3, 2\): a row per .* hip, knee"
-    if what in ("target_vel", "effort"):
-        target_vel, effort = (values.pop(each, None) for each in ("target_vel", "effort"))
-        values |= {"target_vel": target_vel, "effort": effort}
+    names = {"target": "positions", "target_vel": "velocities", "effort": "efforts", "pos": "pos", "vel": "vel"}
+    said = rf"joint_{names[what]} has shape .*, expected a tensor of shape \(3, 2\): a row per .* hip, knee"
     with pytest.raises(ValueError, match=said):
         torque(drive(3), **values)
 
