@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -16,7 +17,7 @@ _MEMORY = 4e9
 """Most memory for it [bytes]; the largest robots' take a tenth."""
 _WAIT = 10.0
 """Longest time of a clock for it, as a multiple of that of a processor."""
-_OUT_OF_MEMORY = 3
+_REFUSED = 3
 _checked: set[tuple[str, int, int]] = set()
 """Files that were within the limits, as long as they are what they were."""
 
@@ -48,7 +49,7 @@ def check_limits(path: Path, read: Callable[[], object]) -> None:
             f"MuJoCo has not read and compiled {path} after {_LONGEST_S:g} s. Look for what the file repeats or sizes "
             "(replicate, composite, flexcomp, size), and make it smaller."
         )
-    if status == _OUT_OF_MEMORY or status < 0:
+    if status == _REFUSED or status < 0:
         raise ValueError(
             f"The model of {path} does not fit into {memory / 1e9:.2g} GB of memory, or ends MuJoCo. Look for what the "
             "file repeats or sizes (replicate, composite, flexcomp, size, hfield), and make it smaller."
@@ -72,11 +73,10 @@ def _read_in_fork(read: Callable[[], object], memory: int) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (used + int(_LONGEST_S) + 1, resource.RLIM_INFINITY))
         signal.signal(signal.SIGXCPU, signal.SIG_DFL)
         read()
-    except MemoryError:
-        status = _OUT_OF_MEMORY
-    except BaseException as error:
-        if "memory" in str(error).lower() or "allocate" in str(error).lower():
-            status = _OUT_OF_MEMORY
+    except ValueError as error:  # whoever reads it next says what is wrong
+        status = _REFUSED if re.search("memory|allocate", str(error), re.IGNORECASE) else 0
+    except BaseException:
+        status = _REFUSED
     finally:
         os._exit(status)
 
