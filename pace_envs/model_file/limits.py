@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import math
 import os
 import re
 import signal
@@ -40,10 +42,15 @@ def check_limits(path: Path, read: Callable[[], object]) -> None:
     if key in _checked or not hasattr(os, "fork"):
         return
     memory = min(_MEMORY, 0.9 * available_memory())
-    if pid := os.fork():
-        status = _end_of(pid)
-    else:
-        _read_in_fork(read, int(memory))
+    collects = gc.isenabled()
+    gc.disable()  # in the fork, a simulation that is collected would wait for threads that are not there
+    try:
+        if not (pid := os.fork()):
+            _read_in_fork(read, int(memory))
+    finally:
+        if collects:
+            gc.enable()
+    status = _end_of(pid)
     if status in (-signal.SIGXCPU, -signal.SIGKILL):
         raise ValueError(
             f"MuJoCo has not read and compiled {path} after {_LONGEST_S:g} s. Look for what the file repeats or sizes "
@@ -59,18 +66,17 @@ def check_limits(path: Path, read: Callable[[], object]) -> None:
 
 def _read_in_fork(read: Callable[[], object], memory: int) -> None:
     """The forked process: it never returns."""
+    import resource  # systems that fork have it
+
     status = 0
     try:
-        import resource
-
         silence = os.open(os.devnull, os.O_WRONLY)
         for descriptor in (1, 2):
             os.dup2(silence, descriptor)
         pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
         most = pages * resource.getpagesize() + memory
         resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
-        used = int(time.process_time())
-        resource.setrlimit(resource.RLIMIT_CPU, (used + int(_LONGEST_S) + 1, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(_LONGEST_S), resource.getrlimit(resource.RLIMIT_CPU)[1]))
         signal.signal(signal.SIGXCPU, signal.SIG_DFL)
         read()
     except ValueError as error:  # whoever reads it next says what is wrong
