@@ -242,7 +242,8 @@ def _judge(trial: Trial, err: str, out: Path, marker: Path, unchanged: bool) -> 
         return "message"
     if "this is a fault of the program" in err or err.count("error:") > 2:
         return "message"
-    if trial.target and Path(trial.target).name not in err and Path(trial.target).stem not in err:
+    known = Path(trial.target).name in err or Path(trial.target).stem in err
+    if trial.target and not known and "that nobody has named" not in err:  # a task's code, where HOME is not set
         return "unnamed"
     return ""
 

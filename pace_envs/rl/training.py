@@ -16,6 +16,7 @@ import torch
 import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
+from pace_envs.devices import find_device
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
@@ -147,6 +148,8 @@ def resume(
         settings = replace(settings, device=device)
     checkpoint = latest_checkpoint(folder)
     try:
+        if device is None:
+            find_device(settings.device)
         cfg = load_cfg(settings, edit)
     except ValueError as error:  # from what the folder says
         raise ValueError(f"{folder / SETTINGS_FILE}: {error}") from None
