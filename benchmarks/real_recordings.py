@@ -101,7 +101,7 @@ def fit_command(args: argparse.Namespace) -> None:
         **more,
     )
     result, folder = fit(settings)
-    print(summary(result))
+    print(*summary(result), sep="\n")
     content = torch.load(folder / "best_trajectory.pt", weights_only=True)
     print(f"\n{errors_table(content, result)}")
     for name, figure in plot_trajectories(content, title=robot.name).items():

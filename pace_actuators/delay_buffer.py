@@ -30,7 +30,8 @@ class DelayBuffer:
     - ``"linear"``: ``(1 - w) * x[k - ceil(e) + 1] + w * x[k - ceil(e)]``: the signal switches within one part, exactly
       for the impulse of a torque, and stays continuous in d. With one part it is the formula above.
 
-    After a reset, the first sample stands for everything before it.
+    After a reset, the first sample stands for everything before it. Gradients flow back through the history, to the
+    last reset of all environments.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class DelayBuffer:
             env_ids: The environments, or ``None`` for all.
 
         Raises:
-            ValueError: If a lag is not a number between 0 and ``max_delay``.
+            ValueError: If a lag is not a number between 0 and ``max_delay``, or their number is wrong.
         """
         lag = torch.as_tensor(time_lag, dtype=torch.float64, device=self._device)
         if lag.ndim == 1:
@@ -108,7 +109,14 @@ class DelayBuffer:
         if lag.ndim == 2 and lag.shape[1] > self._lag.shape[1]:
             with torch.inference_mode(False):  # can be written outside of the caller's inference mode too
                 self._lag = self._lag.expand(-1, lag.shape[1]).clone()
-        self._lag[slice(None) if env_ids is None else env_ids] = lag
+        rows = slice(None) if env_ids is None else env_ids
+        try:
+            self._lag[rows] = lag
+        except RuntimeError:
+            raise ValueError(
+                f"The delay has shape {tuple(lag.shape)}, expected a number, or a row for each of "
+                f"{len(self._lag[rows])} environments with a column for all joints or one per joint."
+            ) from None
         self._index_lags()
 
     def set_lead(self, lead: float) -> None:
@@ -124,6 +132,8 @@ class DelayBuffer:
         else:
             self._stale[slice(None) if env_ids is None else env_ids] = True
         self._any_stale = True
+        if env_ids is None and self._storage is not None and self._storage.requires_grad:
+            self._storage = self._storage.detach()  # gradients end here too
 
     def compute(self, data: torch.Tensor) -> torch.Tensor:
         """Push a sample and return the delayed one.
@@ -140,10 +150,11 @@ class DelayBuffer:
             self.reset()
         if self._any_stale:
             history = self._storage.view(self._length, *data.shape)
-            if data.is_cuda:  # without waiting for the GPU to count them
-                torch.where(self._stale[:, None], data, history, out=history)
+            if data.is_cuda and not (data.requires_grad or history.requires_grad):
+                torch.where(self._stale[:, None], data, history, out=history)  # without waiting for the GPU to count
             else:
-                history[:, self._stale] = data[self._stale]
+                rows = self._stale.nonzero()[:, 0]
+                history[:, rows] = data[rows]
             self._stale[:] = False
             self._any_stale = False
         self._head = (self._head + 1) % self._length

@@ -138,6 +138,9 @@ class Drive:
         )
         self._asked = self.computed_effort
         self._calls_until_control = 0
+        self._renewed = torch.zeros(num_envs, 1, dtype=torch.bool, device=self._device)  # since the last call
+        self._any_renewed = False
+        self._alone: torch.Tensor | None = None
         self.update_time_lags(delay)
         self._delays.set_lead(self._lead)
         self.effects = self._make_effects(dt)
@@ -174,18 +177,39 @@ class Drive:
             self.effects.take_over(self.armature, self.friction, self.viscous_friction)
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Forget the history of all or some environments; parameters stay."""
+        """Forget the history of all or some environments; parameters stay.
+
+        The controller of a drive that is reset runs at the next call, also where the others hold their torque.
+        """
         self._delays.reset(env_ids)
         if env_ids is None:
             self._calls_until_control = 0
             self._first_call = True
+            self._any_renewed = False
+        elif self._calls_until_control or self.centred:
+            if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+                self._renewed |= env_ids[:, None]
+            else:
+                self._renewed[env_ids] = True
+            self._any_renewed = True
         if self.effects is not None:
             self.effects.reset(env_ids)
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
-        """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it."""
+        """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it.
+
+        Raises:
+            ValueError: If it has another shape.
+        """
         rows = slice(None) if env_ids is None else env_ids
-        self.encoder_bias[rows] = torch.as_tensor(encoder_bias, dtype=self._dtype, device=self._device)
+        bias = torch.as_tensor(encoder_bias, dtype=self._dtype, device=self._device)
+        try:
+            self.encoder_bias[rows] = bias
+        except RuntimeError:
+            raise ValueError(
+                f"encoder_bias has shape {tuple(bias.shape)}, expected {tuple(self.encoder_bias[rows].shape)} (one row "
+                "per environment, one column per joint), or a number."
+            ) from None
 
     def update_time_lags(self, delay: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the delay [control steps]: a number, (len(env_ids),) or, per joint, (len(env_ids), num_joints).
@@ -215,7 +239,13 @@ class Drive:
         return 0.5 / self._calls_per_run if early and not (self.is_trapezoidal or self.centred) else 0.0
 
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
-        """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all."""
+        """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all.
+
+        Raises:
+            ValueError: If it has another shape.
+        """
+        if enabled is not None and enabled.numel() != self._num_envs:
+            raise ValueError(f"torque_enable has shape {tuple(enabled.shape)}, expected ({self._num_envs},).")
         self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
         if self.effects is not None:
             given = self.effects.state.enabled
@@ -233,6 +263,19 @@ class Drive:
             )
             for each in things
         ]
+
+    def _check_shapes(self, **given: torch.Tensor | None) -> None:
+        """Refuse what has not a row per environment and a column per joint: torch would spread it without a word."""
+        expected = (self._num_envs, len(self._joint_names))
+        for name, value in given.items():
+            if value is not None and (not isinstance(value, torch.Tensor) or value.shape != expected):
+                found = (
+                    f"shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else f"type {type(value).__name__}"
+                )
+                raise ValueError(
+                    f"{name} has {found}, expected a tensor of shape {expected}: a row per environment, a column for "
+                    f"each of the joints {', '.join(self._joint_names)}."
+                )
 
     def _make_effects(self, physics_dt: float | None) -> EffectStack | None:
         cfgs = [cfg for cfg in effect_cfgs(self.cfg.effects) if _applies(cfg, self._joint_names)]

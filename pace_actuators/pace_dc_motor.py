@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 
 from pace_actuators.dc_motor import clip_effort, clip_to_line, pd_effort
 from pace_actuators.drive import ControllerRun
+from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.drive_with_effects import DriveWithEffects
 
 
@@ -65,16 +67,31 @@ class PaceDCMotor(DriveWithEffects):
 
         Returns:
             A copy of ``control_action`` whose ``joint_efforts`` are the torques at the joints [N m].
+
+        Raises:
+            ValueError: If something has another shape.
         """
+        self._check_shapes(
+            joint_pos=joint_pos,
+            joint_vel=joint_vel,
+            joint_positions=control_action.joint_positions,
+            joint_velocities=control_action.joint_velocities,
+            joint_efforts=control_action.joint_efforts,
+        )
         if self.effects is not None:
             self.effects.begin_step(joint_pos, joint_vel)
         before, first = self._asked, self._first_call
         if self._calls_until_control == 0:
             self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
             self._calls_until_control = self._calls_per_run
-            self._first_call = False
-        elif self._delays.changes(part := self._calls_per_run - self._calls_until_control):
-            self.computed_effort = self._effort_command_at(part)
+            self._first_call, self._alone = False, None
+        else:
+            if self._delays.changes(part := self._calls_per_run - self._calls_until_control):
+                self.computed_effort = self._effort_command_at(part)
+            if self._any_renewed:
+                self._alone = self._run_alone(control_action, joint_pos, joint_vel)
+            if self._alone is not None:
+                self.computed_effort = torch.where(self._alone.isnan(), self.computed_effort, self._alone)
         self._calls_until_control -= 1
         asked = self.computed_effort
         if self.effects is not None and self.effects.has("effort_command"):
@@ -83,7 +100,12 @@ class PaceDCMotor(DriveWithEffects):
                 self._loop_slope = self._loop_slope * self.effects.state.speed_slope
         self._asked = asked
         if self.centred and not first and asked is not before:
+            if self._any_renewed:
+                before = torch.where(self._renewed, asked, before)
             asked = 0.5 * (before + asked)
+        if self._any_renewed:
+            self._renewed.zero_()
+            self._any_renewed = False
         if self._feeds_back:
             asked, self._loop_slope = self.effects.fed_back(asked)  # type: ignore[union-attr]
         effort = self.drive_effort(asked, joint_pos, joint_vel)
@@ -142,6 +164,21 @@ class PaceDCMotor(DriveWithEffects):
         if feed_forward is not None:
             effort += feed_forward
         return self._delays.push("torque", effort) if self.cfg.delay_mode == "effort" else effort
+
+    def _run_alone(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
+        """What the controllers of reset drives ask while the others hold [N m]; NaN for the others.
+
+        Nothing of the others changes. A delay shows the present command, as after any reset.
+        """
+        new = copy.copy(self)
+        new._delays = DriveDelays((), 0.0, self._num_envs, self._device, "linear", runs=1, parts=1)
+        if self.effects is not None:
+            new.effects = copy.deepcopy(self.effects)
+            new.effects.reset(None)
+            new.effects.begin_step(joint_pos, joint_vel)
+        effort = new.compute_effort_command(control_action, joint_pos, joint_vel)
+        others = torch.full_like(effort, torch.nan) if self._alone is None else self._alone
+        return torch.where(self._renewed, effort, others)
 
     def _effort_command_at(self, part: int) -> torch.Tensor:
         """The controller's torque [N m] at a call between two of its runs, when a command or a torque has arrived."""

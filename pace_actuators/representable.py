@@ -68,7 +68,7 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
         if kind.overrides("write_model") and not world.bodies:
             notes.append(
                 f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
-                "use the model that scripts/export.py --format mjcf --joints_only writes, which has it."
+                "use the model that pace export --format mjcf --joints_only writes, which has it."
             )
         if kind.reads_link and not world.inertia_per_step:
             raise ValueError(

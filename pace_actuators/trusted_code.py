@@ -3,15 +3,18 @@
 A record of digests protects from code that has changed, not from a folder of somebody else's that brings its module and
 the module's digest along. So the digest of every file of code that a user names, or runs a fit from, is kept under
 ``$XDG_STATE_HOME/pace`` (``~/.local/state/pace``), where no downloaded folder writes; a record counts for those alone.
+Where that is no absolute path, or not the user's alone (:class:`pace_actuators.files.OwnFolder`), nothing is kept.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from collections.abc import Iterable
-from pathlib import Path
+
+from pace_actuators.files import OwnFolder
+
+_FILE = "named_code.txt"
 
 
 def trust(digests: Iterable[str]) -> None:
@@ -20,28 +23,25 @@ def trust(digests: Iterable[str]) -> None:
     Args:
         digests: SHA-256 of its files.
     """
-    if not (new := sorted(set(digests) - _trusted())):
+    if (folder := _folder()) is None:
         return
-    with contextlib.suppress(OSError):
-        path = _store()
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with path.open("a", encoding="ascii") as file:
-            file.write("".join(f"{digest}\n" for digest in new))
+    with contextlib.suppress(OSError), folder.alone():
+        kept = _kept(folder)
+        if new := set(digests) - kept:
+            folder.write(_FILE, "".join(f"{digest}\n" for digest in sorted(kept | new)).encode())
 
 
 def is_trusted(digest: str) -> bool:
     """Whether code of this SHA-256 has been named here before."""
-    return digest in _trusted()
+    folder = _folder()
+    return folder is not None and digest in _kept(folder)
 
 
-def _trusted() -> set[str]:
-    try:
-        return set(re.findall(r"^[0-9a-f]{64}$", _store().read_text(encoding="ascii", errors="replace"), re.MULTILINE))
-    except OSError:
-        return set()
+def _kept(folder: OwnFolder) -> set[str]:
+    text = (folder.read(_FILE) or b"").decode("ascii", errors="replace")
+    return set(re.findall(r"^[0-9a-f]{64}$", text, re.MULTILINE))
 
 
-def _store() -> Path:
+def _folder() -> OwnFolder | None:
     """Where they are kept: outside of every folder of runs."""
-    state = os.environ.get("XDG_STATE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.local/state")
-    return Path(state) / "pace" / "named_code.txt"
+    return OwnFolder.below("XDG_STATE_HOME", ".local/state", "pace")

@@ -5,17 +5,20 @@
 
 A trial damages one file that a command reads, or one of its options, and runs the command in a forked process of its
 own. It passes if the command ends within the time, with status 0 or with status 2 and one line `error: …`; if nothing
-was executed that the input names; and, with status 2, if not a byte of the folder has changed.
+was executed that the input names; if no line of its output and no statement of the Python that it wrote is the input's;
+and, with status 2, if not a byte of the folder has changed.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import io
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -39,7 +42,7 @@ LONG = ("diagnose", "refit")
 """Options without a value that ask for minutes of work and nothing wrong."""
 WORK = ("max_iterations",)
 """Options whose number is how long a training goes on: a large one is no fault, and no hang."""
-FAULTS = ("hang", "crash", "traceback", "execution", "half-written", "message", "unnamed")
+FAULTS = ("hang", "crash", "traceback", "execution", "forged", "half-written", "message", "unnamed")
 
 
 @dataclass(kw_only=True)
@@ -115,6 +118,7 @@ def attempt(number: int, seed: int, world: Path, scratch: Path) -> Trial:
     world_of.restore(world.parent / world_of.STATE, state)  # what a trial names is trusted in that trial alone
     os.environ["XDG_STATE_HOME"] = str(state)
     command, target = plan(number, rng)
+    environment = dict(os.environ)
     script, words, _ = world_of.COMMANDS[command]
     words = list(words)
     if target is None:
@@ -125,6 +129,9 @@ def attempt(number: int, seed: int, world: Path, scratch: Path) -> Trial:
     else:
         what = mutations.mutate_file(copy / target, rng, marker)
         trial = Trial(number=number, command=command, kind=Path(target).suffix, target=target, what=what)
+        if what.startswith(mutations.FORGED) and rng.random() < 0.5:  # its own store lies in the present folder
+            for name in ("HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME"):
+                os.environ.pop(name, None)
     marker.unlink(missing_ok=True)
     before = world_of.snapshot(copy)
     begin = time.monotonic()
@@ -133,6 +140,7 @@ def attempt(number: int, seed: int, world: Path, scratch: Path) -> Trial:
     if pid == 0:
         _child(script, words, copy, out, err)
     trial.status = _wait(pid)
+    os.environ.update(environment)
     trial.seconds = round(time.monotonic() - begin, 2)
     text = err.read_bytes().decode(errors="surrogateescape") if err.exists() else ""
     trial.message = text[-400:]
@@ -140,8 +148,21 @@ def attempt(number: int, seed: int, world: Path, scratch: Path) -> Trial:
         marker.unlink(missing_ok=True)  # the command line names it: it may run
     after = world_of.snapshot(copy)
     told = [name for name in after if name not in before and name in text]  # as the map that was guessed of a log
-    trial.fault = _judge(trial, text, out, marker, {n: v for n, v in after.items() if n not in told} == before)
+    unchanged = {n: v for n, v in after.items() if n not in told} == before
+    trial.fault = _judge(trial, text, out, marker, unchanged)
+    new = [copy / name for name in after if name not in before and name.endswith(".py")]
+    if not trial.fault and ((copy / "forged").exists() or any(_holds_code(path) for path in new)):
+        trial.fault = "execution"
     return trial
+
+
+def _holds_code(path: Path) -> bool:
+    """Whether a page that was written calls what the input names, or is no Python."""
+    try:
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    except (SyntaxError, ValueError):
+        return True
+    return any(ast.unparse(call.func) == "open" for call in calls)
 
 
 def _child(script: str, words: list[str], folder: Path, out: Path, err: Path) -> None:
@@ -207,6 +228,9 @@ def _judge(trial: Trial, err: str, out: Path, marker: Path, unchanged: bool) -> 
         return "hang"
     if "Traceback" in err:
         return "traceback"
+    said = out.read_bytes().decode(errors="surrogateescape") if out.exists() else ""
+    if re.search(r"^(run|warning|error): forged", f"{said}\n{err}", re.MULTILINE):
+        return "forged"
     if trial.status not in (0, 2):
         return "crash"
     if trial.status == 0:
@@ -218,7 +242,8 @@ def _judge(trial: Trial, err: str, out: Path, marker: Path, unchanged: bool) -> 
         return "message"
     if "this is a fault of the program" in err or err.count("error:") > 2:
         return "message"
-    if trial.target and Path(trial.target).name not in err and Path(trial.target).stem not in err:
+    known = Path(trial.target).name in err or Path(trial.target).stem in err
+    if trial.target and not known and "that nobody has named" not in err:  # a task's code, where HOME is not set
         return "unnamed"
     return ""
 
@@ -247,7 +272,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--world", type=Path, help="keep the files that are damaged here (default: made anew)")
     parser.add_argument("--quick", action="store_true", help="leave out diagnosis and training")
-    parser.add_argument("--output", type=Path, help="write a line of JSON for each trial")
+    parser.add_argument("--output", type=Path, help="a line of JSON for each trial; goes on with it")
     args = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with tempfile.TemporaryDirectory() as scratch:
@@ -266,8 +291,8 @@ def main() -> int:
             for name in slow:
                 del world_of.COMMANDS[name]
         _import_all()
-        trials = []
-        for number in range(args.first, args.first + args.trials):
+        trials = _finished(args.output, range(args.first, args.first + args.trials))
+        for number in sorted(set(range(args.first, args.first + args.trials)) - {t.number for t in trials}):
             trials += run_trials(range(number, number + 1), args.seed, world)
             if trials[-1].fault:
                 print(json.dumps(asdict(trials[-1])), flush=True)
@@ -276,6 +301,14 @@ def main() -> int:
                     file.write(json.dumps(asdict(trials[-1])) + "\n")
     print(table(trials))
     return int(any(t.fault for t in trials))
+
+
+def _finished(output: Path | None, numbers: range) -> list[Trial]:
+    """The trials of an earlier call that was broken off, from its lines."""
+    if output is None or not output.exists():
+        return []
+    trials = [Trial(**json.loads(line)) for line in output.read_text().splitlines()]
+    return [trial for trial in trials if trial.number in numbers]
 
 
 def _import_all() -> None:

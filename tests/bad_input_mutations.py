@@ -17,9 +17,13 @@ import numpy as np
 import torch
 
 ESCAPE = "\x1b[31mred\x1b[0m\a\u202e"
+LINES = "elbow\nrun: forged\nwarning: forged\r\u2028error: forged"
+"""A name that would begin lines of its own."""
+CODE = 'x"""\nopen("forged", "w")\n"""'
+"""A name that would be code in a docstring."""
 WRONG_VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1e308, -1e308, 10**400, 3.5, "", "x", "\0", ESCAPE, "\ud800", "é→×", "../../../etc", [], {},
-    [None], {"a": None}, [[]], ["x"], {"all": "x"}, "trap:Effect", "trap:Task",
+    LINES, CODE, "'+open('forged','w')+'", [None], {"a": None}, [[]], ["x"], {"all": "x"}, "trap:Effect", "trap:Task",
 )  # fmt: skip
 WRONG_NUMBERS = (float("nan"), float("inf"), -float("inf"))
 
@@ -156,9 +160,31 @@ def mutate_file(path: Path, rng: random.Random, marker: Path) -> str:
         return _mutate_tensors(path, rng, marker)
     if suffix == ".npz":
         return _mutate_npz(path, rng)
+    if suffix == ".parquet":
+        if rng.random() < 0.5:
+            path.write_bytes(path.with_name("rows.bin").read_bytes())
+            return "3e8 rows"
+        return mutate_bytes(path, rng, marker)
     if suffix == ".mjb":
         return mutate_bytes(path, rng, marker)
+    if suffix == ".xml" and rng.random() < 0.15:
+        return _oversize(path, rng)
     return _mutate_text(path, rng)
+
+
+def _oversize(path: Path, rng: random.Random) -> str:
+    """A model that takes too long, or too much memory."""
+    kinds = {
+        "replicate": ("<body name=", '<replicate count="100000000"><geom size="0.1"/></replicate><body name='),
+        "nuserdata": ("<worldbody>", '<size nuserdata="2000000000"/><worldbody>'),
+        "memory": ("<worldbody>", '<size memory="500G"/><worldbody>'),
+    }
+    kind = rng.choice(list(kinds))
+    path.write_text(path.read_text().replace(*kinds[kind], 1))
+    return kind
+
+
+FORGED = "a forged record"
 
 
 def _forge(path: Path, tree: dict[str, Any], rng: random.Random) -> str:
@@ -174,7 +200,10 @@ def _forge(path: Path, tree: dict[str, Any], rng: random.Random) -> str:
     if rng.random() < 0.5:
         where["task"] = tree["environment"]["task"] = f"{name}:Task"
     path.write_text(json.dumps(tree))
-    return f"a forged record of {name}"
+    store = _folder_of_trap(path) / "~" / ".local" / "state" / "pace" / "named_code.txt"  # where HOME is not set
+    store.parent.mkdir(parents=True, mode=0o700)
+    store.write_text(f"{record['sha256']}\n")
+    return f"{FORGED} of {name}"
 
 
 def _folder_of_trap(path: Path) -> Path:
@@ -252,7 +281,25 @@ def _mutate_text(path: Path, rng: random.Random) -> str:
         starts = [i for i in range(1, len(lines[row])) if lines[row][i - 1] in marks and lines[row][i] not in marks]
         start = rng.choice(starts or [0])
         end = next((i for i in range(start, len(lines[row])) if lines[row][i] in marks), len(lines[row]))
-        word = rng.choice(("", "nan", "inf", "-1", "1e400", "x", ESCAPE, "1e160", "0", "é", "1;2", "\0"))
+        word = rng.choice(
+            (
+                "",
+                "nan",
+                "inf",
+                "-1",
+                "1e400",
+                "x",
+                ESCAPE,
+                "1e160",
+                "0",
+                "é",
+                "1;2",
+                "\0",
+                "elbow&#10;run: forged&#10;warning: forged",
+                f'"{LINES}"',
+                CODE.replace('"', "&quot;"),
+            )
+        )
         lines[row] = lines[row][:start] + word + lines[row][end:]
         kind = f"a word by {word!r}"
     path.write_text("".join(lines))
@@ -262,7 +309,7 @@ def _mutate_text(path: Path, rng: random.Random) -> str:
 WRONG_WORDS = (
     "", "nan", "inf", "-1", "0", "1e99", "-1e99", "99999999999999999999", "1000000000", "0.3", "abc", ESCAPE, "\udcff",
     "é→×", "/dev/null", "/dev/full", "/proc/self/mem", ".", "..", "/", "runs", "loop", "pipe.npz", "none.npz",
-    "a" * 5000,
+    "a" * 5000, LINES, CODE,
     "trap:Effect", "trap:Task", "@", "/@shared", "(", "[", "=", "a=b", "friction/elbow=nan", "arm.xml", "a.npz",
     "a.npz/x.npz", "closed/x.npz", "a.npz\n", "--", "-", "$(touch executed)", "None", "pace_envs:Arm-v0", "os:x",
 )  # fmt: skip

@@ -135,6 +135,7 @@ def build(folder: Path, *, quick: bool = False) -> Path:
     (folder / "arm.urdf").write_text(_URDF)
     (folder / "map.toml").write_text(_MAP)
     (folder / "log.csv").write_text(_log())
+    _write_parquet(folder)
     with contextlib.chdir(folder):
         for output in ("a.npz", "b.csv", "c.pt"):
             _must(
@@ -179,6 +180,19 @@ def _log(samples: int = 600) -> str:
         motor = -9.0 * math.degrees(target - 0.1)
         rows.append(f"{2.5 * k:.1f},{0.97 * motor:.4f},{motor:.4f},{0.97 * target:.6f},{target:.6f}")
     return "\n".join(rows) + "\n"
+
+
+def _write_parquet(folder: Path) -> None:
+    """The same log as a table, and one of a constant with 3e8 rows, which packs them into a few megabytes."""
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet as pq
+
+    pq.write_table(pyarrow.csv.read_csv(folder / "log.csv"), folder / "log.parquet")
+    part = pa.table({"t_ms": pa.array([0.0]).take(pa.array([0] * 10**6)), "m1 pos": pa.nulls(10**6, pa.float64())})
+    with pq.ParquetWriter(folder / "rows.bin", part.schema, compression="zstd") as writer:
+        for _ in range(300):
+            writer.write_table(part)
 
 
 def _diagnose_and_train() -> None:
@@ -263,6 +277,9 @@ COMMANDS: dict[str, tuple[str, Sequence[str], Sequence[str]]] = {
                          "--max_iteration", "1", "--log_dir", "new"), ("arm.py",)),
     "import": ("import_log", ("log.csv", "--columns", "map.toml", "--output", "new.csv"), ("log.csv", "map.toml")),
     "import guessed": ("import_log", ("log.csv", "--write_map", "guessed.toml"), ("log.csv",)),
+    "import parquet": ("import_log", ("log.parquet", "--columns", "map.toml", "--output", "new.csv"), ("log.parquet",)),
+    **{f"export {fmt}": ("export", (f"{RUN}/result.json", "--format", fmt, "--output", "out.py"),
+                         (f"{RUN}/result.json",)) for fmt in ("cfg", "mjlab", "isaaclab", "newton", "mjlab_native")},
     "new robot": ("new_robot", ("arm.xml", "--output", "mine.py"), ("arm.xml",)),
     "new robot urdf": ("new_robot", ("arm.urdf", "--output", "mine.py"), ("arm.urdf",)),
     "page": ("replay", (RUN, "--viewer", "none"), tuple(f"{RUN}/{name}" for name in (

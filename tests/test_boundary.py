@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +20,8 @@ from pace_actuators.memory import available_memory, check_memory
 from pace_optim.identification.beginning import search_population
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
-from pace_optim.terminal.cli import run_cli
+from pace_optim.terminal.cli import make_parser, run_cli
+from pace_optim.terminal.progress import ProgressLine
 from pace_optim.terminal.screen import one_line, readable, safe_streams
 
 ROOT = Path(__file__).parents[1]
@@ -63,9 +65,44 @@ def test_a_fault_of_the_program_is_told_as_one():
 
 
 def test_words_of_names_are_written_out():
-    assert readable("good\ttab\nline é×") == "good\ttab\nline é×"
-    assert readable("\rprogress\x07") == "\rprogress\\x07"
+    assert readable("good\ttab é×") == "good\ttab é×"
+    assert readable("\rname\x07\nrun: x") == "\\rname\\x07\\nrun: x"
     assert one_line("a\n\n b") == "a b"
+
+
+def test_no_name_begins_a_line_of_its_own(monkeypatch, capsys):
+    forged = "elbow\nrun: theirs\r\x85\u2028\x0bwarning: no\n"
+    with safe_streams():
+        print(f"warning: {forged}")
+        print("two", forged, sep="\n")
+        print(f"{forged}\n", end="")
+        sys.stderr.write(warnings.formatwarning(UserWarning(forged), UserWarning, "this.py", 1))
+        progress = ProgressLine()
+        progress.say(forged)
+        progress.tell(forged, "end")
+        parser = make_parser("Does this.", example="scripts/this.py")
+        parser.print_help()
+    said = capsys.readouterr()
+    lines = [line.strip() for line in (said.out + said.err).splitlines()]
+    assert len([line for line in lines if "elbow" in line]) == 6
+    assert not [line for line in lines if line.startswith(("run:", "warning: no"))]
+    assert "example:" in lines and any(line.startswith("usage:") for line in lines)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_live_line_is_overwritten_and_a_name_in_it_overwrites_nothing(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with safe_streams():
+        stream = sys.stderr
+        progress = ProgressLine()
+        progress.say("fitting \r\nrun: theirs")
+        progress.tell("kept")
+    text = stream.getvalue()
+    assert text.startswith("\rfitting \\r\\nrun: theirs ") and text.endswith("\nkept\n") and text.count("\r") == 1
 
 
 def test_an_ascii_terminal_gets_plain_letters(monkeypatch):

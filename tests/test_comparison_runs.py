@@ -14,7 +14,7 @@ from run_folders import JOINTS, make_result, make_trajectory, write_run
 
 import pace_optim.fit as fit_module
 from pace_actuators.files import write_tensors
-from pace_optim.comparison import compare, comparison_text
+from pace_optim.comparison import compare, comparison_lines
 from pace_optim.fit import fit
 from pace_optim.recording import Load, load_recording, save_recording
 from pace_optim.report import write_report
@@ -165,7 +165,7 @@ def test_the_ladder_is_in_the_last_run_alone(tmp_path):
     assert (
         'id="ladder"' in (last / "report.html").read_text() and 'id="ladder"' not in (base / "report.html").read_text()
     )
-    text = comparison_text(written(last))
+    text = "\n".join(comparison_lines(written(last)))
     assert "stribeck_friction" in text and "3.00, 3.00" in text and "noise floor" in text
 
 

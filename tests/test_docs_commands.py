@@ -84,7 +84,7 @@ def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_p
 def test_a_fit_goes_on_to_the_diagnosis_of_its_run(interrupted, diagnosed, run, tmp_path, monkeypatch):
     ended = SimpleNamespace(stop_reasons=["interrupted" if interrupted else "converged"])
     asked = []
-    monkeypatch.setattr("pace_optim.run.summary.summary", lambda _: "")
+    monkeypatch.setattr("pace_optim.run.summary.summary", lambda _: [])
     monkeypatch.setattr("pace_optim.fit.fit", lambda settings, **_: (ended, run))
     monkeypatch.setattr("pace_optim.commands.diagnose.run_and_tell", asked.append)
     words = ("--task", run.parents[3] / "swing.xml", "--data", run.parents[3] / "data" / "swing.csv", "--diagnose")

@@ -137,14 +137,13 @@ def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out)
     no_line = {"saturation_effort": np.inf, "velocity_limit": np.inf}
     drive = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0, "run_dt": DT} | no_line | changes
     plain = PlainDrive(**drive, encoder_bias=0.01, delay_s=3.4 * DT)
-    made: dict = {}
-    classes = {kind: lambda **fields: made.update(fields)}  # another class is a NameError
-    eval(mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain), classes)
+    call = mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain)
+    assert call.name == kind
     given = {name: value for name, value in drive.items() if np.isfinite(value) and name != "run_dt"}
     joint = {"armature": 0.055, "frictionloss": 0.32, "viscous_damping": 0.45}
     expected = {name: value for name, value in (given | joint).items() if name not in left_out}
     names, delay = {"target_names_expr": ("LF_HFE",)}, {"delay_min_lag": 3, "delay_max_lag": 3}
-    assert made == expected | names | delay
+    assert call.values == expected | names | delay
 
 
 @pytest.mark.parametrize("fmt", FORMATS)

@@ -125,7 +125,7 @@ def test_each_optimizer_finds_the_truth_and_leaves_the_runs_folder(optimizer, sc
     assert FitResult.load(folder) == FitResult.load(folder / "result.json") == result
     check_schema(json.loads((folder / "result.json").read_text()), optimizer)
     check_tensors(folder, result)
-    text = summary(result)
+    text = "\n".join(summary(result))
     assert "servo" in text and "delay mode command" in text and f"score {result.score:.3e}" in text
     if optimizer == "cmaes":
         check_search_files(folder, result)

@@ -13,6 +13,7 @@ import torch
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
+from pace_envs.model_file import limits, read_model_file
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.commands.new_robot import main as new_robot
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -306,3 +307,29 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
     env.close()
     with pytest.raises(ValueError, match="exists"):
         new_robot()
+
+
+@pytest.mark.parametrize(
+    ("head", "body", "message"),
+    [
+        (
+            "",
+            '<replicate count="100000000"><geom size="0.1"/></replicate>',
+            r"not read and compiled .*arm\.xml after 0\.5 s",
+        ),
+        ('<size nuserdata="2000000000"/>', "", r"arm\.xml does not fit into 4 GB of memory"),
+        ('<size memory="500G"/>', "", r"arm\.xml does not fit into 4 GB of memory"),
+        ('<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>', "", r"arm\.xml does not fit"),
+    ],
+)
+def test_a_model_that_takes_too_long_or_too_much_memory_is_refused(head, body, message, tmp_path, monkeypatch):
+    """They ran without end, and took what memory there was."""
+    monkeypatch.setattr(limits, "_LONGEST_S", 0.5)
+    monkeypatch.setattr(limits, "available_memory", lambda: 1e10)
+    joint = '<body pos="0 0 1"><joint name="hinge"/><geom size="0.1"/></body>'
+    path = tmp_path / "arm.xml"
+    path.write_text(f"<mujoco>{head}<worldbody>{joint}{body}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match=message):
+        read_model_file(path)
+    path.write_text(f"<mujoco><worldbody>{joint}</worldbody></mujoco>")
+    assert read_model_file(path).spec.joint("hinge") is not None

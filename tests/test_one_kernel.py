@@ -1,6 +1,9 @@
 """The single-joint simulation as one kernel moves as itself, on a GPU and on the processor."""
 
 import shutil
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +13,8 @@ from effect_envs import EFFECTS, Branching
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import get_effect, registry
-from pace_envs.kernels import CannotCompileError, HostKernels, host_kernels, kernels_of
+from pace_actuators.files import OwnFolder
+from pace_envs.kernels import CannotCompileError, HostKernels, host, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.single_joint_fits.fits import fits_on
 from pace_optim.single_joint_fits.fitting_cfg import DEFAULT
@@ -32,7 +36,7 @@ def kernels(request, tmp_path_factory):
         return {"compiler": kernels_of(device), "device": device}
     if shutil.which("c++") is None:
         pytest.skip("needs a compiler of C++")
-    folder = tmp_path_factory.mktemp("kernels")
+    folder = OwnFolder.at(tmp_path_factory.mktemp("kernels"))
     return {"compiler": HostKernels(shutil.which("c++"), folder), "device": torch.device("cpu")}
 
 
@@ -169,32 +173,62 @@ def test_a_processor_without_a_compiler_simulates_the_drives_themselves(monkeypa
         host_kernels.cache_clear()
 
 
-def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_again(monkeypatch, tmp_path):
+@pytest.fixture
+def keeps(monkeypatch, tmp_path):
+    """Makes the kernels of the processor anew, as another process would; they are kept below the given base folder."""
     if shutil.which("c++") is None:
         pytest.skip("needs a compiler of C++")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     host_kernels.cache_clear()
-    try:
-        source = 'extern "C" void simulate(double* x) { *x *= 2.0; }'
-        for _ in range(2):
-            kernels = host_kernels.__wrapped__()
-            kernels.compile([source])
-            value = torch.tensor(21.0, dtype=torch.float64)
-            kernels.launch(source, 1, 1, [value])
-            assert float(value) == 42.0
-        folder = tmp_path / "pace" / "kernels"
-        assert len(list(folder.iterdir())) == 1 and folder.stat().st_mode & 0o777 == 0o700
-        with pytest.raises(CannotCompileError):
-            kernels.compile(["this is no C"])
-        assert len(list(folder.iterdir())) == 1
-        other = source.replace("2.0", "3.0")
-        kernels._compiled(other).write_bytes(b"damaged")
-        with pytest.raises(CannotCompileError):  # the drives themselves go on, and the next one compiles it again
-            kernels.compile([other])
-        kernels.compile([other])
-        assert len(list(folder.iterdir())) == 2
-        folder.chmod(0o777)  # others could put code there
-        host_kernels.__wrapped__().compile([source.replace("2.0", "4.0")])
-        assert len(list(folder.iterdir())) == 2
-    finally:
-        host_kernels.cache_clear()
+    yield host_kernels.__wrapped__
+    host_kernels.cache_clear()
+
+
+DOUBLE = 'extern "C" void simulate(double* x) { *x *= 2.0; }'
+
+
+def doubled(kernels):
+    kernels.compile([DOUBLE])
+    value = torch.tensor(21.0, dtype=torch.float64)
+    kernels.launch(DOUBLE, 1, 1, [value])
+    return float(value)
+
+
+def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_again(keeps, tmp_path):
+    folder = tmp_path / "pace" / "kernels"
+    assert doubled(keeps()) == 42.0
+    kept = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert doubled(keeps()) == 42.0
+    assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == kept and len(kept) == 2
+    assert all(each.stat().st_mode & 0o777 == 0o700 for each in (folder, folder.parent))
+    with pytest.raises(CannotCompileError):
+        keeps().compile(["this is no C"])
+    assert set(kept) == {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("part", [0.0, 0.1, 0.9])
+def test_a_kernel_that_was_cut_short_is_compiled_again(keeps, tmp_path, part):
+    """Loaded, it ended the process with SIGBUS, each time."""
+    assert doubled(keeps()) == 42.0
+    for path in (tmp_path / "pace" / "kernels").iterdir():
+        path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+    script = (
+        "import torch; from pace_envs.kernels import host_kernels; kernels = host_kernels()\n"
+        f"kernels.compile([{DOUBLE!r}]); x = torch.tensor(4.0, dtype=torch.float64)\n"
+        f"kernels.launch({DOUBLE!r}, 1, 1, [x]); print(float(x))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "8.0\n"), done
+
+
+def test_a_compiler_that_never_ends_leaves_the_simulation_without_kernels(monkeypatch, tmp_path):
+    compiler = tmp_path / "c++"
+    compiler.write_text("#!/bin/sh\nsleep 1000 & wait\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(host, "_FIRST_S", 0.3)
+    begin = time.monotonic()
+    with pytest.warns(UserWarning, match=r"c\+\+ has not ended after 0\.3 s: the simulation goes on without"):
+        assert host_kernels.__wrapped__() is None
+    assert time.monotonic() - begin < 5.0

@@ -447,3 +447,92 @@ def test_a_continuous_loop_is_mujocos_position_actuator():
     assert mine[-1] == pytest.approx(0.2, abs=5e-3)
     held = one_joint(stiffness=2000.0, damping=100.0, effort_limit=60.0, physics_dt=0.002)
     assert max(abs(q - 0.2) for q in stepped(held, inertia=0.02, dt=0.002, steps=300, target=0.2)[-50:]) > 0.01
+
+
+# ---- resets between two runs of the controller
+
+
+HELD = {
+    "plain": {},
+    "delayed": {"delay": 2.5},
+    "torque delayed": {"delay": 1.25, "delay_mode": "effort"},
+    "with effects": {"delay": 0.5, "effects": ["integral_gain", "proportional_gain", "stribeck_friction"]},
+}
+
+
+@pytest.mark.parametrize("calls", [1, 2, 3])
+@pytest.mark.parametrize("rows", [[1], torch.tensor([False, True, False]), slice(1, 2)], ids=["list", "mask", "slice"])
+@pytest.mark.parametrize("fields", HELD.values(), ids=HELD)
+def test_a_drive_that_is_reset_while_the_others_hold_begins_as_a_new_one(fields, rows, calls):
+    """It kept its old torque, that of before the reset, until the next control step."""
+    motor, other, new = (drive(3, physics_dt=0.001, control_decimation=4, **fields) for _ in range(3))
+    for k in range(4 + calls):
+        for each in (motor, other):
+            torque(each, 0.3 + 0.1 * (k // 4), 0.1 * k, 1.0)
+    motor.reset(rows)
+    first, undisturbed = torque(motor, 0.4, -0.2, 0.5), torque(other, 0.4, -0.2, 0.5)
+    assert torch.equal(first[1], torque(new, 0.4, -0.2, 0.5)[1])
+    assert torch.equal(first[[0, 2]], undisturbed[[0, 2]]) and not torch.equal(first[1], undisturbed[1])
+    for k in range(3 - calls):  # it holds it until the others' controllers run
+        assert torch.equal(motor.computed_effort[1], new.computed_effort[1])
+        assert torch.equal(torque(motor, 0.4, 0.01 * k, 0.5)[[0, 2]], torque(other, 0.4, 0.01 * k, 0.5)[[0, 2]])
+    for k in range(8):
+        held, kept = torque(motor, 0.4, 0.02 * k, 0.1), torque(other, 0.4, 0.02 * k, 0.1)
+        assert torch.equal(held[[0, 2]], kept[[0, 2]])
+
+
+def test_a_drive_that_is_reset_gives_nothing_of_its_old_torque_where_torques_are_centred():
+    motor = drive(2, physics_dt=0.001, control_decimation=2)
+    motor.take_over_simulator(is_trapezoidal=False, holds_line=True)
+    for _ in range(2):
+        torque(motor, 5.0)
+    motor.reset(torch.tensor([False, True]))
+    assert torque(motor, 1.0)[:, 0].tolist() == [30.0, 10.0]  # 0.5 (50 + 10), and 10 alone
+    assert torque(motor, 1.0)[:, 0].tolist() == [10.0, 10.0]
+
+
+# ---- gradients and shapes
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"delay": 2.0}, {"delay": 2.5}, {"delay": 2.5, "delay_mode": "effort"}, {"delay": 0.5, "control_decimation": 2}],
+)
+def test_gradients_flow_back_through_a_delay(fields):
+    motor = drive(3, physics_dt=0.001, **fields)
+    targets = torch.randn(12, 3, 2, dtype=torch.float64, requires_grad=True)
+
+    def run(commands):
+        motor.reset()
+        return torch.stack([torque(motor, commands[k]) for k in range(12)]).square().sum()
+
+    run(targets).backward()
+    step = torch.zeros_like(targets)
+    step[2, 1, 0] = 1e-6
+    with torch.no_grad():
+        expected = (run(targets + step) - run(targets - step)) / 2e-6
+    assert float(targets.grad[2, 1, 0]) == pytest.approx(float(expected), rel=1e-5)
+    run(targets).backward()  # a reset of all ends the history that gradients flow through
+
+
+@pytest.mark.parametrize("bad", [(3, 1), (1, 2), (2,), (3, 3), (2, 3), ()])
+@pytest.mark.parametrize("what", ["target", "target_vel", "effort", "pos", "vel"])
+def test_what_has_not_a_row_per_environment_and_a_column_per_joint_is_refused(what, bad):
+    """One column of targets was spread over all joints without a word."""
+    values = {"target": 0.0, "pos": 0.0, "vel": 0.0} | {what: torch.zeros(bad, dtype=torch.float64)}
+    names = {"target": "positions", "target_vel": "velocities", "effort": "efforts", "pos": "pos", "vel": "vel"}
+    said = rf"joint_{names[what]} has shape .*, expected a tensor of shape \(3, 2\): a row per .* hip, knee"
+    with pytest.raises(ValueError, match=said):
+        torque(drive(3), **values)
+
+
+def test_other_shapes_are_refused_too():
+    motor = drive(3)
+    with pytest.raises(ValueError, match=r"joint_pos has type list, expected a tensor of shape"):
+        motor.compute(ActuatorActions(), [[0.0, 0.0]], torch.zeros(3, 2))
+    with pytest.raises(ValueError, match=r"encoder_bias has shape \(3,\), expected \(2, 2\)"):
+        motor.update_encoder_bias(torch.zeros(3), [0, 1])
+    with pytest.raises(ValueError, match=r"delay has shape \(4, 1\), expected a number, or a row for each of 3"):
+        motor.update_time_lags(torch.zeros(4))
+    with pytest.raises(ValueError, match=r"torque_enable has shape \(2,\), expected \(3,\)"):
+        motor.set_torque_enable(torch.ones(2, dtype=torch.bool))

@@ -10,6 +10,7 @@ from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_p
 
 from pace_actuators import PaceDCMotor
 from pace_actuators.effects import get_effect, registry
+from pace_actuators.files import OwnFolder
 from pace_envs import set_physics_dt
 from pace_envs.kernels import host
 from pace_optim.recording import Load
@@ -174,9 +175,10 @@ def test_what_cannot_be_compiled_is_stepped_by_the_environment(bench, monkeypatc
 
 def test_nothing_is_compiled_for_few_steps(bench, monkeypatch, tmp_path):
     monkeypatch.setattr(host, "_PATIENCE", 500)
-    kernels = host.HostKernels(shutil.which("c++"), tmp_path)
+    kernels = host.HostKernels(shutil.which("c++"), OwnFolder.at(tmp_path))
     assert [kernels.pays("source", 300) for _ in range(4)] == [False, True, True, True]
-    kernels._path_of("kept").write_text("")
+    name, binary = kernels._name_of("kept"), b"a kernel"
+    (tmp_path / name).write_bytes(binary + host._digest_of(name, binary))
     assert kernels.pays("kept", 1)
 
 

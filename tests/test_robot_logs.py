@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording
-from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, understood, write_map
+from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
+from pace_optim.robot_logs.messages import rows_of
 from pace_optim.robot_logs.words import meaning
 from pace_optim.terminal.cli import run_cli
 
@@ -499,3 +501,26 @@ def test_one_leg_four_ways_is_one_recording():
                           for c in getattr(r, series).T], axis=1) for r in (bag, recording)
             )  # fmt: skip
             assert np.abs(one - other).max() < (0.005 if series == "dof_pos" else 0.1)
+
+
+def test_a_parquet_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    """4 MB of a constant took 5 GB and went on."""
+    parquet.write_table(pa.table({"t": pa.nulls(10**6, pa.float64())}), tmp_path / "long.parquet")
+    monkeypatch.setattr(tables, "_MOST_ROWS", 10**5)
+    with pytest.raises(ValueError, match=r"long\.parquet: holds 1e\+06 rows; expected at most 1e\+05"):
+        load_recordings(tmp_path / "long.parquet")
+    monkeypatch.setattr(tables, "_MOST_ROWS", 10**8)
+    monkeypatch.setattr("pace_actuators.memory.available_memory", lambda: 5e7)
+    with pytest.raises(ValueError, match=r"long\.parquet: reading its 1e\+06 values would take 0\.064 GB of memory"):
+        load_recordings(tmp_path / "long.parquet")
+
+
+def test_a_trajectory_without_an_end_is_refused():
+    def point(seconds):
+        return SimpleNamespace(
+            positions=[0.0], velocities=[], effort=[], time_from_start=SimpleNamespace(sec=seconds, nanosec=0)
+        )
+
+    message = SimpleNamespace(joint_names=["hip"], points=[point(0), point(10**9)])
+    with pytest.raises(ValueError, match=r"/plan: a trajectory lasts 1e\+09 s, expected at most a day"):
+        list(rows_of(message, "/plan"))

@@ -1,6 +1,7 @@
 """Reading files so that what is wrong with them is said by file and key, and writing them whole or not at all."""
 
 from pace_actuators.files.keeping import refuse_place, refuse_taken
+from pace_actuators.files.own_folder import OwnFolder
 from pace_actuators.files.reading import file_at, parsed_json, read_json, read_tensors
 from pace_actuators.files.schema import checked, refuse
 from pace_actuators.files.writing import (
@@ -15,6 +16,7 @@ from pace_actuators.files.writing import (
 )
 
 __all__ = [
+    "OwnFolder",
     "checked",
     "file_at",
     "json_text",

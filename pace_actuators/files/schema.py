@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
@@ -94,8 +95,8 @@ def _plain(hint: Any, value: Any, where: str, cure: str) -> Any:
 
 def _finite(value: Any, where: str, cure: str) -> None:
     """Look for numbers that no computation can go on with, in whatever there is."""
-    if isinstance(value, float) and not math.isfinite(value):
-        _wrong(where, f"is {value}, expected a finite number", cure)
+    if isinstance(value, int | float) and not abs(value) <= sys.float_info.max:  # NaN, infinite, or too many digits
+        _wrong(where, f"is {_shown(value)}, expected a finite number", cure)
     if isinstance(value, Mapping):
         for key, item in value.items():
             _finite(item, f"{where}/{key}", cure)

@@ -157,7 +157,7 @@ def _activation_note(model: mujoco.MjModel, i: int) -> str:
     if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
         return (
             f"The file filters the commands of {model.actuator(i).name} with {model.actuator_dynprm[i, 0]:g} s: left "
-            "out; --effects command_filter identifies it."
+            "out. The delay stands in for a part of it."
         )
     if kind == mujoco.mjtDyn.mjDYN_INTEGRATOR:
         return f"{model.actuator(i).name} is commanded a speed that it integrates: record the target that comes of it."

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 from pathlib import Path
 from typing import cast
 
@@ -10,15 +12,11 @@ import torch
 
 from pace_envs.from_model.defaults import CONTROL_DT
 from pace_envs.from_model.robot import cfg_from_model
+from pace_envs.generated_python import Word, python_page
 from pace_envs.tasks.pace import ExcitationCfg, PaceSim2realEnvCfg
 
-_TEXT = '''\
-"""{name}: its identification, as {model} states it. Every value is yours to edit.
-
-{notes}
-
-    {command} --task {stem}.py:{task} --data RECORDING
-"""
+_PAGE = '''\
+_ABOUT_
 
 import math
 import re
@@ -32,13 +30,11 @@ from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, Pac
 
 HERE = Path(__file__).parent
 
-# Units of hinges; a slide has m for rad, N for N m, kg for kg m^2. The last four are the largest values to be tried.
-JOINTS = {{
-    # kp, kd, effort limit, speed limit, centre and amplitude of the motion, armature, viscous, friction, encoder bias
-{rows}
-}}
-HOME = {{{home}}}
-LONGEST_DELAY = {delay:g}  # [control steps]
+# Units of hinges; a slide has m for rad, N for N m, kg for kg m^2. The last four are the largest values to be tried:
+# kp, kd, effort limit, speed limit, centre and amplitude of the motion, armature, viscous, friction, encoder bias
+JOINTS = _JOINTS_
+HOME = _HOME_
+LONGEST_DELAY = _DELAY_  # [control steps]
 
 
 def column(i: int) -> list[float]:
@@ -56,26 +52,26 @@ def env_cfg() -> PaceSim2realEnvCfg:
         effort_limit=column(2),
         velocity_limit=column(3),
         max_delay=LONGEST_DELAY,
-        implicit={implicit},  # whether the loop runs continuously; else it holds its torque between two commands
+        implicit=_IMPLICIT_,  # whether the loop runs continuously; else it holds its torque between two commands
     )
     robot = ArticulationCfg(
-        mjcf_path=HERE / {path!r},
+        mjcf_path=HERE / _MODEL_,
         init_state=InitialStateCfg(
-            pos={pos},
-            rot={rot},
-            joint_pos={{re.escape(name): value for name, value in HOME.items()}},
+            pos=_POSITION_,
+            rot=_ROTATION_,
+            joint_pos={re.escape(name): value for name, value in HOME.items()},
         ),
-        actuators={{"drives": drives}},
+        actuators={"drives": drives},
         joint_order=names,
     )
     bounds = [(1e-5 * a, a) for a in column(6)] + [(0.0, v) for v in (*column(7), *column(8))]
     bounds += [(-b, b) for b in column(9)] + [(0.0, LONGEST_DELAY)]
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=robot),
-        sim=SimulationCfg(dt={dt:g}, integrator={integrator!r}, gravity={gravity}),
+        sim=SimulationCfg(dt=_STEP_, integrator=_INTEGRATOR_, gravity=_GRAVITY_),
         sim2real=PaceCfg(
-            robot_name={name!r},
-            data_dir="data/{name}/chirp.npz",
+            robot_name=_ROBOT_,
+            data_dir=_DATA_,
             joint_order=names,
             bounds_params=torch.tensor(bounds, dtype=torch.float64),
             excitation=ExcitationCfg(
@@ -83,19 +79,20 @@ def env_cfg() -> PaceSim2realEnvCfg:
                 direction=(1.0,) * len(names),
                 scale=tuple(column(5)),
             ),
-            sample_params={sample},
-            start_params={{  # of a fit: a tenth of the upper bounds
+            sample_params=_SAMPLE_,
+            start_params={  # of a fit: a tenth of the upper bounds
                 "delay": 0.1 * LONGEST_DELAY,
-                **{{
+                **{
                     group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
                     for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
-                }},
-            }},{assumed}
+                },
+            },
+            assumed_gains=_ASSUMED_,  # without those whose gains you state above
         ),
     )
 
 
-register_task({task!r}, env_cfg)
+register_task(_TASK_, env_cfg)
 '''
 
 
@@ -121,48 +118,51 @@ def configuration_text(
     n, names = len(sim2real.joint_order), sim2real.joint_order
     upper = sim2real.bounds_params[:-1, 1].reshape(4, n)
     excitation = cast(ExcitationCfg, sim2real.excitation)
-    rows = []
+    rows = {}
     for i, name in enumerate(names):
         values = [_of(drive.stiffness, i), _of(drive.damping, i), _of(drive.effort_limit, i)]
         values += [_of(drive.velocity_limit, i), excitation.bias[i] * excitation.scale[i], excitation.scale[i]]
-        rows.append(f"    {name!r}: ({', '.join(_number(v) for v in [*values, *upper[:, i].tolist()])}),")
+        rows[name] = tuple(_number(v) for v in [*values, *upper[:, i].tolist()])
     task = f"Pace-{''.join(word.capitalize() for word in sim2real.robot_name.replace('-', '_').split('_'))}-v0"
-    stem = Path(output).stem
     home = robot.init_state.joint_pos if isinstance(robot.init_state.joint_pos, dict) else {}
-    text = _TEXT.format(
-        name=sim2real.robot_name,
-        model=Path(model).name,
-        notes="\n".join(f"- {note}" for note in sim2real.notes),
-        command="pace fit",
-        stem=stem,
-        task=task,
-        rows="\n".join(rows),
-        home=", ".join(f"{_plain(name)!r}: {value:.6g}" for name, value in home.items()),
-        delay=float(sim2real.bounds_params[-1, 1]),
-        path=os.path.relpath(Path(model).resolve(), Path(output).resolve().parent),
-        implicit=drive.implicit,
-        pos=tuple(robot.init_state.pos),
-        rot=tuple(robot.init_state.rot),
-        dt=cfg.sim.dt,
-        integrator=cfg.sim.integrator,
-        gravity=tuple(cfg.sim.gravity),
-        assumed=_assumed(sim2real.assumed_gains),
-        sample={key: value if key == "delay" else _short(value) for key, value in sim2real.sample_params.items()},
+    about = [
+        f"{sim2real.robot_name}: its identification, as {Path(model).name} states it. Every value is yours to edit.",
+        "",
+        *(f"- {note}" for note in sim2real.notes),
+        "",
+        f"    pace fit --task {shlex.quote(f'{Path(output).stem}.py:{task}')} --data RECORDING",
+        "",
+    ]
+    text = python_page(
+        _PAGE,
+        {
+            "_ABOUT_": "\n".join(about),
+            "_JOINTS_": rows,
+            "_HOME_": {_plain(name): _number(value) for name, value in home.items()},
+            "_DELAY_": _number(float(sim2real.bounds_params[-1, 1])),
+            "_IMPLICIT_": drive.implicit,
+            "_MODEL_": os.path.relpath(Path(model).resolve(), Path(output).resolve().parent),
+            "_POSITION_": tuple(robot.init_state.pos),
+            "_ROTATION_": tuple(robot.init_state.rot),
+            "_STEP_": _number(cfg.sim.dt),
+            "_INTEGRATOR_": cfg.sim.integrator,
+            "_GRAVITY_": tuple(cfg.sim.gravity),
+            "_ROBOT_": sim2real.robot_name,
+            "_DATA_": f"data/{sim2real.robot_name}/chirp.npz",
+            "_SAMPLE_": {key: _short(value) for key, value in sim2real.sample_params.items()},
+            "_ASSUMED_": sim2real.assumed_gains,
+            "_TASK_": task,
+        },
     )
     return text, task, cfg
-
-
-def _assumed(names: tuple[str, ...]) -> str:
-    """A line on gains that nobody has stated."""
-    return f"\n            assumed_gains={names!r},  # without those whose gains you state above" if names else ""
 
 
 def _of(values: object, i: int) -> float:
     return float("inf") if values is None else float(torch.as_tensor(values)[i])
 
 
-def _number(value: float) -> str:
-    return "math.inf" if value == float("inf") else f"{value:.6g}"
+def _number(value: float) -> float | Word:
+    return Word("math.inf") if value == float("inf") else float(f"{value:.6g}")
 
 
 def _short(values: object) -> object:
@@ -171,4 +171,4 @@ def _short(values: object) -> object:
 
 def _plain(pattern: str) -> str:
     """The name that an escaped expression matches."""
-    return "".join(c for i, c in enumerate(pattern) if c != "\\" or (i and pattern[i - 1] == "\\"))
+    return re.sub(r"\\(.)", r"\1", pattern, flags=re.DOTALL)

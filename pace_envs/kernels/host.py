@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
 import shutil
-import stat
+import signal
 import subprocess
 import tempfile
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import OwnFolder
 from pace_envs.kernels.arguments import Argument, as_argument
 
 _COMPILERS = ("c++", "g++", "clang++")
@@ -22,6 +25,13 @@ _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "
 """A multiplication and an addition are rounded one by one, as everywhere else."""
 _PATIENCE = 3000
 """Control steps in Python that take as long as a compiler."""
+_LONGEST_S = 180.0
+"""Longest time of a compiler on one kernel [s]; the largest take some 10 s of a free processor."""
+_FIRST = 'extern "C" void simulate() {}'
+"""A kernel that shows whether the compiler works at all, before any process waits for a long one."""
+_FIRST_S = 30.0
+"""Longest time of a compiler on that [s]; it takes 0.1 s."""
+_DIGEST = hashlib.sha256
 _TEMPORARY: list[tempfile.TemporaryDirectory] = []
 """Folders of this process, removed at its end."""
 
@@ -33,7 +43,7 @@ class CannotCompileError(RuntimeError):
 class HostKernels:
     """Kernels by their source, each compiled once for a user and a compiler."""
 
-    def __init__(self, compiler: str, folder: Path, include: str | None = None):
+    def __init__(self, compiler: str, folder: OwnFolder, include: str | None = None):
         """With a compiler of C++, a folder of the user's alone that keeps what it has made, and one of headers."""
         self._command = [compiler, *_OPTIONS, *([] if include is None else [f"-I{include}"])]
         info = os.stat(compiler)
@@ -41,23 +51,34 @@ class HostKernels:
         self._folder = folder
         self._waited: dict[str, int] = {}
         self._functions: dict[str, Any] = {}
+        self._running: set[subprocess.Popen] = set()
+        self._is_stuck = False
 
     def compile(self, sources: Sequence[str]) -> None:
         """Compile those that are new, side by side.
 
+        A kernel of an earlier process is loaded where its digest is right, and compiled again where it is not.
+
         Raises:
-            CannotCompileError: If the compiler refuses one, or what it makes cannot be loaded.
+            CannotCompileError: If the compiler refuses one or does not end, or what it makes cannot be loaded.
         """
         new = [source for source in dict.fromkeys(sources) if source not in self._functions]
         if not new:
             return
         with ThreadPoolExecutor(min(len(new), os.cpu_count() or 1)) as pool:
-            for source, path in zip(new, pool.map(self._compiled, new), strict=True):
-                try:
-                    self._functions[source] = ctypes.CDLL(str(path)).simulate
-                except (OSError, AttributeError) as error:  # a folder from which nothing may run, a damaged file
-                    path.unlink(missing_ok=True)
-                    raise CannotCompileError(f"{path}: {error}") from error
+            try:
+                names = list(pool.map(self._compiled, new))
+            except BaseException:  # one has failed, or the user has interrupted: nobody needs the others
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in list(self._running):
+                    _end(process)
+                raise
+        for source, name in zip(new, names, strict=True):
+            try:
+                self._functions[source] = ctypes.CDLL(self._folder.path_of(name)).simulate
+            except (OSError, AttributeError) as error:  # a folder from which nothing may run
+                self._folder.remove(name)
+                raise CannotCompileError(f"{self._folder.path / name}: {error}") from error
 
     def launch(self, source: str, threads: int, width: int, arguments: Sequence[Argument]) -> None:
         """Run a compiled kernel over all its joints.
@@ -77,63 +98,117 @@ class HostKernels:
             source: The source.
             steps: Control steps that are simulated now.
         """
-        if source in self._functions or self._path_of(source).exists():
+        if source in self._functions or self._is_kept(self._name_of(source)):
             return True
         self._waited[source] = self._waited.get(source, 0) + steps
-        return self._waited[source] >= _PATIENCE
+        return self._waited[source] >= _PATIENCE and not self._is_stuck
 
     def address_of(self, source: str) -> int:
         """Where the function of a compiled one is."""
         return ctypes.cast(self._functions[source], ctypes.c_void_p).value or 0
 
-    def _path_of(self, source: str) -> Path:
-        return self._folder / f"{hashlib.sha256((self._key + source).encode()).hexdigest()}.so"
+    def _name_of(self, source: str) -> str:
+        return f"{_DIGEST((self._key + source).encode()).hexdigest()}.so"
 
-    def _compiled(self, source: str) -> Path:
-        path = self._path_of(source)
-        if not path.exists():
-            with tempfile.NamedTemporaryFile(dir=self._folder, suffix=".tmp", delete=False) as file:
-                begun = Path(file.name)
+    def _is_kept(self, name: str) -> bool:
+        """Whether a file is the kernel that was compiled under its name: whole, and with its digest at its end."""
+        content = self._folder.read(name) or b""
+        size = _DIGEST().digest_size
+        return len(content) > size and content[-size:] == _digest_of(name, content[:-size])
+
+    def _compiled(self, source: str) -> str:
+        """The name of a source's kernel in the folder."""
+        name = self._name_of(source)
+        if not self._is_kept(name):
             try:
-                subprocess.run([*self._command, "-", "-o", str(begun)], input=source.encode(), check=True, stderr=-1)
-                os.replace(begun, path)  # whole or not at all: other processes may want the same
-            except (OSError, subprocess.CalledProcessError) as error:
+                binary = self._run_compiler(source)
+                self._folder.write(name, binary + _digest_of(name, binary))
+            except OSError as error:
                 raise CannotCompileError(f"{self._command[0]}: {error}") from error
-            finally:
-                begun.unlink(missing_ok=True)
-        return path
+        return name
+
+    def _run_compiler(self, source: str) -> bytes:
+        limit = _FIRST_S if source == _FIRST else _LONGEST_S
+        if self._is_stuck:
+            raise CannotCompileError(f"{self._command[0]} did not end before")
+        with tempfile.TemporaryDirectory(prefix="pace_compiler_") as folder:
+            target = Path(folder) / "kernel.so"
+            with subprocess.Popen(
+                [*self._command, "-", "-o", str(target)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # a compiler is several processes, which are ended together
+            ) as process:
+                self._running.add(process)
+                try:
+                    _, said = process.communicate(source.encode(), timeout=limit)
+                except subprocess.TimeoutExpired:
+                    self._tell_stuck(limit)
+                    raise CannotCompileError(f"{self._command[0]} has not ended after {limit:g} s") from None
+                finally:
+                    _end(process)
+                    self._running.discard(process)
+            if process.returncode:
+                raise CannotCompileError(f"{self._command[0]}: {said.decode(errors='replace')[-500:]}")
+            return target.read_bytes()
+
+    def _tell_stuck(self, limit: float) -> None:
+        if not self._is_stuck:
+            self._is_stuck = True
+            warnings.warn(
+                f"The compiler {self._command[0]} has not ended after {limit:g} s: the simulation goes on without "
+                "compiled kernels, more slowly. Repair it, or put another one first in PATH.",
+                stacklevel=2,
+            )
+
+
+def _end(process: subprocess.Popen) -> None:
+    """End a process that still runs, and those that it started."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def _digest_of(name: str, binary: bytes) -> bytes:
+    return _DIGEST(name.encode() + binary).digest()
 
 
 @cache
 def host_kernels() -> HostKernels | None:
-    """The kernels of the processor; ``None`` where no compiler of C++ is installed."""
-    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
-    return None if compiler is None else HostKernels(compiler, _own_folder())
+    """The kernels of the processor; ``None`` where no compiler of C++ is installed, or it does not work."""
+    return _kernels(None)
 
 
 @cache
 def mujoco_kernels() -> HostKernels | None:
-    """The same for kernels that step MuJoCo themselves; ``None`` where there is no compiler, or MuJoCo no headers."""
+    """The same for kernels that step MuJoCo themselves; ``None`` also where MuJoCo has no headers."""
     import mujoco
 
-    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
     include = Path(mujoco.HEADERS_DIR).parent
-    if compiler is None or not (include / "mujoco" / "mujoco.h").exists():
+    return _kernels(str(include)) if (include / "mujoco" / "mujoco.h").exists() else None
+
+
+def _kernels(include: str | None) -> HostKernels | None:
+    if (compiler := _compiler()) is None:
         return None
-    return HostKernels(compiler, _own_folder(), str(include))
-
-
-def _own_folder() -> Path:
-    """A folder that only the user can write to: kept, or for this process where there is none to keep."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(home) / "pace" / "kernels"
+    kernels = HostKernels(compiler, _own_folder(), include)
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        info = folder.stat()
-        others_write = bool(info.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
-        if info.st_uid == os.getuid() and not others_write and os.access(folder, os.W_OK):
-            return folder
-    except (OSError, AttributeError):  # no such folder, or a system without such owners
-        pass
+        kernels.compile([_FIRST])
+    except CannotCompileError:
+        return None
+    return kernels
+
+
+def _compiler() -> str | None:
+    """The machine's compiler; one of the present folder, which a relative PATH names, is not the machine's."""
+    found = (shutil.which(name) for name in _COMPILERS)
+    return next((path for path in found if path is not None and os.path.isabs(path)), None)
+
+
+def _own_folder() -> OwnFolder:
+    """A folder that is the user's alone: kept, or for this process where there is none to keep."""
+    if (kept := OwnFolder.below("XDG_CACHE_HOME", ".cache", "pace", "kernels")) is not None:
+        return kept
     _TEMPORARY.append(tempfile.TemporaryDirectory(prefix="pace_kernels_"))
-    return Path(_TEMPORARY[-1].name)
+    return OwnFolder.at(Path(_TEMPORARY[-1].name).resolve())

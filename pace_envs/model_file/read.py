@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from pace_envs.model_file.limits import check_limits
 from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
 from pace_envs.model_file.urdf import UrdfFacts, read_urdf
 from pace_envs.mujoco_warnings import keep_quiet
@@ -50,11 +51,16 @@ def read_model_file(path: str | Path) -> ModelFile:
         path: The file.
 
     Raises:
-        ValueError: If the file is missing or is no model.
+        ValueError: If the file is missing or is no model, or takes too much time or memory.
     """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"The model file {path} does not exist. Correct its path.")
+    check_limits(path, lambda: mujoco.MjData(_read(path).spec.compile()))
+    return _read(path)
+
+
+def _read(path: Path) -> ModelFile:
     text = path.read_bytes().decode("utf-8", errors="replace")
     facts = read_urdf(text, path) if "<robot" in text and "<mujoco model" not in text[: text.find("<robot")] else None
     keep_quiet()

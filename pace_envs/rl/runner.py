@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pace_envs.rl.episode_log import DeferredEpisodes
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.simulation import available_processors
 
+_MOST = sys.float_info.max
 _CURE = "Name a model_<iteration>.pt that scripts/train.py wrote."
 _MOST_THREADS = 8  # for networks this small
 
@@ -121,7 +123,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def _finite(value: Any, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST:
         raise ValueError(f"{what} is {value!r:.40}")
     return value
 

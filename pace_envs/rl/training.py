@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TextIO
 
 import torch
 import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
+from pace_envs.devices import find_device
 from pace_envs.identified import set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
@@ -144,6 +148,8 @@ def resume(
         settings = replace(settings, device=device)
     checkpoint = latest_checkpoint(folder)
     try:
+        if device is None:
+            find_device(settings.device)
         cfg = load_cfg(settings, edit)
     except ValueError as error:  # from what the folder says
         raise ValueError(f"{folder / SETTINGS_FILE}: {error}") from None
@@ -159,7 +165,8 @@ def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | No
     """Learn; ``begin`` makes the folder, once a checkpoint is known to be sound."""
     torch.manual_seed(cfg.runner.seed)
     env = make_env(cfg)
-    runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
+    with _by_lines():
+        runner = PaceOnPolicyRunner(env, cfg.runner.to_dict())
     if checkpoint is not None:
         runner.load(str(checkpoint))
         torch.manual_seed(cfg.runner.seed + runner.current_learning_iteration)
@@ -172,7 +179,7 @@ def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | No
         )
     folder = None if process_number() else begin()
     runner.logger.log_dir = None if folder is None else str(folder)
-    with told_of_lost_processes():
+    with told_of_lost_processes(), _by_lines():
         runner.learn(left, init_at_random_ep_len=True)
     if folder is not None:
         export_policy(runner, folder / EXPORTED)
@@ -180,3 +187,19 @@ def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | No
         dist.destroy_process_group()
     env.close()
     return folder
+
+
+def _by_lines() -> contextlib.redirect_stdout:
+    """Let rsl-rl print its tables a line at a time: what is written at once is one line on our terminal."""
+    return contextlib.redirect_stdout(_Lines(sys.stdout))  # type: ignore[type-var]
+
+
+class _Lines:
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return sum(self._stream.write(line) for line in text.splitlines(keepends=True))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)

@@ -22,7 +22,7 @@ def main() -> int:
     """The console command ``pace``; returns its exit code."""
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
-        print(_help())
+        print(*_help(), sep="\n")
         return 0
     if words[0] in ("-V", "--version"):
         print(f"pace-mujoco {package_version()}")
@@ -60,18 +60,16 @@ def _spelt(verb: str) -> str:
     return _SPELT.get(verb, verb).replace("_", "-")
 
 
-def _help() -> str:
+def _help() -> list[str]:
     width = max(len(verb) for verb in verbs())
     lines = [f"  {_spelt(verb):<{width}}  {what}" for verb, what in verbs().items()]
-    return "\n".join(
-        [
-            "usage: pace VERB [options]; pace VERB --help says more",
-            "",
-            "Identify a robot's drives from recordings, find the effect that is missing, train with the result.",
-            "",
-            *lines,
-            "",
-            "example:",
-            "  pace fit --task Pace-AnymalD-v0",
-        ]
-    )
+    return [
+        "usage: pace VERB [options]; pace VERB --help says more",
+        "",
+        "Identify a robot's drives from recordings, find the effect that is missing, train with the result.",
+        "",
+        *lines,
+        "",
+        "example:",
+        "  pace fit --task Pace-AnymalD-v0",
+    ]

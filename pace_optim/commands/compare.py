@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from pace_optim.comparison import compare, comparison_text
+from pace_optim.comparison import compare, comparison_lines
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import (
     add_common_options,
@@ -41,6 +41,6 @@ def main() -> None:
         options["strict"],
         options["device"] or "cpu",
     )
-    print(comparison_text(content))
+    print(*comparison_lines(content), sep="\n")
     print(f"report: {Path(content['run']) / 'report.html'}")
     print(f"run: {content['run']}")

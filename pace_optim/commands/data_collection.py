@@ -16,7 +16,7 @@ def main() -> None:
     collection = collect(cfg_from_args(make_collection_parser().parse_args()), progress.say)
     if collection.design is not None:
         progress.close()
-        print(design_table(collection.design))
+        print(*design_table(collection.design), sep="\n")
     for warning in collection.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for line in collection.hidden:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from pace_actuators.files import refuse_taken
-from pace_optim.comparison import compare, comparison_text
+from pace_optim.comparison import compare, comparison_lines
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.fit import fit
@@ -82,17 +82,17 @@ def main() -> None:
             log_dir=str(args.log_dir),
         )
     )
-    print(summary(result))
-    print("\n3. Compare: where does it fail?", flush=True)
-    print(comparison_text(compare([base])))
-    print("\n4. Diagnose: which effect is missing?", flush=True)
+    print(*summary(result), sep="\n")
+    print("", "3. Compare: where does it fail?", sep="\n", flush=True)
+    print(*comparison_lines(compare([base])), sep="\n")
+    print("", "4. Diagnose: which effect is missing?", sep="\n", flush=True)
     diagnosis = diagnose(DiagnosisSettings(run=base, max_effects=2))
     print(diagnosis.summary)
     hidden = json.loads(Path(files["train"][0]).with_suffix(".truth.json").read_text())["effects"]
-    print(f"\nThe truth: {', '.join(hidden)} on {args.effect_joints}.")
+    print("", f"The truth: {', '.join(hidden)} on {args.effect_joints}.", sep="\n")
     if len(diagnosis.runs) > 1:
-        print("\n5. The ladder of the error, from the base model to the last effect:", flush=True)
-        print(comparison_text(compare(diagnosis.runs)))
+        print("", "5. The ladder of the error, from the base model to the last effect:", sep="\n", flush=True)
+        print(*comparison_lines(compare(diagnosis.runs)), sep="\n")
     for run in diagnosis.runs:
         print(f"report: {write_report(run)}")
     print(f"run: {diagnosis.runs[-1]}")

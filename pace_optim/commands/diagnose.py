@@ -58,5 +58,5 @@ def run_and_tell(settings: DiagnosisSettings) -> None:
 
 def _tell(diagnosis: Diagnosis) -> None:
     """Print what was found, before the robot is fitted again."""
-    print("\n".join(lines_of(diagnosis)))
+    print(*lines_of(diagnosis), sep="\n")
     print(f"report: {Path(diagnosis.run) / 'report.html'}", flush=True)

@@ -27,7 +27,7 @@ def main() -> None:
         refuse_taken([output], option="--output", overwrite=options["overwrite"])
     exported = export(options["result"], options["format"], joints_only=options["joints_only"], task=options["task"])
     if output is None:
-        print(exported.text, end="")
+        print(*exported.text.split("\n"), sep="\n", end="")
     else:
         exported.write(output)
     for note in exported.notes:  # after the text on standard output, they go where they do not mix with it

@@ -108,7 +108,7 @@ def main() -> None:
         if args["task"] is None:
             raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
         result, folder = fit(FitSettings(**args, device=device), processes=processes)
-    print(summary(result))
+    print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
     if then_diagnose and "interrupted" not in result.stop_reasons:
         from pace_optim.commands.diagnose import run_and_tell

@@ -51,7 +51,7 @@ def main() -> None:
     run, physics_dt = args.pop("replay"), args.pop("physics_dt")
     if run is not None:
         training = RunSettings(task=args["task"] or "", identified=run, physics_dt=physics_dt)
-        print(replay_in_training(run, load_cfg(training) if args["task"] else None))
+        print(*replay_in_training(run, load_cfg(training) if args["task"] else None).table, sep="\n")
         return
     if args["checkpoint"] is None:
         raise ValueError("--checkpoint is missing: name a model_<n>.pt or a training's folder, or a fit with --replay.")
@@ -59,4 +59,4 @@ def main() -> None:
     args["device"] = args["device"] or "cpu"
     result = play(PlaySettings(**args))
     if result is not None:
-        print(result)
+        print(*str(result).split("\n"), sep="\n")

@@ -5,6 +5,6 @@
 """
 
 from .compare import VERSION, compare
-from .text import comparison_text
+from .text import comparison_lines
 
-__all__ = ["VERSION", "compare", "comparison_text"]
+__all__ = ["VERSION", "compare", "comparison_lines"]

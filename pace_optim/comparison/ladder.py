@@ -81,8 +81,8 @@ def make_ladder(runs: Sequence[RunTracks]) -> dict[str, Any]:
     return {"steps": steps, "noise_floor": floors}
 
 
-def ladder_table(ladder: dict[str, Any], joint_types: Sequence[JointType]) -> str:
-    """The ladder for a terminal; its errors are of joints of these types."""
+def ladder_table(ladder: dict[str, Any], joint_types: Sequence[JointType]) -> list[str]:
+    """The ladder as lines for a terminal; its errors are of joints of these types."""
     steps, floor = ladder["steps"], ladder["noise_floor"][ALL]
     factor, unit = position_unit([s["rmse"][part].get(ALL) for s in steps for part in _PARTS], joint_types)
     rows = [["", *(f"{part} [{unit}]" for part in _PARTS), "× better (train, validation)"]]
@@ -92,12 +92,8 @@ def ladder_table(ladder: dict[str, Any], joint_types: Sequence[JointType]) -> st
         rows.append([step["name"], *values, ", ".join(ratio)])
     rows.append(["noise floor", *[_cell(floor, factor)] * 2, ""])
     widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
-    return "\n".join(
-        (
-            row[0].ljust(widths[0]) + "".join(f"  {cell.rjust(w)}" for cell, w in zip(row[1:], widths[1:], strict=True))
-        ).rstrip()
-        for row in rows
-    )
+    cells = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
+    return ["  ".join(row).rstrip() for row in cells]
 
 
 def _floor(j: int, tracks: Sequence[Track]) -> float:

@@ -10,8 +10,8 @@ from pace_optim.report.number_text import position_unit
 from .ladder import ladder_table
 
 
-def comparison_text(content: dict[str, Any]) -> str:
-    """A row per joint, the worst places, the ladder.
+def comparison_lines(content: dict[str, Any]) -> list[str]:
+    """A row per joint, the worst places, the ladder, as lines.
 
     Args:
         content: Of comparison.json.
@@ -32,9 +32,8 @@ def comparison_text(content: dict[str, Any]) -> str:
     lines += ["", content["summary"]]
     lines += [f"  {place['sentence']}" for place in content["worst_places"]]
     if "ladder" in content:
-        lines += ["", ladder_table(content["ladder"], types)]
-    lines += [f"note: {note}" for note in content["notes"]]
-    return "\n".join(lines)
+        lines += ["", *ladder_table(content["ladder"], types)]
+    return lines + [f"note: {note}" for note in content["notes"]]
 
 
 def _cell(value: float | None, factor: float) -> str:

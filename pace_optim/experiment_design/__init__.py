@@ -1,8 +1,8 @@
-"""Choosing a motion before any hardware moves: the one after which the parameters are known best.
+r"""Choosing a motion before any hardware moves: the one after which the parameters are known best.
 
 >>> design = optimize_motion(make_problem, "chirp", sim2real, unoptimized, limits, x, control_dt=0.0025)
 >>> design.trajectory, design.before.std, design.after.std
->>> print(design_table(design))
+>>> print(*design_table(design), sep="\n")
 """
 
 from .criterion import expected_uncertainty, mean_log_error

@@ -12,8 +12,12 @@ from pace_optim.uncertainty.warnings import in_words
 from .design import Design
 
 
-def design_table(design: Design) -> str:
-    """Expected error bars of every parameter, before and after; how each joint moves; what stays unknown."""
+def design_table(design: Design) -> list[str]:
+    """Expected error bars of every parameter, before and after; how each joint moves; what stays unknown.
+
+    Returns:
+        Its lines.
+    """
     space = design.space
     own = [p for p in space.parameters if not p.shared]
     joints = design.trajectory.joint_names
@@ -40,8 +44,7 @@ def design_table(design: Design) -> str:
             f"The motion asked for has targets faster than the drive on {', '.join(design.slowed)} (its error bars: "
             f"{100 * math.exp(design.criterion_asked):.3g} %); unoptimised is the same, smaller where too fast."
         )
-    lines += _unknown("unoptimised", design.before) + _unknown("optimised", design.after)
-    return "\n".join(lines)
+    return lines + _unknown("unoptimised", design.before) + _unknown("optimised", design.after)
 
 
 def _change(design: Design, label: str) -> str:

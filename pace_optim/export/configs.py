@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -12,6 +11,7 @@ from pace_actuators import IdentifiedAt, IdentifiedDrives, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable
+from pace_envs.generated_python import Call, Word, python_page
 from pace_envs.identified import load_identified_cfg
 
 _DELAY = (
@@ -42,63 +42,81 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
 
 def cfg_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """``PaceDCMotorCfg``s for the environments of this project."""
-    body = [
-        "from pace_actuators import IdentifiedAt, PaceDCMotorCfg",
-        "from pace_actuators.effects import EffectCfg",
-        "",
-        f"ACTUATORS = {_groups(drives)}",
-        '"""For ArticulationCfg(actuators=ACTUATORS), or set_drives(cfg, ACTUATORS) of pace_envs.tasks.velocity."""',
-    ]
-    return _page(drives, HERE, body)
+    return _page(drives, HERE, _CFG, {})
 
 
 def mjlab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """An articulation of mjlab."""
-    events = _changes_friction(drives)
-    body = [
-        "from mjlab.entity import EntityArticulationInfoCfg",
-        "",
-        "from pace_actuators import IdentifiedAt, PaceDCMotorCfg",
-        "from pace_actuators.effects import EffectCfg",
-        f"from pace_actuators.mjlab import PaceDCMotorActuatorCfg{', drive_friction_event' if events else ''}",
-        "",
-        f"MOTORS = {_groups(drives)}",
-        "ARTICULATION = EntityArticulationInfoCfg(",
-        "    actuators=tuple(PaceDCMotorActuatorCfg(motor=motor) for motor in MOTORS.values())",
-        ")",
-        '"""For EntityCfg(articulation=ARTICULATION); the encoder bias is written to entity.data.encoder_bias."""',
-    ]
-    if events:
-        body += [
-            'EVENTS = {"drive_friction": drive_friction_event()}',
-            '"""Add to the environment\'s events: friction changes at every physics step."""',
-        ]
-    return _page(drives, MJLAB, body)
+    template = _MJLAB
+    if _changes_friction(drives):
+        template = template.replace(_MJLAB_IMPORT, f"{_MJLAB_IMPORT}, drive_friction_event") + _MJLAB_EVENTS
+    return _page(drives, MJLAB, template, {})
 
 
 def isaaclab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """Actuators of an Isaac Lab articulation."""
-    body = [
-        "from pace_actuators import IdentifiedAt, PaceDCMotorCfg",
-        "from pace_actuators.effects import EffectCfg",
-        "from pace_actuators.isaaclab import PaceDCMotorActuatorCfg",
-        "",
-        f"PHYSICS_DT = {drives.at.physics_dt!r}  # your simulation's dt [s]",
-        f"MOTORS = {_groups(drives, physics_dt='PHYSICS_DT')}",
-        "ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS.items()}",
-        '"""For ArticulationCfg(actuators=ACTUATORS); observe encoder_pos_rel of pace_actuators.isaaclab."""',
-    ]
-    return _page(drives, ISAACLAB, body)
+    return _page(drives, ISAACLAB, _ISAACLAB, {"physics_dt": Word("PHYSICS_DT")})
 
 
-def _page(drives: IdentifiedDrives, world: World, body: list[str]) -> tuple[str, list[str]]:
+_CFG = '''\
+_ABOUT_
+
+from pace_actuators import IdentifiedAt, PaceDCMotorCfg
+from pace_actuators.effects import EffectCfg
+
+ACTUATORS = _MOTORS_
+"""For ArticulationCfg(actuators=ACTUATORS), or set_drives(cfg, ACTUATORS) of pace_envs.tasks.velocity."""
+'''
+
+_MJLAB_IMPORT = "from pace_actuators.mjlab import PaceDCMotorActuatorCfg"
+_MJLAB = f'''\
+_ABOUT_
+
+from mjlab.entity import EntityArticulationInfoCfg
+
+from pace_actuators import IdentifiedAt, PaceDCMotorCfg
+from pace_actuators.effects import EffectCfg
+{_MJLAB_IMPORT}
+
+MOTORS = _MOTORS_
+ARTICULATION = EntityArticulationInfoCfg(
+    actuators=tuple(PaceDCMotorActuatorCfg(motor=motor) for motor in MOTORS.values())
+)
+"""For EntityCfg(articulation=ARTICULATION); the encoder bias is written to entity.data.encoder_bias."""
+'''
+_MJLAB_EVENTS = '''\
+EVENTS = {"drive_friction": drive_friction_event()}
+"""Add to the environment's events: friction changes at every physics step."""
+'''
+
+_ISAACLAB = '''\
+_ABOUT_
+
+from pace_actuators import IdentifiedAt, PaceDCMotorCfg
+from pace_actuators.effects import EffectCfg
+from pace_actuators.isaaclab import PaceDCMotorActuatorCfg
+
+PHYSICS_DT = _PHYSICS_DT_  # your simulation's dt [s]
+MOTORS = _MOTORS_
+ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS.items()}
+"""For ArticulationCfg(actuators=ACTUATORS); observe encoder_pos_rel of pace_actuators.isaaclab."""
+'''
+
+
+def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[str, Any]) -> tuple[str, list[str]]:
     notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
     if world.friction_hook and _is_implicit(drives):
         notes.append(
             f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
         )
-    head = [f'"""Drives identified with {drives.task}: {drives.path.parent.name}.', "", *notes, '"""', ""]
-    return "\n".join([*head, *body]) + "\n", notes
+    motors = {group: _call(cfg, extra) for group, cfg in drive_groups(drives).items()}
+    values = {"_ABOUT_": about(drives, "", notes), "_MOTORS_": motors, "_PHYSICS_DT_": drives.at.physics_dt}
+    return python_page(template, values), notes
+
+
+def about(drives: IdentifiedDrives, where: str, notes: Sequence[str]) -> str:
+    """A page's docstring: of which fit it is, for what, and what it does not hold."""
+    return "\n".join([f"Drives identified with {drives.task}{where}: {drives.path.parent.name}.", "", *notes, ""])
 
 
 def _is_implicit(drives: IdentifiedDrives) -> bool:
@@ -111,31 +129,27 @@ def _changes_friction(drives: IdentifiedDrives) -> bool:
     return _is_implicit(drives) or any(kind.overrides(stage) for kind in kinds for stage in stages)
 
 
-def _groups(drives: IdentifiedDrives, **extra: str) -> str:
-    groups = drive_groups(drives)
-    items = [f"    {name!r}: {_source(cfg, extra)}," for name, cfg in groups.items()]
-    return "\n".join(["{", *items, "}"])
-
-
-def _source(cfg: PaceDCMotorCfg, extra: dict[str, str]) -> str:
+def _call(cfg: PaceDCMotorCfg, extra: Mapping[str, Any]) -> Call:
     """A constructor call; defaults are left out."""
     default = PaceDCMotorCfg(joint_names_expr="")
     values = {f.name: getattr(cfg, f.name) for f in fields(cfg)}
-    changed = {name: _literal(value) for name, value in values.items() if value != getattr(default, name)}
-    lines = [f"        {name}={text}," for name, text in (changed | extra).items()]
-    return "\n".join(["PaceDCMotorCfg(", *lines, "    )"])
+    changed = {name: _value(value) for name, value in values.items() if value != getattr(default, name)}
+    return Call(name="PaceDCMotorCfg", values={**changed, **extra})
 
 
-def _literal(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.10g}" if math.isfinite(value) else f'float("{value}")'
+def _value(value: Any) -> Any:
     if isinstance(value, IdentifiedAt):
-        return f"IdentifiedAt(control_dt={value.control_dt!r}, physics_dt={value.physics_dt!r})"
+        return Call(name="IdentifiedAt", values={"control_dt": value.control_dt, "physics_dt": value.physics_dt})
     if isinstance(value, EffectCfg):
-        fixed = f"effect={value.effect!r}, joint_names_expr={_literal(value.joint_names_expr)}"
-        return f"EffectCfg({fixed}, shared={value.shared!r}, values={_literal(value.values)})"
+        names = ("effect", "joint_names_expr", "shared", "values")
+        return Call(name="EffectCfg", values={name: _value(getattr(value, name)) for name in names})
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key!r}: {_literal(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, (tuple, list)):
-        return "(" + "".join(f"{_literal(each)}, " for each in value).rstrip() + ")"
-    return repr(value)
+        return {key: _value(each) for key, each in value.items()}
+    if isinstance(value, tuple | list):
+        return tuple(map(_value, value))
+    return digits(value) if isinstance(value, float) else value
+
+
+def digits(value: float) -> float:
+    """A number as a page shows it, in ten digits."""
+    return float(f"{value:.10g}")

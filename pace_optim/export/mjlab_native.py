@@ -5,9 +5,12 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from pace_actuators import IdentifiedDrives
+from pace_envs.generated_python import Call, python_page
 from pace_optim.export import mjlab_native_template
+from pace_optim.export.configs import about, digits
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
@@ -28,38 +31,42 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """
     plain, notes = plain_drives(drives)
     notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
-    classes = sorted({_class(drive) for drive in plain.values()})
-    rows = [f"    {mjlab_actuator(drives, joint, drive)}," for joint, drive in plain.items()]
-    bias = [f"    {joint!r}: {-drive.encoder_bias:.10g}," for joint, drive in plain.items() if drive.encoder_bias]
-    body = [
-        f'"""Drives identified with {drives.task}, for mjlab 1.6 alone: {drives.path.parent.name}.',
-        "",
-        *notes,
-        '"""',
-        "",
-        f"from mjlab.actuator import {', '.join(classes)}",
-        "from mjlab.entity import EntityArticulationInfoCfg",
-        "from mjlab.envs.mdp import dr",
-        "from mjlab.managers.event_manager import EventTermCfg",
-        "from mjlab.managers.scene_entity_config import SceneEntityCfg",
-        "",
-        f"PHYSICS_DT = {drives.at.physics_dt!r}",
-        '"""Set MujocoCfg(timestep=PHYSICS_DT): delays count these steps [s]."""',
-        "",
-        *["ACTUATORS = (", *rows, ")"],
-        "ARTICULATION = EntityArticulationInfoCfg(actuators=ACTUATORS)",
-        '"""For EntityCfg(articulation=ARTICULATION)."""',
-        "",
-        *["ENCODER_BIAS = {", *bias, "}"],
-        '"""mjlab\'s encoder shows q + these [rad, of slides m]."""',
-    ]
+    calls = [mjlab_actuator(drives, joint, drive) for joint, drive in plain.items()]
+    values = {
+        "_ABOUT_": about(drives, ", for mjlab 1.6 alone", notes),
+        "_PHYSICS_DT_": drives.at.physics_dt,
+        "_ACTUATORS_": tuple(calls),
+        "_BIAS_": {joint: digits(-drive.encoder_bias) for joint, drive in plain.items() if drive.encoder_bias},
+    }
+    classes = ", ".join(sorted({call.name for call in calls}))
     functions = inspect.getsource(mjlab_native_template).split(_START)[1]
-    return "\n".join(body) + "\n" + functions, notes
+    return python_page(_HEAD.replace("CLASSES", classes) + functions, values), notes
 
 
-def mjlab_actuator(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> str:
+_HEAD = '''\
+_ABOUT_
+
+from mjlab.actuator import CLASSES
+from mjlab.entity import EntityArticulationInfoCfg
+from mjlab.envs.mdp import dr
+from mjlab.managers.event_manager import EventTermCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+
+PHYSICS_DT = _PHYSICS_DT_
+"""Set MujocoCfg(timestep=PHYSICS_DT): delays count these steps [s]."""
+
+ACTUATORS = _ACTUATORS_
+ARTICULATION = EntityArticulationInfoCfg(actuators=ACTUATORS)
+"""For EntityCfg(articulation=ARTICULATION)."""
+
+ENCODER_BIAS = _BIAS_
+"""mjlab's encoder shows q + these [rad, of slides m]."""
+'''
+
+
+def mjlab_actuator(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> Call:
     """The call that makes a joint's actuator, by the class of mjlab that holds this kind of drive."""
-    return f"{_class(drive)}({_fields(drives, joint, drive)})"
+    return Call(name=_class(drive), values=_fields(drives, joint, drive))
 
 
 def _class(drive: PlainDrive) -> str:
@@ -70,7 +77,7 @@ def _class(drive: PlainDrive) -> str:
     return "BuiltinPositionActuatorCfg" if drive.stiffness else "BuiltinVelocityActuatorCfg"
 
 
-def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> str:
+def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> dict[str, Any]:
     values: dict[str, float] = {"stiffness": drive.stiffness} if drive.stiffness or drive.run_dt else {}
     values["damping"] = drive.damping
     if math.isfinite(drive.effort_limit):
@@ -83,8 +90,8 @@ def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> str:
         if not is_undetermined(drives, parameter, joint):
             values[name] = drives.values(parameter, [joint])[joint]
     steps = round(drive.delay_s / drives.at.physics_dt)
-    text = [f"target_names_expr=({_expression(joint)!r},)", *(f"{name}={value:.10g}" for name, value in values.items())]
-    return ", ".join([*text, *([f"delay_min_lag={steps}", f"delay_max_lag={steps}"] if steps else [])])
+    lags = {"delay_min_lag": steps, "delay_max_lag": steps} if steps else {}
+    return {"target_names_expr": (_expression(joint),), **{name: digits(v) for name, v in values.items()}, **lags}
 
 
 def _expression(joint: str) -> str:

@@ -7,7 +7,9 @@ import math
 from collections.abc import Mapping
 
 from pace_actuators import IdentifiedDrives
+from pace_envs.generated_python import python_page
 from pace_optim.export import newton_template
+from pace_optim.export.configs import about, digits
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
@@ -39,23 +41,27 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         }
         for joint in plain
     }
-    body = [
-        f'"""Drives identified with {drives.task}, for Newton 1.8: {drives.path.parent.name}.',
-        "",
-        *notes,
-        '"""',
-        "",
-        f"PHYSICS_DT = {drives.at.physics_dt!r}",
-        '"""Step of the identification [s]."""',
-        "",
-        f"JOINTS = {_table(joints)}",
-        '"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]; of a slide [kg], [N], [N s/m]."""',
-        "",
-        f"DRIVES = {_table({joint: _parts(drive) for joint, drive in plain.items()})}",
-        '"""Delay [s], control law and clamp, in SI units."""',
-    ]
-    functions = inspect.getsource(newton_template).split(_START)[1]
-    return "\n".join(body) + "\n" + functions, notes
+    values = {
+        "_ABOUT_": about(drives, ", for Newton 1.8", notes),
+        "_PHYSICS_DT_": drives.at.physics_dt,
+        "_JOINTS_": _table(joints),
+        "_DRIVES_": _table({joint: _parts(drive) for joint, drive in plain.items()}),
+    }
+    return python_page(_HEAD + inspect.getsource(newton_template).split(_START)[1], values), notes
+
+
+_HEAD = '''\
+_ABOUT_
+
+PHYSICS_DT = _PHYSICS_DT_
+"""Step of the identification [s]."""
+
+JOINTS = _JOINTS_
+"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]; of a slide [kg], [N], [N s/m]."""
+
+DRIVES = _DRIVES_
+"""Delay [s], control law and clamp, in SI units."""
+'''
 
 
 def _parts(drive: PlainDrive) -> dict[str, float]:
@@ -86,9 +92,5 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
     return notes
 
 
-def _table(values: Mapping[str, Mapping[str, float]]) -> str:
-    rows = []
-    for joint, row in values.items():
-        entries = ", ".join(f"{name!r}: {value:.10g}" for name, value in row.items())
-        rows.append(f"    {joint!r}: {{{entries}}},")
-    return "\n".join(["{", *rows, "}"])
+def _table(values: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    return {joint: {name: digits(value) for name, value in row.items()} for joint, row in values.items()}

@@ -85,7 +85,7 @@ def conclude(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> 
     if not end.is_far and not outcome.is_interrupted:
         end = _told_of_step(run, end)
     if run.progress.elapsed > _LONG and not outcome.is_interrupted:
-        run.progress.tell(f"{summary(_result(run, record, outcome, end))}\nThat was the fit; what follows checks it.")
+        run.progress.tell(*summary(_result(run, record, outcome, end)), "That was the fit; what follows checks it.")
     if left_open := undetermined(run.problem, end.x, end.uncertainty, end.is_far):
         end = _with_prior(run, outcome, end, left_open)
     if not end.is_far and not outcome.is_interrupted:

@@ -20,6 +20,8 @@ _COMMANDED = ("desired", "reference", "output", "command", "commands")
 _MEASURED = ("actual", "feedback", "state")
 _FINE = 5_000_000
 """Spacing at which a trajectory of several points is followed [ns]."""
+_LONGEST = 86_400_000_000_000
+"""Longest trajectory that is followed [ns]: a day."""
 _MOST = 600
 """Numbers of a message beyond which it is no message on joints (images, maps)."""
 
@@ -106,6 +108,11 @@ def _trajectory(message: Any, topic: str) -> Iterator[tuple[int, Names, np.ndarr
         yield 0, tuple(names), table[0]
         return
     after = np.array([p.time_from_start.sec * 1_000_000_000 + p.time_from_start.nanosec for p in points])
+    if after[-1] - after[0] > _LONGEST:
+        raise ValueError(
+            f"{topic}: a trajectory lasts {1e-9 * (after[-1] - after[0]):.3g} s, expected at most a day. Leave its "
+            "messages out of the bag."
+        )
     for at in range(int(after[0]), int(after[-1]) + 1, _FINE):
         yield at, tuple(names), np.array([np.interp(at, after, column) for column in table.T])
 

@@ -8,12 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.memory import check_memory
+
 from .log import Channel, Log, cleaned
 from .messages import STATE_DEFINITIONS, rows_of
 from .optional import reader
 
 _CLOCKS_AGREE = 0.5
 """Header stamps further than this from the instants of arrival are of another clock [s]."""
+_AT_ONCE = 100_000
+"""Messages after which it is looked again whether there is memory for more."""
+_BYTES_PER_ROW = 10_000
+"""Memory of a message's numbers, of the longest ones."""
 _GOOD = 0.98
 """Share of messages whose header must hold a stamp."""
 
@@ -40,6 +46,7 @@ def read_rosbag(path: Path) -> Log:
         store.register(typesys.get_types_from_msg(text, name))
     tables: dict[str, dict[tuple[tuple[str, str, str], ...], _Rows]] = {}
     unread: dict[str, str] = {}
+    count = 0
     try:
         with highlevel.AnyReader([path], default_typestore=store) as bag:
             for connection, received, raw in bag.messages():
@@ -51,6 +58,11 @@ def read_rosbag(path: Path) -> Log:
                     unread[connection.topic] = f"{connection.msgtype} ({type(error).__name__})"
                     continue
                 for after, names, values in rows_of(message, connection.topic):
+                    count += 1
+                    if count % _AT_ONCE == 0:
+                        check_memory(
+                            _AT_ONCE * _BYTES_PER_ROW, f"{path}: reading beyond {count:.3g} messages", "Cut it."
+                        )
                     rows = tables.setdefault(connection.topic, {}).setdefault(names, _Rows())
                     rows.received.append(received + after)
                     stamp = _stamp(message)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import parsed_json
+from pace_actuators.memory import check_memory
 from pace_optim.recording.keys import listed
 from pace_optim.recording.stamps import seconds_of, unix_unit
 
@@ -23,6 +24,11 @@ from .words import TIME_UNITS, is_time, meaning, time_unit
 
 _FASTEST, _SLOWEST = 5e-5, 0.12
 """Steps that a log of joints may have [s]."""
+_MOST_ROWS = 10**8
+_BYTES_PER_VALUE = 64
+"""Memory of a value of a parquet file while lists of it are read."""
+_BYTES_PER_BYTE = 12
+"""Memory of a CSV's cells as text, for each of its bytes."""
 _NANO = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
 
 
@@ -52,7 +58,10 @@ def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     logs: list[Log] = []
     for file in files:
         try:
+            _check_size(file, parquet.ParquetFile(file).metadata)
             table = parquet.read_table(file)
+        except ValueError:
+            raise
         except Exception as error:  # pyarrow raises many kinds
             text = " ".join(str(error).split())[:200]
             raise ValueError(
@@ -70,7 +79,23 @@ def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     return logs
 
 
+def _check_size(path: Path, metadata: Any) -> None:
+    """Refuse a parquet file that unpacks to more than can be read: of a constant it holds 1e8 in a megabyte.
+
+    Raises:
+        ValueError: If it has too many rows, or does not fit into memory.
+    """
+    if metadata.num_rows > _MOST_ROWS:
+        raise ValueError(
+            f"{path}: holds {metadata.num_rows:.3g} rows; expected at most {_MOST_ROWS:.0e} (28 h at 1 kHz). Cut it."
+        )
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    values = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
+    check_memory(_BYTES_PER_VALUE * values, f"{path}: reading its {values:.3g} values", "Cut it.")
+
+
 def _csv_columns(path: Path) -> dict[str, np.ndarray]:
+    check_memory(_BYTES_PER_BYTE * path.stat().st_size, f"{path}: reading it", "Cut it.")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             head = file.read(65536)

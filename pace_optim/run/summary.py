@@ -7,8 +7,8 @@ from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
 from pace_optim.run.result import FitResult
 
 
-def summary(result: FitResult) -> str:
-    """The table of parameters with error bars, the errors and the warnings."""
+def summary(result: FitResult) -> list[str]:
+    """The table of parameters with error bars, the errors and the warnings, a line each."""
     names = [name for name, values in result.parameters.items() if set(values) != {ALL}]
     width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
@@ -33,8 +33,7 @@ def summary(result: FitResult) -> str:
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
     lines += [f"note: {note}" for note in result.notes]
-    lines += [f"warning: {warning}" for warning in result.warnings]
-    return "\n".join(lines)
+    return lines + [f"warning: {warning}" for warning in result.warnings]
 
 
 def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:

@@ -58,8 +58,9 @@ class TrainingReplay:
         parts = [part for part in self.replayed if self.replayed[part] and self.fitted.get(part)]
         return max((abs(self.replayed[p][ALL] / self.fitted[p][ALL] - 1) for p in parts), default=float("nan"))
 
-    def __str__(self) -> str:
-        """A table: one line per joint."""
+    @property
+    def table(self) -> list[str]:
+        """Its lines, one per joint."""
         width = max(len(name) + len(" [mrad]") for name in (*self.joint_names, "joint"))
         parts = [part for part in ("train", "validation") if self.replayed.get(part)]
         head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>9}" for part in parts)
@@ -74,7 +75,11 @@ class TrainingReplay:
         lines.append(
             f"control steps: {1e3 * self.fitted_control_dt:g} ms in the fit, {1e3 * self.control_dt:g} ms here"
         )
-        return "\n".join(lines)
+        return lines
+
+    def __str__(self) -> str:
+        """The table as text."""
+        return "\n".join(self.table)
 
 
 def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -> TrainingReplay:

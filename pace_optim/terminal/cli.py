@@ -17,7 +17,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from pace_optim.terminal.faults import is_of_input, own_code, sentence
 from pace_optim.terminal.screen import one_line, safe_streams
@@ -85,6 +85,10 @@ def as_called(text: str) -> str:
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line and say what was probably meant."""
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print a text of argparse, which is several lines."""
+        print(*message.removesuffix("\n").split("\n"), sep="\n", file=file or sys.stderr)
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with 2."""

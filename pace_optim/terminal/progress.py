@@ -65,15 +65,15 @@ class ProgressLine:
         self._latest = (self.elapsed, self._latest[1])
         if self._live:
             width = shutil.get_terminal_size().columns - 1
-            self._stream.write("\r" + text[:width].ljust(width))
+            self._stream.write("\r")
+            self._stream.write(text[:width].ljust(width))
         else:
             self._stream.write(text + "\n")
         self._stream.flush()
 
-    def tell(self, text: str) -> None:
+    def tell(self, *lines: str) -> None:
         """Show lines that stay."""
-        self._stream.write(("\n" if self._live else "") + text + "\n")
-        self._stream.flush()
+        print(*([""] if self._live else []), *lines, sep="\n", file=self._stream, flush=True)
 
     def close(self) -> None:
         """End the line."""

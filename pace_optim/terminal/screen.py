@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import unicodedata
+import warnings
 from collections.abc import Iterator
 from typing import Any, TextIO
 
@@ -19,31 +20,32 @@ _ERRORS = "pace_plain"
 
 
 def readable(text: str) -> str:
-    """The text with what steers a terminal written out: escapes, bells, changes of direction."""
-    if text.isprintable():
-        return text
-    head = "\r" if text.startswith("\r") else ""  # the progress line's own
-    return head + "".join(_shown(c) for c in text[len(head) :])
+    """The text with what steers a terminal written out: ends of lines, escapes, bells, changes of direction."""
+    return text if text.isprintable() else "".join(map(_shown, text))
 
 
 def one_line(text: str) -> str:
     """The text as one line that can be read; words without an end are cut."""
-    line = " ".join(readable(text).split())
+    line = readable(" ".join(text.split()))
     return re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda found: f"{found[0][:80]}…{found[0][-20:]}", line)
 
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[None]:
-    """Let everything in the block print through :func:`readable`, to streams that take any character.
+    r"""Let everything in the block print through :func:`readable`, to streams that take any character.
 
-    A stream that is closed swallows what it gets: ``2>&-`` must not let messages run into the output.
+    What is written at once is one line, which may end: the end of a line within it came with a name or a text of
+    somebody else's, and is written out. So nothing foreign can begin a line of its own, such as ``run: …``. Print
+    several lines with ``print(*lines, sep="\n")``. A stream that is closed swallows what it gets: ``2>&-`` must not
+    let messages run into the output.
     """
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (_Screen(_open(stream)) for stream in before)  # type: ignore[assignment]
+    before = sys.stdout, sys.stderr, warnings.formatwarning
+    sys.stdout, sys.stderr = (_Screen(_open(stream)) for stream in before[:2])  # type: ignore[assignment]
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"  # type: ignore[assignment]
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr, warnings.formatwarning = before
 
 
 def _open(stream: TextIO | None) -> TextIO:
@@ -56,13 +58,15 @@ def _open(stream: TextIO | None) -> TextIO:
 
 
 class _Screen:
-    """A text stream that shows what steers a terminal instead of passing it on."""
+    """A text stream that shows what steers a terminal instead of passing it on; a line, or a part of one, at a time."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
 
     def write(self, text: str) -> int:
-        self._stream.write(readable(text))
+        line = text.removesuffix("\n")
+        shown = line if line == "\r" else readable(line)  # alone it is the progress line's own
+        self._stream.write(shown + text[len(line) :])
         return len(text)
 
     def __getattr__(self, name: str) -> Any:
@@ -70,7 +74,7 @@ class _Screen:
 
 
 def _shown(character: str) -> str:
-    if character in "\n\t":
+    if character == "\t":
         return character
     if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
         return character.encode("unicode_escape").decode() if character < "\ud800" else f"\\u{ord(character):04x}"
