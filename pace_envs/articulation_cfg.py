@@ -3,12 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from pace_actuators import JointValue, PaceDCMotorCfg
+from pace_actuators.config import Config
 
 
 @dataclass(kw_only=True)
-class InitialStateCfg:
+class InitialStateCfg(Config):
     """State after a reset."""
 
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -31,8 +33,16 @@ class InitialStateCfg:
 
 
 @dataclass(kw_only=True)
-class ArticulationCfg:
+class ArticulationCfg(Config):
     """A robot."""
+
+    InitialStateCfg = InitialStateCfg
+    """As Isaac Lab has it."""
+
+    elsewhere: ClassVar = {
+        "prim_path": "MuJoCo has no stage. Leave it out.",
+        "spawn": "write mjcf_path='robot.xml', the robot's MJCF file. pace new-robot makes one of a URDF.",
+    }
 
     mjcf_path: str | Path
     """MJCF file. Its actuators are not used: the drives below take their place."""

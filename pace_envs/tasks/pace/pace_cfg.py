@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from pace_actuators.config import Config
 from pace_actuators.drive_result import BASE_FIELDS
 from pace_actuators.effects import EffectCfg
 
@@ -17,7 +18,7 @@ PARAMETER_GROUPS = BASE_FIELDS
 
 
 @dataclass(kw_only=True)
-class CMAESOptimizerCfg:
+class CMAESOptimizerCfg(Config):
     """Settings of the search."""
 
     per_tree: bool = True
@@ -40,7 +41,7 @@ class CMAESOptimizerCfg:
 
 
 @dataclass(kw_only=True)
-class ExcitationCfg:
+class ExcitationCfg(Config):
     """How the robot is moved for a recording: target = (signal + bias) * direction * scale, per joint."""
 
     bias: tuple[float, ...]
@@ -54,14 +55,15 @@ class ExcitationCfg:
 
 
 @dataclass(kw_only=True)
-class PaceCfg:
+class PaceCfg(Config):
     """Names, bounds and search settings of a robot's identification."""
 
     robot_name: str
     """Name of the robot; runs are kept under it."""
 
     data_dir: str | Path
-    """The recording that is used when no other is named."""
+    """The recording that is used when no other is named; a relative path that is not there is one under ``data/``, as
+    in PACE."""
 
     joint_order: tuple[str, ...]
     """The joints, in the order of every vector."""
@@ -112,8 +114,20 @@ class PaceCfg:
     notes: tuple[str, ...] = ()
     """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
 
-    def __post_init__(self) -> None:
-        """Check the shape and order of the bounds."""
+    @property
+    def recording(self) -> Path:
+        """Where the recording of ``data_dir`` is, or is to be written."""
+        path = Path(self.data_dir)
+        beside = path.is_absolute() or path.exists() or path.parts[:1] in ((), ("data",))
+        return path if beside else "data" / path
+
+    def prepare(self) -> None:
+        """Check names and bounds; everything that uses the configuration calls this first.
+
+        Raises:
+            ValueError: If bounds, their number or a name are unusable.
+        """
+        self.joint_order = tuple(self.joint_order)
         expected = (4 * len(self.joint_order) + 1, 2)
         self.bounds_params = torch.as_tensor(self.bounds_params, dtype=torch.float64)
         if tuple(self.bounds_params.shape) != expected:
