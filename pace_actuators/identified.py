@@ -263,8 +263,8 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
             )
         if steps > cfg.largest_delay:
             notes.append(
-                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.largest_delay:g}: it was "
-                f"raised to {math.ceil(steps)}."
+                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.largest_delay:g}: "
+                f"it was raised to {math.ceil(steps)}."
             )
     ratio = max(physics_dt / at.physics_dt, at.physics_dt / physics_dt)
     if ratio > _FARTHEST * (1 + 1e-6):

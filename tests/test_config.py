@@ -85,7 +85,9 @@ def test_static_friction_is_friction_and_sliding_friction_an_effect():
     assert cfg.friction == 0.5 and cfg.effects[0].effect == "dynamic_friction"
     assert cfg.effects[0].values == {"ratio": pytest.approx(0.4)}
     assert cfg.replace(stiffness=3.0).effects == cfg.effects
-    by_joint = PaceDCMotorCfg(joint_names_expr=".*", friction={"a": 0.4, "b": 0.2}, dynamic_friction={"a": 0.1, "b": 0.1})
+    by_joint = PaceDCMotorCfg(
+        joint_names_expr=".*", friction={"a": 0.4, "b": 0.2}, dynamic_friction={"a": 0.1, "b": 0.1}
+    )
     assert by_joint.effects[0].values["ratio"] == {"a": pytest.approx(0.25), "b": pytest.approx(0.5)}
     assert PaceDCMotorCfg(joint_names_expr=".*", friction=0.3, dynamic_friction=0.3).effects == ()
 
@@ -202,7 +204,7 @@ def test_a_class_without_a_decorator_is_refused_instead_of_ignored():
     class Forgotten(CMAESOptimizerCfg):
         max_iteration = 500
 
-    with pytest.raises(TypeError, match="Forgotten sets max_iteration.*Write @configclass above it"):
+    with pytest.raises(TypeError, match=r"Forgotten sets max_iteration.*Write @configclass above it"):
         Forgotten()
 
 

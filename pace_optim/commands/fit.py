@@ -48,7 +48,21 @@ def main() -> None:
         metavar="FACT",
         help=f"facts of the drives that nobody knows, to be identified: {', '.join(UNKNOWN_FACTS)}",
     )
-    parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
+    parser.add_argument(
+        "--optimizer",
+        default="hybrid",
+        metavar="NAME",
+        help=f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell says "
+        "what is minimised",
+    )
+    parser.add_argument(
+        "--stop",
+        nargs="+",
+        default=[],
+        metavar="RULE",
+        help="further rules that end the search: plateau, window, gradient, early_stopping, parameters, "
+        "target:score=S; with numbers as in plateau:generations=30,improvement=0.01",
+    )
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
     parser.add_argument("--epsilon", type=number, help="stop at this relative spread of a generation's scores")
     parser.add_argument("--sigma", type=number, help="initial standard deviation of the search, normalised")

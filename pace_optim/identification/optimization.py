@@ -126,7 +126,7 @@ class Optimization:
 
     def _optimize(self) -> Outcome:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
-        if self.optimizer is not None and self.settings.optimizer == "cmaes":
+        if self.optimizer is not None and self.settings.only_searches:
             self._search(self.optimizer)
             return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
         if self.settings.start is not None:
@@ -178,7 +178,7 @@ class Optimization:
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history
         history.search_best.append(optimizer.best_score)
-        history.search_mean.append(float(optimizer.scores.sum(axis=1).mean()))
+        history.search_mean.append(float(optimizer.generation_scores.sum(axis=1).mean()))
         history.search_steps.append(self.steps)
         history.search_time_s.append(self.progress.elapsed)
         self.log.log_generation(optimizer)
@@ -194,7 +194,7 @@ class Optimization:
     def _keep_process(self, optimizer: CMAESOptimizer) -> None:
         if optimizer.cfg.save_optimization_process:
             self._saved["params"].append(optimizer.candidates)
-            self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
+            self._saved["scores"].append(torch.as_tensor(optimizer.generation_scores.sum(axis=1)))
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         now = next((d for d in descents if not d.stop_reason), descents[-1])

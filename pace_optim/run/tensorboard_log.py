@@ -52,7 +52,7 @@ class TensorBoardLog:
     def log_generation(self, optimizer: CMAESOptimizer) -> None:
         """Log a generation, after ``evolve()``."""
         step, space, write = optimizer.generation, optimizer.space, self._writer
-        scores = torch.as_tensor(optimizer.scores).sum(dim=1)
+        scores = torch.as_tensor(optimizer.generation_scores).sum(dim=1)
         write.add_scalar("score/best", optimizer.best_score, step)
         write.add_scalar("score/generation_min", float(scores.min()), step)
         write.add_scalar("score/generation_median", float(scores.median()), step)

@@ -30,6 +30,11 @@ class CMAESOptimizerCfg(Config):
     epsilon: float | None = 1e-2
     """Stop when (max - min) / min of a generation's scores falls below this; ``None`` switches it off."""
 
+    stop: Sequence[Any] = ()
+    """Further rules that end the search, beside ``epsilon`` and ``max_iteration``: ``"plateau"``, ``"window"``,
+    ``"gradient"``, ``"early_stopping"``, ``"parameters"`` or ``"target"``, with numbers as in
+    ``"plateau:generations=30,improvement=0.01"``; or a rule of your own (``pace_optim.optimizers.convergence``)."""
+
     sigma: float = 0.5
     """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
 
@@ -105,6 +110,9 @@ class PaceCfg(Config):
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
+    ee_site: str | None = None
+    """The site of the model whose pose objectives of your own compare with the recordings' ``real_ee_pose``."""
+
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
 
@@ -133,7 +141,9 @@ class PaceCfg(Config):
         if tuple(self.bounds_params.shape) != expected:
             raise ValueError(
                 f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
-                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay."
+                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay. Declare a parameter "
+                "of your own in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
+                "apply=function(env, values)),)."
             )
         if unknown := sorted(set(self.start_params) - {*PARAMETER_GROUPS, "delay"}):
             raise ValueError(

@@ -81,9 +81,9 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
                 longest = float(pace.bounds_params[-1, 1]) * self.decimation / drive.control_decimation
                 drive.max_delay = max(longest, drive.largest_delay)
             drive.delay = drive.delay or 0.0  # identification sets the delay; max_delay alone would be one
-        if pace.effects or pace.separate_dynamic_friction:
-            if not all(drive.effects for drive in robot.actuators.values()):
-                self.set_effects(pace.effects)
+        has_effects = all(drive.effects for drive in robot.actuators.values())
+        if (pace.effects or pace.separate_dynamic_friction) and not has_effects:
+            self.set_effects(pace.effects)
 
     def set_effects(self, effects: Sequence[EffectCfg | str]) -> None:
         """Give the drives effects whose parameters are identified; before a finer physics step is set.
