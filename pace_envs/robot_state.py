@@ -105,7 +105,9 @@ class RobotState:
         return tuple("slide" if name in slides else "hinge" for name in self.joint_names)
 
     def site_pose(self, name: str | None) -> torch.Tensor:
-        """Pose of a site in the frame of the robot's first body, as the state is now.
+        """Pose of a site in the frame of the robot's base, as the state is now.
+
+        The base is the first body; where a joint moves that one on the world, it is the world.
 
         Args:
             name: The site's name.
@@ -123,13 +125,16 @@ class RobotState:
                 f"ee_site is {name!r}, expected a site of the model. Available: {', '.join(sites) or 'none'}. Add "
                 '<site name="tip"/> to the last body, and set PaceCfg.ee_site.'
             )
-        i, base = sites.index(name), self._body_ids[0]
-        sim.forward()
-        base_quat = sim.bind("xquat")[:, base]
-        position = rotate_inverse(base_quat, sim.bind("site_xpos")[:, i] - sim.bind("xpos")[:, base])
+        first = self._body_ids[0]
+        is_jointed = bool(model.body_jntnum[first]) and self.is_fixed_base
+        i, base = sites.index(name), 0 if is_jointed else first
+        quat, place, sites_at = (sim.bind(field) for field in ("xquat", "xpos", "site_xpos"))
+        sim.forward()  # fills what is bound
+        base_quat = quat[:, base]
+        position = rotate_inverse(base_quat, sites_at[:, i] - place[:, base])
         local = sim.tensor(model.site_quat[i]).expand(self.num_envs, -1)
         inverse = base_quat * base_quat.new_tensor([1.0, -1.0, -1.0, -1.0])
-        rotation = multiply(inverse, multiply(sim.bind("xquat")[:, int(model.site_bodyid[i])], local))
+        rotation = multiply(inverse, multiply(quat[:, int(model.site_bodyid[i])], local))
         return torch.cat([position, rotation], dim=1)
 
     def find_joints(

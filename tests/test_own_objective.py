@@ -169,9 +169,8 @@ def with_pose(recording, poses):
 
 
 def tip(q):
-    """Of the left pendulum [m]."""
-    zero = np.zeros_like(q)
-    return np.stack([-0.25 * np.sin(q), zero, -0.25 * np.cos(q)], axis=1)
+    """Of the left pendulum in the world, which is its base [m]."""
+    return np.stack([-0.25 * np.sin(q), np.full_like(q, -0.3), 1.0 - 0.25 * np.cos(q)], axis=1)
 
 
 def test_an_end_effectors_pose_is_that_of_a_site_and_of_the_recording(tmp_path):

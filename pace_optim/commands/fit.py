@@ -120,7 +120,7 @@ def main() -> None:
         result, folder = resume(run, args["max_iteration"], task=args["task"], device=own, processes=processes)
     else:
         if args["task"] is None:
-            raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
+            raise ValueError(missing_task())
         result, folder = fit(FitSettings(**args, device=device), processes=processes)
     print(summary(result))
     print(f"report: {folder / 'report.html'}")
@@ -132,6 +132,17 @@ def main() -> None:
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
         print(f"run: {folder}")
+
+
+def missing_task() -> str:
+    """What to say where ``--task`` is missing."""
+    from pace_envs import load_env_cfg, registered_tasks
+
+    known = [name for name in registered_tasks() if hasattr(load_env_cfg(name), "sim2real")]
+    return (
+        f"--task is missing. It takes a registered name ({', '.join(known)}), my_module:Name, my_file.py:Name, or a "
+        "model file (robot.xml, robot.urdf). PACE's example is --task Pace-AnymalD-v0."
+    )
 
 
 def _is_large(path: str) -> bool:
