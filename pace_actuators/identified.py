@@ -85,6 +85,12 @@ class IdentifiedDrives:
     undetermined: frozenset[str] = frozenset()
     """Labels ``parameter/joint`` that the recordings do not determine: their value is that of the configuration."""
 
+    at_bound: tuple[str, ...] = ()
+    """Labels of what ended at a bound of the fit."""
+
+    times_noise: float | None = None
+    """The fit's error as a multiple of the measurement noise; ``None``: it is not known."""
+
     environment: Mapping[str, Any] = field(default_factory=dict)
     """Where the environment of the identification comes from: its code and files, by digest."""
 
@@ -115,6 +121,8 @@ class IdentifiedDrives:
             effects=tuple(_parsed(path, label) for label in content.effects),
             drive=content.drive,
             undetermined=frozenset(content.undetermined),
+            at_bound=tuple(content.at_bound),
+            times_noise=content.times_noise,
             environment=content.environment,
         )
         result._check()

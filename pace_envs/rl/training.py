@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
-from pace_envs.identified import set_identified_step, set_step, use_identified
+from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
@@ -84,6 +85,8 @@ def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
         if settings.physics_dt is not None:
             set_step(cfg, settings.physics_dt)
         return
+    for doubt in doubts(cfg, settings.identified):
+        print(f"warning: identified drives: {doubt}", file=sys.stderr)
     notes = [set_identified_step(cfg, settings.identified)]
     more = use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
     if settings.physics_dt is not None:
