@@ -25,7 +25,7 @@ def configclass(cls: _Class) -> _Class:
     A subclass may give its fields any default, also a list, a tensor or another configuration: every instance gets a
     copy. A field of a base class needs no annotation to get another default.
     """
-    return dataclasses.dataclass(kw_only=True)(cls)
+    return dataclasses.dataclass(kw_only=True)(cls)  # type: ignore[return-value]
 
 
 class Config:
@@ -37,7 +37,9 @@ class Config:
     def __init_subclass__(cls, **options: Any) -> None:
         """Give every instance its own copy of a default that can change, and annotate defaults of inherited fields."""
         super().__init_subclass__(**options)
-        inherited = {f.name: f.type for f in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else {}
+        inherited: dict[str, Any] = (
+            {f.name: f.type for f in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else {}
+        )
         annotations = dict(inspect.get_annotations(cls))
         for name, value in list(vars(cls).items()):
             if name in inherited and name not in annotations:

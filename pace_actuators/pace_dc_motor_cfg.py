@@ -197,16 +197,16 @@ def _friction_ratio(static: JointValue | None, dynamic: JointValue) -> JointValu
         raise ValueError(
             f"dynamic_friction is {dynamic}, and there is no friction at rest. Give friction (static_friction) too."
         )
-    pairs = {key: (static, dynamic) for key in (None,)}
+    keys: list[Any] = [None]
     for value in (static, dynamic):
         if isinstance(value, Mapping):
-            pairs = dict.fromkeys(value, (static, dynamic))
-        elif not isinstance(value, (int, float)):
-            pairs = dict.fromkeys(range(len(value)), (static, dynamic))
+            keys = list(value)
+        elif not _is_number(value):
+            keys = list(range(len(value)))  # type: ignore[arg-type]
     found: dict[Any, float] = {}
-    for key, pair in pairs.items():
+    for key in keys:
         try:
-            rest, sliding = (float(v) if isinstance(v, (int, float)) else float(v[key]) for v in pair)  # type: ignore[index]
+            rest, sliding = _at(static, key), _at(dynamic, key)
         except (KeyError, IndexError, TypeError):
             raise ValueError(
                 f"friction is {static} and dynamic_friction {dynamic}: expected numbers, or values of the same joints."
@@ -217,3 +217,12 @@ def _friction_ratio(static: JointValue | None, dynamic: JointValue) -> JointValu
     if len(set(found.values())) == 1:
         return next(iter(found.values()))
     return dict(found) if isinstance(next(iter(found)), str) else list(found.values())
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) or getattr(value, "ndim", 1) == 0
+
+
+def _at(value: Any, key: Any) -> float:
+    """A joint's value of a number, a list or a dict."""
+    return float(value if _is_number(value) else value[key])

@@ -32,11 +32,14 @@ class InitialStateCfg(Config):
     """Joint velocities [rad/s]; joints without a value start at 0."""
 
 
+_State = InitialStateCfg
+
+
 @dataclass(kw_only=True)
 class ArticulationCfg(Config):
     """A robot."""
 
-    InitialStateCfg = InitialStateCfg
+    InitialStateCfg: ClassVar[type[_State]] = _State
     """As Isaac Lab has it."""
 
     elsewhere: ClassVar = {
@@ -47,7 +50,7 @@ class ArticulationCfg(Config):
     mjcf_path: str | Path
     """MJCF file. Its actuators are not used: the drives below take their place."""
 
-    init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
+    init_state: _State = field(default_factory=_State)
     """State after a reset."""
 
     actuators: Mapping[str, PaceDCMotorCfg] = field(default_factory=dict)

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -30,7 +31,8 @@ from pace_envs.rl.run_folder import (
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.task_source import EnvironmentRecord
-from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
+from pace_envs.tasks.training_env_cfg import TrainingEnvCfg, use_rewards
+from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization
 
 
 def process_number() -> int:
@@ -38,10 +40,10 @@ def process_number() -> int:
     return int(os.environ.get("RANK", "0"))
 
 
-EditCfg = Callable[[VelocityEnvCfg], None]
+EditCfg = Callable[[Any], None]
 
 
-def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvCfg:
+def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvCfg:
     """The configuration of a training's environment.
 
     Args:
@@ -52,13 +54,16 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
         ValueError: If the task is none that can be trained, or a setting is unusable.
     """
     cfg = load_env_cfg(settings.task)
-    if not isinstance(cfg, VelocityEnvCfg):
+    if not isinstance(cfg, TrainingEnvCfg):
         raise ValueError(
-            f"{settings.task} is no velocity task: there is nothing to learn in it. "
-            "Available: Pace-AnymalD-Velocity-v0, Pace-Go2-Velocity-v0, and your own with a VelocityEnvCfg."
+            f"{settings.task} is no training task: there is nothing to learn in it. Available: "
+            "Pace-AnymalD-Velocity-v0, Pace-Go2-Velocity-v0, Pace-SO101-Reach-v0, and your own with a VelocityEnvCfg "
+            "or a ReachEnvCfg."
         )
     use_rewards(cfg, settings.reward)
     if settings.randomize:
+        if not isinstance(cfg, VelocityEnvCfg):
+            raise ValueError(f"--randomize is for walking robots, and {settings.task} is no velocity task.")
         add_randomization(cfg)
     _use_drives(cfg, settings)
     if settings.num_envs is not None:
@@ -74,7 +79,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
     return cfg
 
 
-def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
+def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
     """Physics step and drives as the settings say; prints what a reader should know of it."""
     scale = settings.randomize_identified
     if scale is not None and not 0 <= scale < math.inf:
@@ -99,7 +104,7 @@ def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
             print(f"identified drives: {note}")
 
 
-def make_env(cfg: VelocityEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
+def make_env(cfg: TrainingEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
     """The environment as rsl-rl sees it; one thread for torch's small tensors, the physics takes the cores."""
     torch.set_num_threads(1)
     return RslRlVecEnvWrapper(ManagerBasedRLEnv(cfg, render_mode), clip_actions=cfg.runner.clip_actions)
@@ -158,7 +163,7 @@ def resume(
     return _learn(cfg, begin, checkpoint)
 
 
-def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | None) -> Path | None:
+def _learn(cfg: TrainingEnvCfg, begin: Callable[[], Path], checkpoint: Path | None) -> Path | None:
     """Learn; ``begin`` makes the folder, once a checkpoint is known to be sound."""
     torch.manual_seed(cfg.runner.seed)
     env = make_env(cfg)

@@ -131,7 +131,8 @@ def error_bars(run: Optimization, objective: Objective, x: torch.Tensor) -> tupl
                 break
             steps = steps * np.minimum(scale, 1 / np.abs(steps).max(axis=1))[:, None]
         pairs = list(itertools.combinations(range(len(steps)), 2))
-        both = parts(torch.stack([x + torch.as_tensor(steps[i] + steps[j]) for i, j in pairs])) if pairs else []
+        corners = [x + torch.as_tensor(steps[i] + steps[j]) for i, j in pairs]
+        both = parts(torch.stack(corners)) if corners else np.zeros((0, up.shape[1]))
         curvature = np.diag((up + down - 2 * here).sum(axis=1))
         for (i, j), part in zip(pairs, both, strict=True):
             curvature[i, j] = curvature[j, i] = (part - up[i] - up[j] + here).sum()
