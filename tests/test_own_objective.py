@@ -21,7 +21,7 @@ from pace_optim import CMAESOptimizer
 from pace_optim.fit import fit, resume
 from pace_optim.identification.own_objective import error_bars
 from pace_optim.optimizers.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
-from pace_optim.optimizers.jacobian import colour
+from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.optimizers.own_objective import Objective, optimizer_class
 from pace_optim.recording import load_recording, save_recording
