@@ -4,6 +4,7 @@ Needs torch alone.
 """
 
 from pace_actuators.actions import ActuatorActions
+from pace_actuators.config import configclass
 from pace_actuators.dc_motor import clip_effort, pd_effort
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.identified import IdentifiedAt, IdentifiedDrives
@@ -20,6 +21,7 @@ __all__ = [
     "PaceDCMotor",
     "PaceDCMotorCfg",
     "clip_effort",
+    "configclass",
     "match_names",
     "pd_effort",
     "resolve_joint_values",

@@ -50,6 +50,11 @@ class DriveResult:
     undetermined: list[str] = field(default_factory=list)
     """Labels (``parameter/joint``) of what the recordings do not determine: it keeps its prior value."""
 
+    at_bound: list[str] = field(default_factory=list)
+    """Labels of what ended at a bound."""
+    times_noise: float | None = None
+    """The training error as a multiple of the measurement noise; ``None``: it is not known."""
+
     environment: dict[str, Any] = field(default_factory=dict)
     """Where the environment of the identification comes from: its code and files, by digest."""
 

@@ -85,6 +85,12 @@ class IdentifiedDrives:
     undetermined: frozenset[str] = frozenset()
     """Labels ``parameter/joint`` that the recordings do not determine: their value is that of the configuration."""
 
+    at_bound: tuple[str, ...] = ()
+    """Labels of what ended at a bound of the fit."""
+
+    times_noise: float | None = None
+    """The fit's error as a multiple of the measurement noise; ``None``: it is not known."""
+
     environment: Mapping[str, Any] = field(default_factory=dict)
     """Where the environment of the identification comes from: its code and files, by digest."""
 
@@ -115,6 +121,8 @@ class IdentifiedDrives:
             effects=tuple(_parsed(path, label) for label in content.effects),
             drive=content.drive,
             undetermined=frozenset(content.undetermined),
+            at_bound=tuple(content.at_bound),
+            times_noise=content.times_noise,
             environment=content.environment,
         )
         result._check()
@@ -227,14 +235,14 @@ def delay_in_steps(cfg: PaceDCMotorCfg, physics_dt: float | None) -> tuple[float
         ValueError: If the delay is given in seconds, and the time of a step is not known.
     """
     if cfg.delay_s is None:
-        return cfg.delay, cfg.max_delay
+        return (cfg.max_delay or 0.0) if cfg.delay is None else cfg.delay, cfg.largest_delay
     if physics_dt is None:
         raise ValueError(
             f"The delay is given in seconds (delay_s = {cfg.delay_s:g}), and the time between two calls is not known: "
             "set physics_dt [s] in the actuator's configuration."
         )
     steps = round(cfg.delay_s / (physics_dt * cfg.control_decimation), 9)
-    return steps, max(cfg.max_delay, math.ceil(steps))
+    return steps, max(cfg.largest_delay, math.ceil(steps))
 
 
 def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
@@ -261,10 +269,10 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
                 f"linear mix of two samples, which smooths more than at the {1e3 * at.control_dt:g} ms of the "
                 "identification. Train at that step for the identified delay."
             )
-        if steps > cfg.max_delay:
+        if steps > cfg.largest_delay:
             notes.append(
-                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.max_delay:g}: it was "
-                f"raised to {math.ceil(steps)}."
+                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.largest_delay:g}: "
+                f"it was raised to {math.ceil(steps)}."
             )
     ratio = max(physics_dt / at.physics_dt, at.physics_dt / physics_dt)
     if ratio > _FARTHEST * (1 + 1e-6):

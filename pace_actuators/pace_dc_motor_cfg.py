@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from pace_actuators.config import Config
 from pace_actuators.effects import EffectCfg
 from pace_actuators.joint_values import JointValue, match_names, resolve_joint_values
 
@@ -17,14 +18,23 @@ if TYPE_CHECKING:
 
 DelayMode = Literal["command", "effort"]
 
+_LARGEST_DELAY = 10.0
+"""That of a configuration that says none [control steps]."""
+
 
 @dataclass(kw_only=True)
-class PaceDCMotorCfg:
+class PaceDCMotorCfg(Config):
     """One type of drive and the joints that it moves.
 
     Values are numbers (for every joint of the group), dicts of regular expression to value, or one value
     per joint. A pattern that matches no joint, and a joint matched twice, are errors.
     """
+
+    elsewhere: ClassVar = {
+        "min_delay": "write delay, the delay that acts, and max_delay, the largest that can be set later.",
+        "effort_limit_sim": "the drive limits its own torque. Write effort_limit.",
+        "velocity_limit_sim": "the torque-speed line limits the speed. Write velocity_limit.",
+    }
 
     class_type: type[PaceDCMotor] | None = None
     """The actuator class to build; ``None`` means :class:`PaceDCMotor`. Set it to your own subclass."""
@@ -53,20 +63,30 @@ class PaceDCMotorCfg:
     friction: JointValue | None = None
     """Coulomb friction [N m]. Applied by the simulator, not by the actuator."""
 
+    static_friction: JointValue | None = None
+    """Another name of ``friction``, which takes it over."""
+
+    dynamic_friction: JointValue | None = None
+    """Coulomb friction of a sliding joint [N m], where it is below that at rest: the effect ``dynamic_friction``, which
+    takes it over."""
+
     viscous_friction: JointValue | None = None
     """Viscous friction [N m s/rad]. Applied by the simulator, not by the actuator."""
 
     encoder_bias: JointValue = 0.0
     """Encoder bias [rad]: the encoder shows q_enc = q - bias."""
 
-    delay: float = 0.0
-    """Delay of every environment at the start [control steps], from 0 to ``max_delay``."""
+    delay: float | None = None
+    """Delay of every environment at the start [control steps], from 0 to ``max_delay``. ``None``: as in PACE, a
+    ``max_delay`` that is set; without one, 0."""
 
     delay_s: float | None = None
     """Delay [s] in place of ``delay``: the drive converts it to its own control steps, and raises ``max_delay``."""
 
-    max_delay: float = 10.0
-    """Largest delay that can be set later [control steps]."""
+    max_delay: float | None = None
+    """Largest delay that can be set later [control steps]; ``None``: 10. As in PACE, a drive with a ``max_delay`` and
+    neither ``delay`` nor ``delay_s`` acts with a delay of ``max_delay``. To set the largest only, give ``delay=0.0``
+    too."""
 
     delay_mode: DelayMode = "command"
     """What is delayed: ``"command"`` (targets and feed-forward) or ``"effort"`` (the controller's torque)."""
@@ -100,6 +120,30 @@ class PaceDCMotorCfg:
 
     identified: IdentifiedAt | None = None
     """Time steps of the identification that the values come from: the drive warns where its own are too different."""
+
+    def __post_init__(self) -> None:
+        """Take over the friction at rest and while sliding.
+
+        Raises:
+            ValueError: If two of them contradict each other.
+        """
+        if self.static_friction is not None:
+            if self.friction is not None and self.friction != self.static_friction:
+                raise ValueError(
+                    f"friction is {self.friction} and static_friction {self.static_friction}: both are the friction at "
+                    "rest. Give one of them."
+                )
+            self.friction, self.static_friction = self.static_friction, None
+        if self.dynamic_friction is not None:
+            ratio = _friction_ratio(self.friction, self.dynamic_friction)
+            self.dynamic_friction = None
+            if ratio != 1.0:
+                self.effects = (*self.effects, EffectCfg(effect="dynamic_friction", values={"ratio": ratio}))
+
+    @property
+    def largest_delay(self) -> float:
+        """Largest delay that can be set later [control steps]."""
+        return _LARGEST_DELAY if self.max_delay is None else self.max_delay
 
     def on_joints(self, joint_names: Sequence[str], chosen: Sequence[str]) -> PaceDCMotorCfg | None:
         """The same for some of the joints of its group, without effects; ``None`` if it moves none of them.
@@ -141,3 +185,44 @@ class PaceDCMotorCfg:
 
         drives = IdentifiedDrives.load(path)
         return cls(**drives.cfg_fields(joint_names_expr) | overrides)
+
+
+def _friction_ratio(static: JointValue | None, dynamic: JointValue) -> JointValue:
+    """The sliding friction's part of that at rest, per joint as the two are.
+
+    Raises:
+        ValueError: If there is no friction at rest, it is the smaller one, or the two name different joints.
+    """
+    if static is None:
+        raise ValueError(
+            f"dynamic_friction is {dynamic}, and there is no friction at rest. Give friction (static_friction) too."
+        )
+    keys: list[Any] = [None]
+    for value in (static, dynamic):
+        if isinstance(value, Mapping):
+            keys = list(value)
+        elif not _is_number(value):
+            keys = list(range(len(value)))  # type: ignore[arg-type]
+    found: dict[Any, float] = {}
+    for key in keys:
+        try:
+            rest, sliding = _at(static, key), _at(dynamic, key)
+        except (KeyError, IndexError, TypeError):
+            raise ValueError(
+                f"friction is {static} and dynamic_friction {dynamic}: expected numbers, or values of the same joints."
+            ) from None
+        if not 0 <= sliding <= rest:
+            raise ValueError(f"dynamic_friction is {sliding:g} N m, expected 0 to the friction at rest, {rest:g} N m.")
+        found[key] = sliding / rest if rest else 1.0
+    if len(set(found.values())) == 1:
+        return next(iter(found.values()))
+    return dict(found) if isinstance(next(iter(found)), str) else list(found.values())
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) or getattr(value, "ndim", 1) == 0
+
+
+def _at(value: Any, key: Any) -> float:
+    """A joint's value of a number, a list or a dict."""
+    return float(value if _is_number(value) else value[key])

@@ -1,5 +1,6 @@
 """Robots as batched Gymnasium environments on MuJoCo. Importing registers them."""
 
+from pace_actuators import configclass
 from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.gym_vector import PaceVectorEnv
@@ -29,6 +30,7 @@ __all__ = [
     "Simulation",
     "SimulationCfg",
     "TerrainCfg",
+    "configclass",
     "load_env_cfg",
     "register_envs",
     "register_task",

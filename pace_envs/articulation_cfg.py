@@ -3,12 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from pace_actuators import JointValue, PaceDCMotorCfg
+from pace_actuators.config import Config
 
 
 @dataclass(kw_only=True)
-class InitialStateCfg:
+class InitialStateCfg(Config):
     """State after a reset."""
 
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -30,14 +32,25 @@ class InitialStateCfg:
     """Joint velocities [rad/s]; joints without a value start at 0."""
 
 
+_State = InitialStateCfg
+
+
 @dataclass(kw_only=True)
-class ArticulationCfg:
+class ArticulationCfg(Config):
     """A robot."""
+
+    InitialStateCfg: ClassVar[type[_State]] = _State
+    """As Isaac Lab has it."""
+
+    elsewhere: ClassVar = {
+        "prim_path": "MuJoCo has no stage. Leave it out.",
+        "spawn": "write mjcf_path='robot.xml', the robot's MJCF file. pace new-robot makes one of a URDF.",
+    }
 
     mjcf_path: str | Path
     """MJCF file. Its actuators are not used: the drives below take their place."""
 
-    init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
+    init_state: _State = field(default_factory=_State)
     """State after a reset."""
 
     actuators: Mapping[str, PaceDCMotorCfg] = field(default_factory=dict)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
-from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names
+from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolve_joint_values
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
@@ -20,6 +21,12 @@ from pace_envs.managers import EventTermCfg
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
 
+_FAR_ABOVE_NOISE = 10.0
+"""An error of this many times the noise is no residual of noise."""
+_SAME = 0.01
+"""Relative difference of gains and limits that is none."""
+_MOST = 4
+"""Labels that a sentence names, at most."""
 _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -63,6 +70,32 @@ def use_identified(
             ),
         }
     return notes
+
+
+def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
+    """Why an environment may not want the drives that a fit identified, in sentences; none if all is well.
+
+    Args:
+        cfg: The environment, with its own gains and limits.
+        path: ``result.json``, or the run's folder.
+    """
+    drives, found = IdentifiedDrives.load(path), []
+    if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
+        found.append(
+            f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values make up for what "
+            "the model lacks. Find it with pace diagnose before you train."
+        )
+    if drives.at_bound:
+        found.append(
+            f"{_named(drives.at_bound)} ended at a bound of the fit, so the value is the bound's. Widen bounds_params "
+            "and fit again."
+        )
+    if drives.undetermined:
+        found.append(
+            f"{_named(sorted(drives.undetermined))} was not determined by the recordings and keeps its prior. Record a "
+            "motion that shows it, or train with --randomize_identified 1."
+        )
+    return found + _other_drives(cfg.scene.robot, drives)
 
 
 def load_identified_cfg(drives: IdentifiedDrives) -> Any:
@@ -115,6 +148,35 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None
         return None
     set_step(cfg, dt)
     return f"physics and drives run at {1e3 * dt:g} ms, as in the identification, not at {1e3 * before:g} ms"
+
+
+def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]:
+    """Gains and limits of the environment that are not those of the recordings."""
+    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
+    found = []
+    for name in DRIVE_FIELDS:
+        differs: dict[tuple[float, float], list[str]] = {}
+        for drive in robot.actuators.values():
+            own = [names[i] for group in match_names(drive.joint_names_expr, names) for i in group]
+            if (configured := getattr(drive, name)) is None:
+                continue
+            values = resolve_joint_values(configured, own, field=name).tolist()
+            for joint, value in zip(own, values, strict=True):
+                recorded = drives.drive.get(name, {}).get(joint)
+                if recorded is not None and abs(value - recorded) > _SAME * max(abs(value), abs(recorded)):
+                    differs.setdefault((float(recorded), value), []).append(joint)
+        for (recorded, value), joints in differs.items():
+            found.append(
+                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({_named(joints)}). Set the "
+                "task's to what the robot will run, the recordings' where you do not know."
+            )
+    return found
+
+
+def _named(labels: Sequence[str]) -> str:
+    """Some labels, the rest by number."""
+    more = len(labels) - _MOST
+    return ", ".join(labels[:_MOST]) + (f" and {more} more" if more > 0 else "")
 
 
 def _identified_groups(

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from pace_actuators.config import Config
 from pace_envs.fused import Fusion, fusion_for
 from pace_envs.managers import (
     ActionManager,
@@ -25,7 +26,7 @@ from pace_envs.step_graphs import StepGraphs
 
 
 @dataclass(kw_only=True)
-class ManagerBasedEnvCfg:
+class ManagerBasedEnvCfg(Config):
     """Configuration of an environment."""
 
     scene: InteractiveSceneCfg
@@ -48,6 +49,15 @@ class ManagerBasedEnvCfg:
 
     events: Mapping[str, EventTermCfg] = field(default_factory=dict)
     """Events by name."""
+
+    def prepare(self) -> None:
+        """Check and complete the configuration; everything that uses one calls this first.
+
+        A subclass may set its fields in ``__post_init__``, with or without ``super()``, so that none is checked there.
+
+        Raises:
+            ValueError: If it is unusable.
+        """
 
 
 class ManagerBasedEnv(gym.Env):
@@ -73,6 +83,7 @@ class ManagerBasedEnv(gym.Env):
         Raises:
             ValueError: If the configuration is unusable.
         """
+        cfg.prepare()
         if not (isinstance(cfg.decimation, int) and cfg.decimation >= 1):
             raise ValueError(f"decimation is {cfg.decimation!r}, expected an integer >= 1.")
         self.cfg = cfg

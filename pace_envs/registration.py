@@ -23,6 +23,7 @@ _TASKS = {
     "Pace-TestBench-v0": "pace_envs.tasks.pace.test_bench:test_bench_pace_env_cfg",
     "Pace-AnymalD-Velocity-v0": "pace_envs.tasks.velocity.anymal_d:anymal_d_velocity_env_cfg",
     "Pace-Go2-Velocity-v0": "pace_envs.tasks.velocity.go2:go2_velocity_env_cfg",
+    "Pace-SO101-Reach-v0": "pace_envs.tasks.reach.so101:so101_reach_env_cfg",
 }
 
 _REGISTERED_BY: dict[str, dict[str, Any]] = {}
@@ -180,7 +181,14 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float, name: str = "phys
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:
-    if not isinstance(entry_point, str):
-        return copy.deepcopy(entry_point())
-    module, _, name = entry_point.partition(":")
-    return copy.deepcopy(getattr(import_module(module), name)())
+    if isinstance(entry_point, str):
+        module, _, name = entry_point.partition(":")
+        entry_point = getattr(import_module(module), name)
+    cfg = copy.deepcopy(entry_point())  # type: ignore[operator]
+    if not isinstance(cfg, ManagerBasedEnvCfg):
+        raise ValueError(
+            f"{entry_point} returned {cfg!r}, expected the configuration of an environment. Return a "
+            "ManagerBasedRLEnvCfg, such as PaceSim2realEnvCfg."
+        )
+    cfg.prepare()
+    return cfg

@@ -14,6 +14,7 @@ from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
 from pace_envs.joint_layout import JointLayout
+from pace_envs.quaternions import multiply, rotate_inverse
 from pace_envs.simulation import Simulation
 
 
@@ -102,6 +103,39 @@ class RobotState:
         """Whether each of the joints turns or slides."""
         slides = self.slide_joints
         return tuple("slide" if name in slides else "hinge" for name in self.joint_names)
+
+    def site_pose(self, name: str | None) -> torch.Tensor:
+        """Pose of a site in the frame of the robot's base, as the state is now.
+
+        The base is the first body; where a joint moves that one on the world, it is the world.
+
+        Args:
+            name: The site's name.
+
+        Returns:
+            Position [m] and quaternion (w, x, y, z), (num_envs, 7).
+
+        Raises:
+            ValueError: If the model has no such site.
+        """
+        sim, model = self._sim, self._sim.model
+        sites = [model.site(i).name for i in range(model.nsite)]
+        if name not in sites:
+            raise ValueError(
+                f"ee_site is {name!r}, expected a site of the model. Available: {', '.join(sites) or 'none'}. Add "
+                '<site name="tip"/> to the last body, and set PaceCfg.ee_site.'
+            )
+        first = self._body_ids[0]
+        is_jointed = bool(model.body_jntnum[first]) and self.is_fixed_base
+        i, base = sites.index(name), 0 if is_jointed else first
+        quat, place, sites_at = (sim.bind(field) for field in ("xquat", "xpos", "site_xpos"))
+        sim.forward()  # fills what is bound
+        base_quat = quat[:, base]
+        position = rotate_inverse(base_quat, sites_at[:, i] - place[:, base])
+        local = sim.tensor(model.site_quat[i]).expand(self.num_envs, -1)
+        inverse = base_quat * base_quat.new_tensor([1.0, -1.0, -1.0, -1.0])
+        rotation = multiply(inverse, multiply(quat[:, int(model.site_bodyid[i])], local))
+        return torch.cat([position, rotation], dim=1)
 
     def find_joints(
         self, name_keys: str | Sequence[str], *, preserve_order: bool = False

@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import mujoco
 import torch
 
 from pace_actuators import match_names
+from pace_actuators.config import Config
 from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
@@ -16,7 +18,7 @@ from pace_envs.simulation import EnvIds, SimulationCfg, make_simulation
 
 
 @dataclass(kw_only=True)
-class TerrainCfg:
+class TerrainCfg(Config):
     """Flat ground."""
 
     friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
@@ -34,8 +36,14 @@ class TerrainCfg:
 
 
 @dataclass(kw_only=True)
-class InteractiveSceneCfg:
+class InteractiveSceneCfg(Config):
     """What stands in every environment."""
+
+    elsewhere: ClassVar = {
+        "env_spacing": "environments have a world each. Leave it out.",
+        "ground": "write terrain=TerrainCfg(); a robot in the air has none.",
+        "sky_light": "the model file has the lights. Leave it out.",
+    }
 
     num_envs: int = 1
     """Number of environments."""

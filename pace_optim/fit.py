@@ -13,6 +13,8 @@ from pace_envs.task_source import EnvironmentRecord
 from pace_optim.identification.beginning import load_for_fit, logged_control_dt, make_optimizer, make_searcher
 from pace_optim.identification.conclusion import conclude
 from pace_optim.identification.optimization import Optimization
+from pace_optim.identification.own_objective import conclude_own
+from pace_optim.optimizers.own_objective import optimizer_modules, use_recorded_optimizer
 from pace_optim.optimizers.search import agree_to_stop, search
 from pace_optim.problem.processes import Processes
 from pace_optim.report import check_folder, write_report
@@ -66,7 +68,8 @@ def fit(
         env_cfg = load_env_cfg(settings.task, control_dt)
         problem = load_for_fit(settings, env_cfg, told=True)
     settings = with_absolute_paths(settings, env_cfg)
-    record = EnvironmentRecord.of(settings.task, problem.env_cfg, effect_modules(problem.effects), place)
+    own_code = [*effect_modules(problem.effects), *optimizer_modules(settings.optimizer)]
+    record = EnvironmentRecord.of(settings.task, problem.env_cfg, own_code, place)
     digests, inputs = recording_digests(settings), input_digests(settings, record)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
     folder.write_start(settings.to_dict(), digests, problem, inputs=inputs, environment=record.to_dict())
@@ -102,7 +105,7 @@ def resume(
     read_bounds(folder.path)
     if (folder.path / "result.json").exists():  # of a fit that had ended: its report is made of more
         check_folder(folder.path)
-    before = Run.open(folder.path, task)
+    before = _reopened(folder.path, settings, task)
     check_unchanged(before)
     settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
     if device is not None:
@@ -131,20 +134,29 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         return
     settings, history, line_generation = start
     settings = replace(settings, device=device)
-    problem = load_for_fit(
-        settings,
-        load_env_cfg(settings.task, settings.control_dt) if path is None else Run.open(Path(path), task).load_cfg(),
-    )
+    if path is None:
+        env_cfg = load_env_cfg(settings.task, settings.control_dt)
+    else:
+        env_cfg = _reopened(Path(path), settings, task).load_cfg()
+    problem = load_for_fit(settings, env_cfg)
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes)
     optimizer.restore(history, line_generation)
     search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
 
 
+def _reopened(path: Path, settings: FitSettings, task: str | None) -> Run:
+    """A run, its objective made known again too."""
+    before = Run.open(path, task)
+    if settings.has_own_objective:
+        use_recorded_optimizer(settings.optimizer, before.record.code, str(path / "settings.json"))
+    return before
+
+
 def _finished(run: Optimization, record: EnvironmentRecord, keep_interrupted: bool = True) -> tuple[FitResult, Path]:
     """Search, refine, conclude, write."""
     outcome = run.run(keep_interrupted)
-    result = conclude(run, record, outcome)
+    result = (conclude_own if run.settings.has_own_objective else conclude)(run, record, outcome)
     run.progress.close()
     run.log.log_result(result)
     run.log.close()

@@ -141,7 +141,7 @@ def main(wheel: str, output: str, result: str, configuration: str) -> None:
 
     # against Isaac Lab's own actuators, with what they have too
     plain = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0}
-    ours = PaceDCMotorCfg(joint_names_expr=".*", **plain, delay=4.0)
+    ours = PaceDCMotorCfg(joint_names_expr=".*", **plain, max_delay=4.0)
     out["ours_delayed"] = efforts(build(PaceDCMotorActuatorCfg(motor=ours)), data)
     theirs = DelayedPDActuatorCfg(joint_names_expr=[".*"], **plain, min_delay=4, max_delay=4)
     out["theirs_delayed"] = efforts(build(theirs), data)

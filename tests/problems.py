@@ -213,6 +213,7 @@ def pendulums_cfg(folder: Path, more: str = "", **cmaes: Any) -> PaceSim2realEnv
         saturation_effort=80.0,
         effort_limit=50.0,
         velocity_limit=9.0,
+        delay=0.0,
         max_delay=10.0,
     )
     return PaceSim2realEnvCfg(

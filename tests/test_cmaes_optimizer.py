@@ -186,7 +186,7 @@ def test_a_diverging_candidate_gets_the_worst_score_and_the_search_goes_on(bench
     optimizer.update_simulator(bench.evaluator().rollout(4))
     optimizer.scores_buffer[:, 0] = torch.tensor([torch.nan, torch.inf, 1e30, 0.5])
     optimizer.evolve()
-    assert optimizer.scores[:, 0].tolist() == [DIVERGED_SCORE] * 3 + [0.5]
+    assert optimizer.generation_scores[:, 0].tolist() == [DIVERGED_SCORE] * 3 + [0.5]
     assert optimizer.best_score == 0.5
     assert bool(optimizer.ask().isfinite().all())
 
@@ -319,7 +319,7 @@ def test_the_truth_scores_nothing_in_each_objective(bench, pendulums):
         for sim_dof_pos, real_dof_pos in rollout:
             optimizer.tell(sim_dof_pos, real_dof_pos)
         optimizer.evolve()
-        scores = optimizer.scores.sum(axis=1)
+        scores = optimizer.generation_scores.sum(axis=1)
         assert scores[1:].max() < 0.05 * scores[0], kind
         if kind is not PositionAndVelocity:  # measured speeds are differences
             assert scores[1:].max() < 1e-20, kind
@@ -333,7 +333,7 @@ def test_an_error_per_environment_counts_once(pendulums):
     for _ in rollout:
         optimizer.add_score(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64))
     optimizer.evolve()
-    assert optimizer.scores[:, 0].tolist() == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    assert optimizer.generation_scores[:, 0].tolist() == pytest.approx([1.0, 2.0, 3.0, 4.0])
 
 
 # ---------------------------------------------------------------- misuse and stopping

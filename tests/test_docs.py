@@ -75,6 +75,12 @@ def test_the_tutorial_for_an_own_effect_works_when_typed(tmp_path):
     assert "verdict: effect\nMissing: cable_drag. With it" in printed
 
 
+@pytest.mark.slow
+def test_the_page_for_users_of_pace_works_when_typed(tmp_path):
+    printed = type_in(ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
+    assert "plot: " in printed and "objective my_optimizers:Weighted" in printed
+
+
 def test_the_page_of_effects_is_that_of_the_registry():
     assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page_of_effects(), (
         "Write it anew: python -m pace_actuators.effects > docs/effects.md"

@@ -274,7 +274,7 @@ def test_a_name_can_be_registered_only_once(arm_task):
 )
 def test_bounds_that_do_not_fit_the_joints_are_refused(bounds, message):
     with pytest.raises(ValueError, match=message):
-        PaceCfg(robot_name="x", data_dir=".", joint_order=("servo",), bounds_params=bounds)
+        PaceCfg(robot_name="x", data_dir=".", joint_order=("servo",), bounds_params=bounds).prepare()
 
 
 # ---- pictures

@@ -122,7 +122,7 @@ def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
     raised = ParameterSpace.of(sim2real)
     assert float(raised.to_physical(raised.start)[0]) == pytest.approx(float(sim2real.bounds_params[0, 0]))
     with pytest.raises(ValueError, match="start_params names mass"):
-        dataclasses.replace(sim2real, start_params={"mass": 1.0})
+        dataclasses.replace(sim2real, start_params={"mass": 1.0}).prepare()
 
 
 def test_the_excitation_stays_within_range_and_command_range(tmp_path):

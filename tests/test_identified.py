@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from pace_actuators.effects import get_effect
 from pace_actuators.identified_draws import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
-from pace_envs.identified import set_identified_step, set_step, use_identified
+from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.commands.train import _task_for
 from pace_optim.fit import fit
@@ -425,3 +426,27 @@ def test_gains_that_differ_between_recordings_are_not_the_drives():
     found = drive_in_force(make_problem(made))
     assert "stiffness" not in found and found["damping"] == {"servo": 0.6}
     assert drive_in_force(make_problem(made[:1]))["stiffness"] == {"servo": 60.0}
+
+
+# ---- doubts about a result, before a policy is trained with it
+
+
+def test_a_sound_result_with_the_tasks_gains_raises_no_doubt(result):
+    assert doubts(load_env_cfg(WALK), result) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"times_noise": 55.0}, r"ended at 55 times the measurement noise.*pace diagnose"),
+        ({"at_bound": ["friction/LF_HAA"]}, r"friction/LF_HAA ended at a bound.*Widen bounds_params"),
+        ({"undetermined": [f"encoder_bias/{j}" for j in JOINTS]}, r"LF_HAA.*and 8 more was not determined"),
+        ({"drive": {"stiffness": {"LF_HAA": 120.0}}}, r"stiffness is 85 in this task and was 120 in the recordings"),
+        ({"drive": {"effort_limit": {"LF_KFE": 40.0}}}, r"effort_limit is 89 .* was 40 .*\(LF_KFE\)"),
+    ],
+)
+def test_what_a_result_is_doubted_for_is_told_before_training(result, changes, said, capsys):
+    found = doubts(load_env_cfg(WALK), changed(result, **changes))
+    assert len(found) == 1 and re.search(said, found[0])
+    load_cfg(RunSettings(task=WALK, identified=str(result)))
+    assert f"warning: identified drives: {found[0]}" in capsys.readouterr().err

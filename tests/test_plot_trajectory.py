@@ -85,7 +85,7 @@ def test_one_plot_of_one_run_can_be_chosen(home):
         (["--robot_name", "leg", "--folder_name", "26_01"], ["'26_01'", f"Runs: {NEW}, {OLD}"]),
         (["--robot_name", "leg", "--mean_name", "mean_020.pt"], ["no 'mean_020.pt' in", "nor another saved mean"]),
         (["--robot_name", "leg", "--log_dir", "elsewhere"], ["no run under elsewhere", "scripts/fit.py"]),
-        (["--plot_score"], ["--robot_name"]),
+        (["logs/pace/leg/26_01"], ["There is no run logs/pace/leg/26_01"]),
         (["--robot_name", "leg", "--plot_trajectories"], ["did you mean --plot_trajectory"]),
     ],
 )

@@ -33,6 +33,7 @@ def servo_cfg(
         saturation_effort=stall,
         effort_limit=2 * stall if largest_amps is None else torque_per_amp * largest_amps,
         velocity_limit=volts / torque_per_amp,
+        delay=0.0,  # until a fit knows it; with max_delay alone a drive acts with that delay, as in PACE
         max_delay=10.0,
     )
 

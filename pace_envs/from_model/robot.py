@@ -166,6 +166,7 @@ def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous
         damping=[damping for _, damping in pairs],
         effort_limit=limits if np.isfinite(limits).any() else None,
         velocity_limit=speeds if np.isfinite(speeds).any() else None,
+        delay=0.0,
         max_delay=longest_delay,
         implicit=continuous,
     )

@@ -51,6 +51,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
         damping=column(1),
         effort_limit=column(2),
         velocity_limit=column(3),
+        delay=0.0,  # with max_delay alone the drive would act with that delay
         max_delay=LONGEST_DELAY,
         implicit=_IMPLICIT_,  # whether the loop runs continuously; else it holds its torque between two commands
     )

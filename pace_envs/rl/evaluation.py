@@ -1,4 +1,4 @@
-"""How well a policy walks."""
+"""How well a policy walks, or reaches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from pace_actuators import resolve_joint_values
 from pace_envs.articulation_data import of_floating_base
 from pace_envs.mdp import motor_power
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
+from pace_envs.tasks.reach import ReachEnvCfg
+from pace_envs.tasks.reach.reach_env_cfg import COMMAND
+from pace_envs.tasks.reach.terms import distance
 from pace_envs.tasks.velocity import VelocityEnvCfg
+
+_SETTLED = 2.0
+"""A hand has had time to arrive this long after a command [s]."""
+_NEAR = 0.02
+"""What counts as arrived [m]."""
 
 Policy = Callable[[TensorDict], torch.Tensor]
 
@@ -100,3 +108,49 @@ def evaluate(
         power=mean_power,
         speed=speed,
     )
+
+
+@dataclass(kw_only=True)
+class ReachEvaluation:
+    """Where a policy brought a hand, over all environments and all steps."""
+
+    distance: float
+    """Mean distance to the commanded place, two seconds after the command and later [m]."""
+
+    arrived: float
+    """Part of that time within 2 cm."""
+
+    def __str__(self) -> str:
+        """One line per figure."""
+        return f"distance          {1e3 * self.distance:.1f} mm\nwithin 20 mm      {100 * self.arrived:.1f} %"
+
+
+@torch.inference_mode()
+def evaluate_reach(
+    env: RslRlVecEnvWrapper, policy: Policy, steps: int | None = None, on_step: Callable[[], None] | None = None
+) -> ReachEvaluation:
+    """Let a policy reach in all environments; the arguments are those of :func:`evaluate`.
+
+    Raises:
+        ValueError: If the environment is no reaching task, or no command is held for long enough.
+    """
+    base = env.unwrapped
+    if not isinstance(base.cfg, ReachEnvCfg):
+        raise ValueError("This environment is no reaching task: its configuration is no ReachEnvCfg.")
+    command = base.command_manager.get_term(COMMAND)
+    steps = steps or int(base.max_episode_length)
+    far = near = count = 0.0
+    held = torch.zeros(base.num_envs, device=base.device)
+    obs, _ = env.reset()
+    for _ in range(steps):
+        before = command.command.clone()
+        obs, *_ = env.step(policy(obs))
+        held = torch.where((command.command == before).all(dim=1), held + base.step_dt, torch.zeros_like(held))
+        settled = held >= _SETTLED
+        away = distance(base, COMMAND, base.cfg.site)[settled]
+        far, near, count = far + float(away.sum()), near + float((away < _NEAR).sum()), count + float(settled.sum())
+        if on_step is not None:
+            on_step()
+    if not count:
+        raise ValueError(f"No command was held for {_SETTLED:g} s. Play for longer (--seconds).")
+    return ReachEvaluation(distance=far / count, arrived=near / count)

@@ -12,7 +12,7 @@ import numpy as np
 from pace_actuators.files import refuse_taken
 from pace_actuators.memory import check_memory
 from pace_envs.rendering import OffscreenRenderer
-from pace_envs.rl.evaluation import Evaluation, evaluate
+from pace_envs.rl.evaluation import Evaluation, ReachEvaluation, evaluate, evaluate_reach
 from pace_envs.rl.export import EXPORTED, export_policy, exported_files
 from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, find_checkpoint
 from pace_envs.rl.runner import PaceOnPolicyRunner
@@ -20,7 +20,9 @@ from pace_envs.rl.training import EditCfg, load_cfg, make_env
 from pace_envs.rl.video import check_video_path, write_video
 from pace_envs.rl.viewer import watch
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
-from pace_envs.tasks.velocity import fix_command, play_cfg
+from pace_envs.tasks.reach import ReachEnvCfg
+from pace_envs.tasks.training_env_cfg import play_cfg
+from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command
 
 _FRAME_EVERY = 2  # environment steps: 25 pictures per second at 50 Hz
 _SIZE = (640, 360)
@@ -70,7 +72,7 @@ class PlaySettings:
     """Where it walks: ``cpu``, or a GPU as ``cuda:0``; wherever it was trained."""
 
 
-def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | None:
+def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | ReachEvaluation | None:
     """Play a policy; returns its figures, or nothing after a window was closed.
 
     Raises:
@@ -93,6 +95,8 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
         raise ValueError(f"{own}: {error}" if own.is_file() else str(error)) from None
     play_cfg(cfg)
     if settings.command is not None:
+        if not isinstance(cfg, VelocityEnvCfg):
+            raise ValueError(f"--command is a velocity, and {run.task} is no velocity task.")
         fix_command(cfg, settings.command)
     env = make_env(cfg)
     try:
@@ -106,10 +110,11 @@ def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | No
             watch(env, policy)
             return None
         steps = max(round(settings.seconds / env.unwrapped.step_dt), 1)
+        judge = evaluate_reach if isinstance(cfg, ReachEnvCfg) else evaluate
         if settings.video is None:
-            return evaluate(env, policy, steps)
+            return judge(env, policy, steps)
         film = _Film(env, steps)
-        result = evaluate(env, policy, steps, film.step)
+        result = judge(env, policy, steps, film.step)
         write_video(settings.video, film.frames, 1.0 / (_FRAME_EVERY * env.unwrapped.step_dt))
         film.renderer.close()
         return result

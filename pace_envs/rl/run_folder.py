@@ -34,8 +34,8 @@ class RunSettings:
     seed: int = 42
     """Seed of the environment and of the networks."""
 
-    reward: str = "velocity"
-    """Name of the task's reward set."""
+    reward: str | None = None
+    """Name of the task's reward set; ``None``: the task's own."""
 
     randomize: bool = False
     """Whether friction and mass are randomised and the robot is pushed."""

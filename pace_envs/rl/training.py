@@ -17,7 +17,7 @@ import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
 from pace_envs.devices import find_device
-from pace_envs.identified import set_identified_step, set_step, use_identified
+from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
@@ -33,7 +33,8 @@ from pace_envs.rl.run_folder import (
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.task_source import EnvironmentRecord
-from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization, use_rewards
+from pace_envs.tasks.training_env_cfg import TrainingEnvCfg, use_rewards
+from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization
 
 
 def process_number() -> int:
@@ -41,10 +42,10 @@ def process_number() -> int:
     return int(os.environ.get("RANK", "0"))
 
 
-EditCfg = Callable[[VelocityEnvCfg], None]
+EditCfg = Callable[[Any], None]
 
 
-def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvCfg:
+def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvCfg:
     """The configuration of a training's environment.
 
     Args:
@@ -55,13 +56,16 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
         ValueError: If the task is none that can be trained, or a setting is unusable.
     """
     cfg = load_env_cfg(settings.task)
-    if not isinstance(cfg, VelocityEnvCfg):
+    if not isinstance(cfg, TrainingEnvCfg):
         raise ValueError(
-            f"{settings.task} is no velocity task: there is nothing to learn in it. "
-            "Available: Pace-AnymalD-Velocity-v0, Pace-Go2-Velocity-v0, and your own with a VelocityEnvCfg."
+            f"{settings.task} is no training task: there is nothing to learn in it. Available: "
+            "Pace-AnymalD-Velocity-v0, Pace-Go2-Velocity-v0, Pace-SO101-Reach-v0, and your own with a VelocityEnvCfg "
+            "or a ReachEnvCfg."
         )
     use_rewards(cfg, settings.reward)
     if settings.randomize:
+        if not isinstance(cfg, VelocityEnvCfg):
+            raise ValueError(f"--randomize is for walking robots, and {settings.task} is no velocity task.")
         add_randomization(cfg)
     _use_drives(cfg, settings)
     if settings.num_envs is not None:
@@ -77,7 +81,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> VelocityEnvC
     return cfg
 
 
-def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
+def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
     """Physics step and drives as the settings say; prints what a reader should know of it."""
     scale = settings.randomize_identified
     if scale is not None and not 0 <= scale < math.inf:
@@ -88,6 +92,8 @@ def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
         if settings.physics_dt is not None:
             set_step(cfg, settings.physics_dt)
         return
+    for doubt in doubts(cfg, settings.identified):
+        print(f"warning: identified drives: {doubt}", file=sys.stderr)
     notes = [set_identified_step(cfg, settings.identified)]
     more = use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
     if settings.physics_dt is not None:
@@ -100,7 +106,7 @@ def _use_drives(cfg: VelocityEnvCfg, settings: RunSettings) -> None:
             print(f"identified drives: {note}")
 
 
-def make_env(cfg: VelocityEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
+def make_env(cfg: TrainingEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:
     """The environment as rsl-rl sees it; one thread for torch's small tensors, the physics takes the cores."""
     torch.set_num_threads(1)
     return RslRlVecEnvWrapper(ManagerBasedRLEnv(cfg, render_mode), clip_actions=cfg.runner.clip_actions)
@@ -161,7 +167,7 @@ def resume(
     return _learn(cfg, begin, checkpoint)
 
 
-def _learn(cfg: VelocityEnvCfg, begin: Callable[[], Path], checkpoint: Path | None) -> Path | None:
+def _learn(cfg: TrainingEnvCfg, begin: Callable[[], Path], checkpoint: Path | None) -> Path | None:
     """Learn; ``begin`` makes the folder, once a checkpoint is known to be sound."""
     torch.manual_seed(cfg.runner.seed)
     env = make_env(cfg)

@@ -16,7 +16,6 @@ def anymal_d_drive_cfg() -> PaceDCMotorCfg:
         saturation_effort=140.0,
         effort_limit=89.0,
         velocity_limit=8.5,
-        max_delay=10.0,
     )
 
 

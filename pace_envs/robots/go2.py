@@ -17,7 +17,6 @@ def go2_drive_cfgs() -> dict[str, PaceDCMotorCfg]:
             saturation_effort=23.7,
             effort_limit=23.7,
             velocity_limit=30.1,
-            max_delay=20.0,
         ),
         "calf": PaceDCMotorCfg(
             joint_names_expr=".*_calf_joint",
@@ -26,7 +25,6 @@ def go2_drive_cfgs() -> dict[str, PaceDCMotorCfg]:
             saturation_effort=45.43,
             effort_limit=45.43,
             velocity_limit=15.7,
-            max_delay=20.0,
         ),
     }
 

@@ -29,7 +29,6 @@ def so101_drive_cfg() -> PaceDCMotorCfg:
         saturation_effort=_STALL_TORQUE,
         effort_limit=2 * _STALL_TORQUE,  # braking from no-load speed; the motoring limit is the line above
         velocity_limit=_NO_LOAD_SPEED,
-        max_delay=80.0,
     )
 
 

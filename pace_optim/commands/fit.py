@@ -48,7 +48,21 @@ def main() -> None:
         metavar="FACT",
         help=f"facts of the drives that nobody knows, to be identified: {', '.join(UNKNOWN_FACTS)}",
     )
-    parser.add_argument("--optimizer", choices=OPTIMIZERS, default="hybrid")
+    parser.add_argument(
+        "--optimizer",
+        default="hybrid",
+        metavar="NAME",
+        help=f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell says "
+        "what is minimised",
+    )
+    parser.add_argument(
+        "--stop",
+        nargs="+",
+        default=[],
+        metavar="RULE",
+        help="further rules that end the search: plateau, window, gradient, early_stopping, parameters, "
+        "target:score=S; with numbers as in plateau:generations=30,improvement=0.01",
+    )
     parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
     parser.add_argument("--epsilon", type=number, help="stop at this relative spread of a generation's scores")
     parser.add_argument("--sigma", type=number, help="initial standard deviation of the search, normalised")
@@ -106,7 +120,7 @@ def main() -> None:
         result, folder = resume(run, args["max_iteration"], task=args["task"], device=own, processes=processes)
     else:
         if args["task"] is None:
-            raise ValueError("--task is missing. scripts/list_envs.py lists what there is.")
+            raise ValueError(missing_task())
         result, folder = fit(FitSettings(**args, device=device), processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
@@ -118,6 +132,17 @@ def main() -> None:
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
         print(f"run: {folder}")
+
+
+def missing_task() -> str:
+    """What to say where ``--task`` is missing."""
+    from pace_envs import load_env_cfg, registered_tasks
+
+    known = [name for name in registered_tasks() if hasattr(load_env_cfg(name), "sim2real")]
+    return (
+        f"--task is missing. It takes a registered name ({', '.join(known)}), my_module:Name, my_file.py:Name, or a "
+        "model file (robot.xml, robot.urdf). PACE's example is --task Pace-AnymalD-v0."
+    )
 
 
 def _is_large(path: str) -> bool:

@@ -18,7 +18,7 @@ def rows(tasks: list[str], control_dt: float | None = None) -> list[tuple[str, .
         robot = sim2real.robot_name if sim2real else Path(cfg.scene.robot.mjcf_path).stem
         joints = cfg.scene.robot.joint_order
         rates = f"{1 / cfg.sim.dt:g}/{1 / (cfg.sim.dt * cfg.decimation):g} Hz"
-        recording = sample_recording(Path(sim2real.data_dir)) if sim2real else "-"
+        recording = sample_recording(sim2real.recording) if sim2real else "-"
         result.append((task, robot, str(len(joints)) if joints else "all", rates, recording))
     return result
 

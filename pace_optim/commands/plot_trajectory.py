@@ -3,6 +3,7 @@
 import argparse
 import io
 import shlex
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -11,8 +12,9 @@ from matplotlib.figure import Figure
 
 from pace_actuators.files import refuse_taken, write_together
 from pace_optim.report.plots import plot_scores, plot_trajectories
-from pace_optim.run.find import find_mean, find_run
+from pace_optim.run.find import find_mean, find_run, newest_mean
 from pace_optim.run.history import History
+from pace_optim.run.open import run_folder
 from pace_optim.run.replay import replay
 from pace_optim.run.result import FitResult
 from pace_optim.run.tensors import read_mean, read_trajectory
@@ -24,9 +26,10 @@ def main() -> None:
     """Parse the command line, draw, show or save."""
     parser = make_parser(
         "Plot a run's trajectories and score: on screen, or as PNG files where there is none.",
-        example="scripts/plot_trajectory.py --robot_name anymal_d --plot_trajectory --output plots",
+        example="scripts/plot_trajectory.py logs/pace/anymal_d/26_01_01_12-00-00 --plot_trajectory --output plots",
     )
-    parser.add_argument("--robot_name", required=True, help="whose run")
+    parser.add_argument("run", nargs="?", metavar="RUN", help="the run's folder (default: the newest)")
+    parser.add_argument("--robot_name", help="whose newest run (default: that of any robot)")
     parser.add_argument("--folder_name", help="which run (default: the newest)")
     parser.add_argument("--mean_name", help="simulate this mean of the search, as mean_020.pt, instead of the best")
     parser.add_argument("--plot_trajectory", action="store_true", help="positions and errors of every joint")
@@ -40,7 +43,10 @@ def main() -> None:
     both = not (args.plot_trajectory or args.plot_score)
 
     torch.set_num_threads(1)
-    run = find_run(args.log_dir, args.robot_name, args.folder_name)
+    run = run_folder(args.run) if args.run else find_run(args.log_dir, args.robot_name, args.folder_name)
+    if args.mean_name is None and not (run / "best_trajectory.pt").exists() and (newest := newest_mean(run)):
+        print(f"note: the fit has not ended, so this is {newest}, the newest so far", file=sys.stderr)
+        args.mean_name = newest
     on_screen = not (args.output or args.headless) and has_display()
     if not on_screen:
         matplotlib.use("Agg")
@@ -48,7 +54,7 @@ def main() -> None:
 
     figures: dict[str, Figure] = {}
     types = FitResult.load(run).joint_types if (run / "result.json").exists() else ()
-    title = f"{args.robot_name} · {run.name}"
+    title = f"{run.resolve().parent.name} · {run.name}"
     if args.plot_trajectory or both:
         if args.mean_name:
             path = find_mean(run, args.mean_name)

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--num_envs", type=int, help="robots at once (default: the task's)")
     parser.add_argument("--max_iterations", type=int, help="iterations in all (default: the task's)")
     parser.add_argument("--seed", type=int, default=42)
-    parser.add_argument("--reward", default="velocity", help="reward set: velocity (default) or energy")
+    parser.add_argument("--reward", help="reward set (default: the task's own); walking tasks have velocity and energy")
     parser.add_argument("--randomize", action="store_true", help="train with pushes, over many frictions and loads")
     parser.add_argument("--identified", metavar="FILE", help="train with the drives of this fit: its result.json")
     parser.add_argument(

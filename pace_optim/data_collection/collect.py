@@ -81,7 +81,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         max_frequency=cfg.max_frequency,
         seed=cfg.seed,
     )
-    files = plan_files(cfg, sim2real.robot_name, [trajectory.name for trajectory in trajectories])
+    files = plan_files(cfg, sim2real, [trajectory.name for trajectory in trajectories])
     if cfg.optimize and len(trajectories) > 1:
         raise ValueError(
             f"--optimize chooses one trajectory, and {cfg.excitation} makes {len(trajectories)}. Choose another "
@@ -126,7 +126,7 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         env.close()
     written = _write(cfg, sim2real, trajectories, simulated, files, findings, limits)
     if hidden is not None:
-        path = write_truth(truth_file(cfg, sim2real.robot_name), hidden.truth.to_dict())
+        path = write_truth(truth_file(cfg, sim2real), hidden.truth.to_dict())
         written = replace(written, hidden=hidden.lines, truth=path)
     return replace(written, design=design)
 

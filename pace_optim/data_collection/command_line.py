@@ -16,6 +16,8 @@ from pace_optim.terminal.options import (
     add_common_options,
     add_control_option,
     add_overwrite_option,
+    add_paces_options,
+    drop_paces_options,
     number,
     take_common_options,
 )
@@ -65,10 +67,11 @@ def make_collection_parser() -> Parser:
     robot = parser.add_argument_group("simulated robot")
     robot.add_argument(
         "--parameter",
-        action="append",
+        action="extend",
+        nargs="+",
         default=[],
         metavar="NAME[/JOINT]=VALUE",
-        help="true parameter of all joints or one, in place of the robot's sample_params; may be repeated",
+        help="true parameters of all joints or one, in place of the robot's sample_params",
     )
     robot.add_argument(
         "--effect",
@@ -96,7 +99,7 @@ def make_collection_parser() -> Parser:
     robot.add_argument("--load_length", type=number, metavar="M", help="test bench: length of the arm")
     robot.add_argument("--arm_mass", type=number, metavar="KG", help="test bench: mass of the arm")
     robot.add_argument(
-        "--added_mass", action="append", default=[], metavar="BODY=KG", help="mass added to a body; may be repeated"
+        "--added_mass", action="extend", nargs="+", default=[], metavar="BODY=KG", help="masses added to bodies"
     )
     encoder = parser.add_argument_group("encoder")
     encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
@@ -110,6 +113,7 @@ def make_collection_parser() -> Parser:
     files.add_argument("--command_only", action="store_true", help="write the commands and simulate nothing")
     files.add_argument("--plot", type=Path, metavar="FILE.png", help="default: beside the recording")
     files.add_argument("--no_plot", action="store_true", help="draw nothing")
+    add_paces_options(parser)
     return parser
 
 
@@ -120,6 +124,7 @@ def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
         ValueError: If one is malformed.
     """
     options = take_common_options(vars(args))
+    drop_paces_options(options)
     load = Load(
         added_mass=_pairs("--added_mass", options.pop("added_mass"), "BODY=KG"),
         **{key: options.pop(key) for key in ("load_mass", "load_length", "arm_mass")},

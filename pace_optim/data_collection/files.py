@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pace_actuators.files import refuse_place, refuse_taken
+from pace_envs.tasks.pace import PaceCfg
 from pace_optim.recording import SUFFIXES, written_files
 
 from .cfg import CollectionCfg
@@ -24,12 +25,12 @@ class Files:
     """The picture."""
 
 
-def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> list[Files]:
+def plan_files(cfg: CollectionCfg, sim2real: PaceCfg, names: Sequence[str]) -> list[Files]:
     """Name the files of every trajectory, and refuse what could not be written before the work is done.
 
     Args:
         cfg: The request.
-        robot_name: Names the folder under ``data/`` where the request names none.
+        sim2real: Says where files go that the request does not place.
         names: Names of the trajectories; with several, each adds its own to the stem of its files.
 
     Raises:
@@ -38,9 +39,8 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     _check("--output", cfg.output, SUFFIXES)
     _check("--export_command", cfg.export_command, (".csv",))
     _check("--plot", cfg.plot, (".png",))
-    folder = Path("data") / robot_name
-    stem = f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
-    recording = None if cfg.command_only else cfg.output or folder / f"{stem}.npz"
+    folder, stem = Path("data") / sim2real.robot_name, _stem(cfg)
+    recording = None if cfg.command_only else _recording(cfg, sim2real)
     command = cfg.export_command
     if command is None and cfg.command_only:
         command = folder / f"{stem}_command.csv"
@@ -57,16 +57,30 @@ def plan_files(cfg: CollectionCfg, robot_name: str, names: Sequence[str]) -> lis
     if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
     recordings = [path for file in files if file.recording for path in written_files(file.recording)]
-    truth = [truth_file(cfg, robot_name)] if cfg.effects else []
+    truth = [truth_file(cfg, sim2real)] if cfg.effects else []
     refuse_taken(dict.fromkeys((*paths, *recordings, *truth)), option="--output", overwrite=cfg.overwrite)
     return files
 
 
-def truth_file(cfg: CollectionCfg, robot_name: str) -> Path:
+def truth_file(cfg: CollectionCfg, sim2real: PaceCfg) -> Path:
     """Where it is said what was hidden: the recording's stem (of several, what theirs have in common)."""
-    stem = f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
-    recording = cfg.output or Path("data") / robot_name / f"{stem}.npz"
+    recording = _recording(cfg, sim2real)
     return recording.with_name(f"{recording.stem}.truth.json")
+
+
+def _stem(cfg: CollectionCfg) -> str:
+    return f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
+
+
+def _recording(cfg: CollectionCfg, sim2real: PaceCfg) -> Path:
+    """Where a recording goes: as asked; where a fit looks for one of this motion; else under ``data/``."""
+    if cfg.output is not None:
+        return cfg.output
+    own = Path(sim2real.data_dir)
+    is_for_motion = own.stem.startswith(_stem(cfg)) and own.suffix.lower() in SUFFIXES
+    if is_for_motion and not own.is_absolute():
+        return sim2real.recording
+    return Path("data") / sim2real.robot_name / f"{_stem(cfg)}.npz"
 
 
 def _part(path: Path | None, name: str, count: int) -> Path | None:

@@ -9,6 +9,8 @@ from typing import Any
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
 from pace_envs.model_file.read import is_model_file
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.convergence import stop_rule
+from pace_optim.optimizers.own_objective import Objective, build, optimizer_class
 from pace_optim.optimizers.way_down import WayDownCfg
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
@@ -56,13 +58,17 @@ def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Pro
     chosen = {
         name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None
     }
+    own = optimizer_class(settings.optimizer) if settings.has_own_objective else None
     problem.env_cfg.sim2real.cmaes = replace(
         cmaes,
         per_tree=cmaes.per_tree and not settings.joint_strategy,
         save_optimization_process=cmaes.save_optimization_process or settings.save_optimization_process,
+        stop=settings.stop or cmaes.stop,
         **chosen,
     )
-    if problem.dataset.num_recordings * 4 > settings.num_envs and settings.optimizer == "cmaes":
+    for rule in problem.env_cfg.sim2real.cmaes.stop:
+        stop_rule(rule)
+    if problem.dataset.num_recordings * 4 > settings.num_envs and settings.only_searches:
         raise ValueError(
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
             f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
@@ -70,6 +76,8 @@ def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Pro
     if not bool((problem.space.upper > problem.space.lower).any()):
         raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
     try_out(problem)
+    if own is not None and Objective(own, problem).joins_joints:
+        problem.env_cfg.sim2real.cmaes.per_tree = False
     if settings.device != "cpu":
         problem.for_search(settings.device).make_env(1).close()
     if settings.optimizer != "least_squares":  # which chooses how much it simulates at once
@@ -87,8 +95,9 @@ def search_population(problem: Problem, settings: FitSettings) -> int:
 
 def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
     """The search of a fit."""
-    return CMAESOptimizer(
-        problem.space,
+    return build(
+        optimizer_class(settings.optimizer) if settings.has_own_objective else CMAESOptimizer,
+        problem,
         search_population(problem, settings),
         problem.env_cfg.sim2real.cmaes,
         trees=problem.trees,

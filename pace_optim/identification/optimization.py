@@ -126,7 +126,7 @@ class Optimization:
 
     def _optimize(self) -> Outcome:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
-        if self.optimizer is not None and self.settings.optimizer == "cmaes":
+        if self.optimizer is not None and self.settings.only_searches:
             self._search(self.optimizer)
             return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
         if self.settings.start is not None:
@@ -157,7 +157,7 @@ class Optimization:
         self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
 
     def _write_mean(self, optimizer: CMAESOptimizer) -> None:
-        self.folder.write_mean(optimizer.generation, self.problem.space.to_physical(optimizer.mean))
+        self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(optimizer.mean))
 
     def _search(self, optimizer: CMAESOptimizer) -> torch.Tensor:
         """Run CMA-ES as far as an interrupted run had not; returns the best."""
@@ -173,12 +173,13 @@ class Optimization:
         optimizer.close()
         self._search_stop = optimizer.stop_reasons
         self._write_mean(optimizer)
+        self._write_process()
         return optimizer.best
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history
         history.search_best.append(optimizer.best_score)
-        history.search_mean.append(float(optimizer.scores.sum(axis=1).mean()))
+        history.search_mean.append(float(optimizer.generation_scores.sum(axis=1).mean()))
         history.search_steps.append(self.steps)
         history.search_time_s.append(self.progress.elapsed)
         self.log.log_generation(optimizer)
@@ -187,14 +188,17 @@ class Optimization:
         self._keep_process(optimizer)
         if optimizer.generation % cfg.save_interval == 0:
             self._write_mean(optimizer)
-            if cfg.save_optimization_process:
-                self.folder.write_tensors("progress.pt", {k: torch.stack(v) for k, v in self._saved.items()})
+            self._write_process()
         self._write_checkpoint()
 
     def _keep_process(self, optimizer: CMAESOptimizer) -> None:
         if optimizer.cfg.save_optimization_process:
             self._saved["params"].append(optimizer.candidates)
-            self._saved["scores"].append(torch.as_tensor(optimizer.scores.sum(axis=1)))
+            self._saved["scores"].append(torch.as_tensor(optimizer.generation_scores.sum(axis=1)))
+
+    def _write_process(self) -> None:
+        if self._saved["params"]:
+            self.folder.write_progress({name: torch.stack(values) for name, values in self._saved.items()})
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         now = next((d for d in descents if not d.stop_reason), descents[-1])
@@ -208,6 +212,7 @@ class Optimization:
             self.log.log_refinement(now.iteration, best)
         name = "begin" if on_pieces else "refine"
         self.progress.show(name, now.iteration, cfg.max_iteration, best, None, self.steps)
+        self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()
 
     def refuse_divergence(self, score: float) -> None:

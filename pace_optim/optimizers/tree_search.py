@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.optimizers.convergence import Criterion, ScoreSpread
+from pace_optim.optimizers.convergence import Criterion, ScoreSpread, stop_rule
 from pace_optim.optimizers.tree_strategy import TreeStrategy
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.processes import Processes
@@ -56,7 +56,7 @@ class TreeSearch:
             [next(g for g, joints in enumerate(groups) if name in joints) for name in self.joint_names]
         )
         if criteria is None:
-            criteria = [] if cfg.epsilon is None else [ScoreSpread(cfg.epsilon)]
+            criteria = [*([] if cfg.epsilon is None else [ScoreSpread(cfg.epsilon)]), *map(stop_rule, cfg.stop)]
         x0 = np.zeros(space.size) if start is None else np.asarray(start, dtype=float)
         seeds = np.random.SeedSequence(seed).generate_state(len(groups))
         self.strategies = []
@@ -178,7 +178,7 @@ class TreeSearch:
         self._doers = self.processes
 
     def _learn(self, scores: np.ndarray) -> None:
-        self.scores = scores
+        self.generation_scores = scores
         self.history.append(scores)
         self.generation += 1
         self._update_strategies(scores)

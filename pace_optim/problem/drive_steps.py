@@ -40,7 +40,9 @@ def set_control_step(cfg: PaceSim2realEnvCfg) -> None:
             )
         if drive.drive_dt is None and not drive.implicit:
             drive.drive_dt = own
-        drive.delay, drive.max_delay = (steps * own / control_dt for steps in (drive.delay, drive.max_delay))
+        drive.delay, drive.max_delay = (
+            None if steps is None else steps * own / control_dt for steps in (drive.delay, drive.max_delay)
+        )
         drive.control_decimation = cfg.decimation
 
 

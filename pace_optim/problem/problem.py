@@ -205,6 +205,7 @@ def load_problem(
         raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
     if delay_mode is not None and delay_mode not in DELAY_MODES:
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
+    cfg.prepare()
     control_dt = cfg.sim.dt * cfg.decimation
     set_control_step(cfg)
     drives = cfg.scene.robot.actuators.values()
@@ -213,10 +214,10 @@ def load_problem(
         if drive_dt is not None:
             drive.drive_dt, drive.implicit = drive_dt, False
         longest = float(cfg.sim2real.bounds_params[-1, 1])
-        if drive.max_delay < longest:
+        if drive.largest_delay < longest:
             raise ValueError(
                 f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
-                f"{drive.max_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
+                f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
     cfg.scene.num_envs = 1
     set_drive_rate(cfg, physics_dt)
@@ -224,7 +225,7 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings = read_all(data or [cfg.sim2real.data_dir], env, control_dt, columns=columns, strict=strict, tell=tell)
+    recordings = read_all(data or [cfg.sim2real.recording], env, control_dt, columns=columns, strict=strict, tell=tell)
     held_out = read_all(validation, env, control_dt, columns=columns, strict=strict, tell=tell)
     recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
     count = len(recordings)

@@ -15,6 +15,7 @@ from pace_optim.recording.dataset import Dataset
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
+    from pace_envs.contact_sensor import ContactSensor
 
 _LOAD_STEPS = 6
 """Fixed-point steps of a start whose positions depend on the load there."""
@@ -62,6 +63,7 @@ class Rollout:
         self._compiled = CompiledRobot(env, self.dataset)
         self._where = self.dataset.train
         self._enable_changes = _changes(dataset.torque_enable)
+        self._step, self._contacts_at, self._is_late = 0, -1, False
         self.weight: torch.Tensor | float = 0.0
         self.physical = torch.empty(0)
         for r in range(count):
@@ -70,14 +72,79 @@ class Rollout:
         self._session_start = begin.expand(-1, self.robot.num_joints)
 
     @property
+    def step(self) -> int:
+        """Control step of the present sample."""
+        return self._step
+
+    @property
     def sim_dof_vel(self) -> torch.Tensor:
-        """Simulated joint velocities at the present sample, (num_envs, n) [rad/s]."""
+        """Simulated joint velocities at the present sample, (num_envs, n) [rad/s].
+
+        Raises:
+            ValueError: If samples are not taken at control steps.
+        """
+        self._refuse_late("velocities")
         return self.robot.data.joint_vel
 
     @property
     def real_dof_vel(self) -> torch.Tensor:
         """Measured joint velocities at the present sample, (num_envs, n) [rad/s]."""
         return self._rows(self.dataset.measured_vel[self._step])
+
+    @property
+    def sim_ee_pose(self) -> torch.Tensor:
+        """Pose of the site ``PaceCfg.ee_site`` in the base's frame at the present sample, shaped as the measured one.
+
+        Raises:
+            ValueError: If the configuration names no such site, or samples are not taken at control steps.
+        """
+        self._refuse_late("the end effector's pose")
+        measured = self.real_ee_pose
+        pose = self.robot.site_pose(self.env.cfg.sim2real.ee_site)[:, : measured.shape[1]]  # type: ignore[attr-defined]
+        if pose.shape[1] > 3:  # q and -q are one rotation
+            pose[:, 3:] *= (pose[:, 3:] * measured[:, 3:]).sum(dim=1, keepdim=True).sign()
+        return pose
+
+    @property
+    def real_ee_pose(self) -> torch.Tensor:
+        """Measured pose of the end effector at the present sample.
+
+        (num_envs, 3), a position [m], or (num_envs, 7), position and quaternion (w, x, y, z).
+
+        Raises:
+            ValueError: If a recording has none.
+        """
+        if self.dataset.ee_pose is None:
+            raise ValueError(
+                "The recordings have no pose of the end effector: add the series real_ee_pose, (T, 3) [m] or (T, 7) "
+                "with a quaternion (w, x, y, z), to each of them."
+            )
+        return self._rows(self.dataset.ee_pose[self._step])
+
+    def contacts(self, name: str) -> ContactSensor:
+        """A contact sensor of the scene, as it is at the present sample.
+
+        Raises:
+            ValueError: If contacts are off, there is no such sensor, or samples are not taken at control steps.
+        """
+        scene, sensors = self.env.scene, ", ".join(self.env.scene.sensors) or "none"
+        if not self.env.cfg.sim.contacts or name not in scene.sensors:
+            raise ValueError(
+                f"There is no contact sensor {name!r} to read (there are: {sensors}). In the task's configuration set "
+                f"sim.contacts = True and scene.contact_sensors = {{{name!r}: ContactSensorCfg(geom_names=…)}}."
+            )
+        self._refuse_late("contacts")
+        if self._contacts_at != self._step:
+            self._contacts_at = self._step
+            scene.update_sensors(self.env.step_dt)
+        return scene.sensors[name]
+
+    def _refuse_late(self, what: str) -> None:
+        if self.dataset.sample_offset is not None or self._is_late:
+            raise ValueError(
+                f"Only positions are known at the instants of these samples, which do not lie on control steps: {what} "
+                "are not. Choose a control step that divides the recording's, or leave out effects on the recording."
+            )
 
     @property
     def duration_steps(self) -> int:
@@ -114,6 +181,8 @@ class Rollout:
         data = self.dataset
         weights = (self._where.double() / self._where.sum()).to(self.env.dtype)
         counts = self._where.any(dim=1).tolist()
+        self._is_late = self.observation_lag(self.duration_steps) is not None
+        self._contacts_at = -1
         for k, sim_dof_pos in self.samples():
             self._step = k
             if counts[k]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from .data import Recording
 from .facts import as_array, drive_of, joint_names_of, load_of
-from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, SERIES, closest, listed
+from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest, listed
 from .stamps import seconds_of
 
 _HUGE = 1e6
@@ -47,6 +47,7 @@ def check_recording(
                 "Give every series one column per joint."
             )
     joint_names = joint_names_of(fields.get("joint_names"), num_joints, source)
+    pose = fields.get("real_ee_pose")
     enable = fields.get("torque_enable")
     torque_enable = None if enable is None else _torque_enable(enable, len(time), source)
     for key, array in series.items():
@@ -66,6 +67,7 @@ def check_recording(
         **series,
         des_time=des_time,
         torque_enable=torque_enable,
+        real_ee_pose=None if pose is None else _pose(pose, len(time), source),
         time_origin=_origin(fields.get("time_origin"), origin, source),
         drive=drive_of(fields, joint_names, num_joints, source),
         load=load_of(fields, source),
@@ -198,6 +200,22 @@ def _torque_enable(value: Any, num_samples: int, source: str) -> np.ndarray:
             "sample for all joints together. Cut the recording where only some joints are off."
         )
     return array.astype(bool)
+
+
+def _pose(value: Any, num_samples: int, source: str) -> np.ndarray:
+    array = _numeric("real_ee_pose", value, source)
+    if array.ndim != 2 or len(array) != num_samples or array.shape[1] not in (3, len(POSE_COLUMNS)):
+        raise ValueError(
+            f"{source}: real_ee_pose has shape {array.shape}; expected ({num_samples}, 3), a position [m], or "
+            f"({num_samples}, {len(POSE_COLUMNS)}), position and quaternion (w, x, y, z). Store one row per sample."
+        )
+    _check_finite("real_ee_pose", array, POSE_COLUMNS[: array.shape[1]], source)
+    if array.shape[1] > 3 and np.any(np.abs(np.linalg.norm(array[:, 3:], axis=1) - 1.0) > 1e-2):
+        raise ValueError(
+            f"{source}: real_ee_pose has quaternions of a length other than 1 in its columns 3 to 6; expected "
+            "(x, y, z, qw, qx, qy, qz). Put the columns in this order."
+        )
+    return array
 
 
 def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], source: str) -> None:

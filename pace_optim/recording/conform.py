@@ -13,7 +13,7 @@ from pace_actuators.joint_units import JointType
 from .checks import MIN_SAMPLES
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
-from .keys import JOINT_SERIES, MEASURED_SERIES, listed
+from .keys import JOINT_SERIES, SAMPLED_SERIES, listed
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base
@@ -122,7 +122,7 @@ def _from_first_command(recording: Recording) -> Recording:
             f"{recording.label}: {before} of {recording.num_samples} samples come before the first command, so too "
             "few are left. Record the commands from the beginning on."
         )
-    cut = {key: value[before:] for key in ("time", *MEASURED_SERIES, "torque_enable")
+    cut = {key: value[before:] for key in ("time", *SAMPLED_SERIES)
            if (value := getattr(recording, key)) is not None}  # fmt: skip
     note = f"The first {recording.time[before] - recording.time[0]:.4g} s were left out: no command is known there."
     return replace(recording, **cut, notes=(*recording.notes, note))
@@ -156,6 +156,7 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
         ("dof_pos", interpolate_smooth),
         ("dof_vel", interpolate_smooth),
         ("dof_effort", interpolate_linear),
+        ("real_ee_pose", interpolate_linear),
     ):
         if (values := getattr(recording, key)) is not None:
             result[key] = interpolate(stamps, values, at)

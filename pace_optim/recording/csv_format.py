@@ -1,4 +1,4 @@
-"""The CSV form of a recording: columns `time`, `torque_enable`, and `<series>/<joint>`.
+"""The CSV form of a recording: columns `time`, `torque_enable`, `<series>/<joint>`, and `real_ee_pose/x` to `/qz`.
 
 Commands with a clock of their own have a column `des_time`; whichever clock has fewer rows leaves the last cells empty.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 from pace_actuators.memory import check_memory
 
-from .keys import COMMAND_SERIES, JOINT_SERIES, listed
+from .keys import COMMAND_SERIES, JOINT_SERIES, POSE_COLUMNS, listed
 
 Rows = list[list[str]] | np.ndarray
 """Cells as text, or all of them as numbers."""
@@ -50,6 +50,9 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
             indices = list(index_of.values())
             values = np.stack([_numbers(path, header[i], own, i) for i in indices], axis=1)
             fields[series] = values[:, 0] if len(indices) == 1 else values
+        elif series == "real_ee_pose" and set(index_of) in (set(POSE_COLUMNS[:3]), set(POSE_COLUMNS)):
+            names = POSE_COLUMNS[: len(index_of)]
+            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
         elif series in JOINT_SERIES and joints:
             _check_joints(path, series, list(index_of), joints, header)
             none = np.full(len(own), np.nan)
@@ -74,7 +77,8 @@ def write_csv(file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tu
             header.append(key)
             columns.append((values.astype(int) if values.dtype == bool else values).tolist())
             continue
-        for joint, column in zip(joints, values.T, strict=True):
+        names = POSE_COLUMNS[: values.shape[1]] if key == "real_ee_pose" else joints
+        for joint, column in zip(names, values.T, strict=True):
             if not np.isnan(column).all():
                 header.append(f"{key}/{joint}")
                 columns.append(column.tolist())

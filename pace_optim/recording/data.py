@@ -70,6 +70,8 @@ class Recording:
     """Torques that the drive measures or asks for, (T, n) [N m]."""
     torque_enable: np.ndarray | None = None
     """False where the drive gives no torque, (T,) bool."""
+    real_ee_pose: np.ndarray | None = None
+    """Measured pose of the end effector in the base's frame, (T, 3) [m], or (T, 7) with a quaternion (w, x, y, z)."""
     time_origin: float = 0.0
     """What the log's own clock showed at `time` = 0 [s]: Unix time where the log has it."""
     drive: Drive = field(default_factory=Drive)

@@ -37,6 +37,8 @@ class Dataset:
     """Where there is a sample to train on, (T, R) bool."""
     torque_enable: torch.Tensor | None
     """Whether the drives give torque, (T, R) bool; ``None`` when always."""
+    ee_pose: torch.Tensor | None
+    """Measured pose of the end effector, (T, R, 3) [m] or (T, R, 7); ``None`` where a recording has none."""
     sample_offset: torch.Tensor | None
     """By how much later than its step each sample was taken, (T, R) [control steps]; ``None`` where never."""
     validation_only: tuple[bool, ...]
@@ -72,6 +74,7 @@ class Dataset:
             sampled=self.sampled[:, chosen],
             train=self.train[:, chosen],
             torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
+            ee_pose=None if self.ee_pose is None else self.ee_pose[:, chosen],
             sample_offset=None if self.sample_offset is None else self.sample_offset[:, chosen],
             validation_only=tuple(self.validation_only[r] for r in chosen),
             session_start=self.session_start[chosen],
@@ -175,6 +178,7 @@ def make_dataset(
         sampled=sampled,
         train=train,
         torque_enable=None if bool(enable.all()) else enable,
+        ee_pose=_poses(every, steps),
         sample_offset=offset if bool(offset.any()) else None,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
         session_start=torch.as_tensor(session_start),
@@ -191,6 +195,19 @@ def _further(commands: Sequence[np.ndarray | None], position: torch.Tensor) -> t
     for r, each in enumerate(commands):
         if each is not None:
             _hold(result[:, r], each)
+    return result
+
+
+def _poses(recordings: Sequence[Recording], steps: int) -> torch.Tensor | None:
+    """Measured poses at the samples, of the columns that all have, (T, R, 3) or (T, R, 7)."""
+    found = [recording.real_ee_pose for recording in recordings]
+    known = [pose for pose in found if pose is not None]
+    if len(known) < len(found):
+        return None
+    columns = min(pose.shape[1] for pose in known)
+    result = torch.zeros(steps, len(known), columns, dtype=torch.float64)
+    for r, (pose, recording) in enumerate(zip(known, recordings, strict=True)):
+        result[torch.as_tensor(recording.sample_steps), r] = torch.as_tensor(pose[:, :columns])
     return result
 
 

@@ -11,7 +11,11 @@ COMMAND_SERIES = ("des_dof_pos", "des_dof_vel", "des_dof_effort")
 """What a drive may be told; at least one of them is in every recording."""
 MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
 JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort")
-SERIES = ("time", *JOINT_SERIES, "torque_enable", "des_time")
+POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+"""Columns of `real_ee_pose`: a position [m], or a position and a quaternion."""
+SAMPLED_SERIES = (*MEASURED_SERIES, "torque_enable", "real_ee_pose")
+"""Series with a value at each sample."""
+SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time")
 UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
 UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
 """Unit of each series of joints."""

@@ -16,7 +16,7 @@ import numpy as np
 from pace_actuators.memory import check_memory
 
 from .data import Recording
-from .keys import MEASURED_SERIES
+from .keys import SAMPLED_SERIES
 
 _NUMBERS = 20_000_000
 """Derivatives that a fit keeps unless it is told otherwise: 0.16 GB."""
@@ -107,9 +107,7 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
     at, begin = recording.sample_steps[first:end], float(recording.time[first])
     grid = slice(int(at[0]), int(at[-1]) + 1)
     measured: dict[str, Any] = {
-        key: value[first:end]
-        for key in (*MEASURED_SERIES, "torque_enable")
-        if (value := getattr(recording, key)) is not None
+        key: value[first:end] for key in SAMPLED_SERIES if (value := getattr(recording, key)) is not None
     }
     commands: dict[str, Any] = {
         key: value[grid]

@@ -82,6 +82,7 @@ class Windows:
             sampled=self.mask(dataset.sampled),
             train=self.mask(dataset.train),
             torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[at],
+            ee_pose=None if dataset.ee_pose is None else dataset.ee_pose[at],
             sample_offset=None if dataset.sample_offset is None else dataset.sample_offset[at],
             validation_only=tuple(dataset.validation_only[r] for r in recording),
             start_vel=torch.stack(

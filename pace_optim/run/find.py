@@ -10,12 +10,12 @@ _MOST_NAMED = 8
 _OF_A_RUN = ("settings.json", "result.json", "best_trajectory.pt")
 
 
-def find_run(log_dir: str | Path, robot_name: str, folder_name: str | None = None) -> Path:
+def find_run(log_dir: str | Path, robot_name: str | None = None, folder_name: str | None = None) -> Path:
     """The folder of a run.
 
     Args:
         log_dir: Where runs are kept.
-        robot_name: The robot's folder in it.
+        robot_name: The robot's folder in it; ``None`` means that of the newest run.
         folder_name: The run's folder in that; ``None`` means the newest.
 
     Raises:
@@ -27,6 +27,8 @@ def find_run(log_dir: str | Path, robot_name: str, folder_name: str | None = Non
         raise ValueError(
             f"There is no run under {log_dir}. Fit first: scripts/fit.py --task … --log_dir {shlex.quote(str(log_dir))}"
         )
+    if robot_name is None:
+        robot_name = max(robots, key=lambda robot: _age(_runs(log_dir / robot)[-1]))
     if robot_name not in robots:
         raise ValueError(
             f"There is no run of {robot_name!r} under {log_dir}. {_available('Robots', robots, robot_name)}"
@@ -59,6 +61,12 @@ def find_mean(run: Path, mean_name: str) -> Path:
             "or there was none. Leave --mean_name out to see the best parameters."
         )
     raise ValueError(f"There is no {mean_name!r} in {run}. {_available('Means', means, mean_name)}")
+
+
+def newest_mean(run: Path) -> str | None:
+    """Name of the file of a run's last saved mean."""
+    names = [path.stem for path in run.glob("mean_*.pt") if path.stem.removeprefix("mean_").isdigit()]
+    return max(names, key=lambda name: int(name.removeprefix("mean_")), default=None)
 
 
 def _runs(robot: Path) -> list[Path]:

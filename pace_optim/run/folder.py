@@ -32,8 +32,8 @@ report.html          the same to look at
 replay.html          the robot in 3-D, once {replay} was run
 drives.json          the drives in force, and what each recording asked of them
 best_trajectory.pt   commanded, measured and simulated positions of the best parameters (torch.load)
-mean_xxx.pt          mean of the search after generation xxx, physical, in the layout of config.pt
-config.pt            joints, bounds and layout of the parameter vector
+mean_xxx.pt          mean of the search, or best of the refinement, after iteration xxx; physical, as config.pt says
+config.pt            joints, bounds and layout of the parameter vector, and the recordings
 history.json         scores over iterations
 comparison.json      where the model fails, once {compare} was run
 diagnosis.json       which physical effect is missing, once {diagnose} was run
@@ -111,6 +111,7 @@ class RunFolder:
             {
                 "task": problem.task,
                 "joint_order": list(problem.joint_names),
+                **_dataset(problem),
                 "bounds_params": torch.stack([problem.space.lower, problem.space.upper], dim=1),
                 "parameters": list(problem.space.labels),
                 "slices": {name: [s.start, s.stop] for name, s in problem.space.slices.items()},
@@ -189,9 +190,14 @@ class RunFolder:
             refuse(where, "is no JSON", _ANEW)
         return checked(History, content, where, _ANEW)
 
-    def write_mean(self, generation: int, physical: torch.Tensor) -> None:
-        """The mean of the search after a generation."""
-        write_tensors(self.path / f"mean_{generation:03d}.pt", physical)
+    def write_mean(self, iteration: int, physical: torch.Tensor) -> None:
+        """The mean of the search, or the best of the refinement, after an iteration of either."""
+        write_tensors(self.path / f"mean_{iteration:03d}.pt", physical)
+
+    def write_progress(self, saved: dict[str, torch.Tensor]) -> None:
+        """Every generation's candidates and scores, also by PACE's names; tensors are written once."""
+        names = {"params_buffer": saved["params"], "scores_buffer": saved["scores"]}
+        write_tensors(self.path / "progress.pt", saved | names)
 
     def write_tensors(self, name: str, content: Any) -> None:
         """A file for ``torch.load``."""
@@ -200,3 +206,19 @@ class RunFolder:
     def write_json(self, name: str, content: Any) -> None:
         """A JSON file."""
         write_json(self.path / name, content)
+
+
+def _dataset(problem: Problem) -> dict[str, Any]:
+    """The recordings, as logged on the control grid; the first also under the keys that PACE's ``config.pt`` has."""
+    recordings = [
+        {
+            "name": recording.name,
+            "time": torch.as_tensor(recording.time),
+            "dof_pos": torch.as_tensor(recording.dof_pos),
+            "des_dof_pos": torch.as_tensor(recording.sampled_command),
+        }
+        for recording in problem.dataset.recordings
+    ]
+    first = {key: recordings[0][key] for key in ("time", "dof_pos", "des_dof_pos")}
+    bounds = torch.stack([problem.space.lower, problem.space.upper], dim=1)
+    return {"recordings": recordings, **first, "bounds": bounds}

@@ -42,6 +42,11 @@ class History:
                 refuse(path, f"{', '.join(own)} differ in length ({', '.join(map(str, own.values()))})", cure)
         return history
 
+    @property
+    def iterations(self) -> int:
+        """Generations of the search and iterations of the refinement so far, together."""
+        return len(self.search_best) + len(self.refine_best)
+
     def places(self) -> tuple[list[int], list[int]]:
         """Which of all iterations, counted from 1 by simulated steps, those of the search and of the refinement are."""
         search = [(steps, 0, i) for i, steps in enumerate(self.search_steps)]

@@ -17,7 +17,7 @@ _NOT_TO_COMPARE = ("versions",)
 
 def with_absolute_paths(settings: FitSettings, env_cfg: Any) -> FitSettings:
     """The same settings, which mean the same from any folder; the robot's sample stands in ``data`` where none does."""
-    sample = getattr(getattr(env_cfg, "sim2real", None), "data_dir", None)
+    sample = getattr(getattr(env_cfg, "sim2real", None), "recording", None)
     data = settings.data or ([str(sample)] if sample is not None else [])
     columns = None if settings.columns is None else str(Path(settings.columns).absolute())
     return replace(settings, data=_absolute(data), validation=_absolute(settings.validation), columns=columns)

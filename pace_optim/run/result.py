@@ -43,8 +43,8 @@ class FitResult(DriveResult):
     simulated_steps: int
     wall_time_s: float
     stop_reasons: list[str]
-    times_noise: float | None = None
-    """The training error as a multiple of the measurement noise."""
+    objective: dict[str, float | None] = field(default_factory=dict)
+    """What an objective of the user's own is at the result, in ``train`` and ``validation``; empty: it is ``score``."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
     """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
     assumes_loop_rate: bool = False

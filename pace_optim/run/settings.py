@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import checked, read_json, refuse
+from pace_actuators.own_code import absolute_reference
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
@@ -39,13 +40,17 @@ class FitSettings:
     """Simulations at once in a search; refining takes as many as it needs."""
 
     optimizer: str = "hybrid"
-    """``hybrid``, ``least_squares`` or ``cmaes``."""
+    """``hybrid``, ``least_squares`` or ``cmaes``; or a subclass of ``CMAESOptimizer``, itself or as ``module:Class`` or
+    ``path/to/file.py:Class``, whose ``tell`` says what is minimised."""
 
     max_iteration: int | None = None
     """Largest number of generations of the search; ``None`` keeps the robot's."""
 
     epsilon: float | None = None
     """PACE's stopping rule, (max - min) / min of a generation's scores; ``None`` keeps the robot's."""
+
+    stop: list[str] = field(default_factory=list)
+    """Further rules that end the search, as in ``CMAESOptimizerCfg.stop``; none keeps the robot's."""
 
     sigma: float | None = None
     """Initial standard deviation of the search, normalised; ``None`` keeps the robot's."""
@@ -98,8 +103,14 @@ class FitSettings:
         Raises:
             ValueError: If a value is unusable.
         """
-        if self.optimizer not in OPTIMIZERS:
-            raise ValueError(f"Unknown optimizer {self.optimizer!r}. Available: {', '.join(OPTIMIZERS)}.")
+        if isinstance(self.optimizer, type):
+            self.optimizer = f"{self.optimizer.__module__}:{self.optimizer.__qualname__}"
+        if self.optimizer not in OPTIMIZERS and ":" not in self.optimizer:
+            raise ValueError(
+                f"Unknown optimizer {self.optimizer!r}. Available: {', '.join(OPTIMIZERS)}, or module:Class, a "
+                "subclass of CMAESOptimizer."
+            )
+        self.optimizer = absolute_reference(self.optimizer)
         check_unknown(self.unknown)
         for name, lowest in (("num_envs", 1), ("max_iteration", 1), ("seed", 0)):
             value = getattr(self, name)
@@ -110,6 +121,16 @@ class FitSettings:
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")
         self.data, self.validation = without_fact_files(self.data), without_fact_files(self.validation)
+
+    @property
+    def has_own_objective(self) -> bool:
+        """Whether the optimizer is a class of the user's own."""
+        return ":" in self.optimizer
+
+    @property
+    def only_searches(self) -> bool:
+        """Whether nothing is refined: CMA-ES alone, or an objective that least squares do not minimise."""
+        return self.optimizer == "cmaes" or self.has_own_objective
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""

@@ -28,6 +28,9 @@ def summary(result: FitResult) -> list[str]:
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))
+    if result.objective:
+        parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
+        lines.append(f"objective {result.optimizer}: {parts} (train / validation)")
     lines.append(
         f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s; "
         f"stopped: {'; '.join(result.stop_reasons)}"

@@ -15,6 +15,14 @@ if TYPE_CHECKING:
 
     from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 
+_PACES_GROUPS = {
+    "delay": "0_Delay",
+    "armature": "1_Armature",
+    "viscous_friction": "2_Damping",
+    "friction": "3_Friction",
+    "encoder_bias": "4_Bias",
+}
+"""Parameters by the groups of PACE's tags."""
 _BINS = 40
 """Of a histogram, from the smallest to the largest candidate."""
 
@@ -28,6 +36,10 @@ class TensorBoardLog:
     spread/<parameter>                    standard deviation of the search, normalised, mean over the joints
     refinement/score                      best score over the iterations of the refinement [rad²]
     result/…                              values, error bars and errors in the end
+
+    Beside them the tags of PACE: ``0_Episode/score``, ``max_score``, ``diff_score``, ``0_Delay/best``,
+    ``0_Delay/distribution``, and ``best_<joint>``, ``distribution_<joint>`` under ``1_Armature``, ``2_Damping``,
+    ``3_Friction`` and ``4_Bias``. There ``best`` is of the generation, not so far.
     """
 
     def __init__(self, folder: Path, histogram_interval: int = 10):
@@ -52,11 +64,12 @@ class TensorBoardLog:
     def log_generation(self, optimizer: CMAESOptimizer) -> None:
         """Log a generation, after ``evolve()``."""
         step, space, write = optimizer.generation, optimizer.space, self._writer
-        scores = torch.as_tensor(optimizer.scores).sum(dim=1)
+        scores = torch.as_tensor(optimizer.generation_scores).sum(dim=1)
         write.add_scalar("score/best", optimizer.best_score, step)
         write.add_scalar("score/generation_min", float(scores.min()), step)
         write.add_scalar("score/generation_median", float(scores.median()), step)
         write.add_scalar("score/generation_max", float(scores.max()), step)
+        self._log_as_pace(optimizer, scores)
         best, spread = space.to_physical(optimizer.best).tolist(), optimizer.spread
         for label, value in zip(space.labels, best, strict=True):
             write.add_scalar(f"best/{label}", value, step)
@@ -67,6 +80,23 @@ class TensorBoardLog:
             candidates = optimizer.candidates.numpy()
             for i, label in enumerate(space.labels):
                 write.add_histogram(f"population/{label}", candidates[:, i], step, bins=_BINS)  # type: ignore[arg-type]
+
+    def _log_as_pace(self, optimizer: CMAESOptimizer, scores: torch.Tensor) -> None:
+        step, write, low, high = optimizer.generation, self._writer, float(scores.min()), float(scores.max())
+        write.add_scalar("0_Episode/score", low, step)
+        write.add_scalar("0_Episode/max_score", high, step)
+        if low > 0:
+            write.add_scalar("0_Episode/diff_score", (high - low) / low, step)
+        candidates, best = optimizer.candidates.numpy(), int(scores.argmin())
+        with_histograms = step % self.histogram_interval == 0 or step == 1
+        for name, group in _PACES_GROUPS.items():
+            entries = range(optimizer.space.size)[optimizer.space[name]]
+            keys = ("",) if name == "delay" else optimizer.joint_names
+            for entry, key in zip(entries, keys, strict=True):
+                end = f"_{key}" if key else ""
+                write.add_scalar(f"{group}/best{end}", float(candidates[best, entry]), step)
+                if with_histograms:
+                    write.add_histogram(f"{group}/distribution{end}", candidates[:, entry], step, bins=_BINS)  # type: ignore[arg-type]
 
     def log_refinement(self, iteration: int, score: float) -> None:
         """Log an iteration of the refinement.

@@ -107,7 +107,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     env_cfg = _held_robot(fitted_cfg, cfg, folder)
     control_dt = _control_dt(env_cfg)
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
-    paths = settings.data or [str(fitted_cfg.sim2real.data_dir)]
+    paths = settings.data or [str(fitted_cfg.sim2real.recording)]
     trained, held_out = (
         read_all(each, env, control_dt, columns=settings.columns, strict=settings.strict)
         for each in (paths, settings.validation)

@@ -31,6 +31,20 @@ def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco
     )
 
 
+def add_paces_options(parser: argparse.ArgumentParser) -> None:
+    """Options of PACE's data collection that change nothing here."""
+    group = parser.add_argument_group("accepted for PACE's command lines")
+    group.add_argument("--num_envs", type=int, default=1, metavar="N", help="one environment a trajectory is simulated")
+    group.add_argument("--device", default="cpu", help="recordings are made on the processor")
+    group.add_argument("--headless", action="store_true", help="nothing is shown")
+
+
+def drop_paces_options(options: dict[str, Any]) -> None:
+    """Leave out what :func:`add_paces_options` added."""
+    for name in ("num_envs", "device", "headless"):
+        del options[name]
+
+
 def add_control_option(parser: argparse._ActionsContainer) -> None:
     """Of every command that makes a robot of a model file; runs keep it."""
     parser.add_argument(

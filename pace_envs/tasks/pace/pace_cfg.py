@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from pace_actuators.config import Config
 from pace_actuators.drive_result import BASE_FIELDS
 from pace_actuators.effects import EffectCfg
 
@@ -17,7 +18,7 @@ PARAMETER_GROUPS = BASE_FIELDS
 
 
 @dataclass(kw_only=True)
-class CMAESOptimizerCfg:
+class CMAESOptimizerCfg(Config):
     """Settings of the search."""
 
     per_tree: bool = True
@@ -28,6 +29,11 @@ class CMAESOptimizerCfg:
 
     epsilon: float | None = 1e-2
     """Stop when (max - min) / min of a generation's scores falls below this; ``None`` switches it off."""
+
+    stop: Sequence[Any] = ()
+    """Further rules that end the search, beside ``epsilon`` and ``max_iteration``: ``"plateau"``, ``"window"``,
+    ``"gradient"``, ``"early_stopping"``, ``"parameters"`` or ``"target"``, with numbers as in
+    ``"plateau:generations=30,improvement=0.01"``; or a rule of your own (``pace_optim.optimizers.convergence``)."""
 
     sigma: float = 0.5
     """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
@@ -40,7 +46,7 @@ class CMAESOptimizerCfg:
 
 
 @dataclass(kw_only=True)
-class ExcitationCfg:
+class ExcitationCfg(Config):
     """How the robot is moved for a recording: target = (signal + bias) * direction * scale, per joint."""
 
     bias: tuple[float, ...]
@@ -54,14 +60,15 @@ class ExcitationCfg:
 
 
 @dataclass(kw_only=True)
-class PaceCfg:
+class PaceCfg(Config):
     """Names, bounds and search settings of a robot's identification."""
 
     robot_name: str
     """Name of the robot; runs are kept under it."""
 
     data_dir: str | Path
-    """The recording that is used when no other is named."""
+    """The recording that is used when no other is named; a relative path that is not there is one under ``data/``, as
+    in PACE."""
 
     joint_order: tuple[str, ...]
     """The joints, in the order of every vector."""
@@ -103,6 +110,9 @@ class PaceCfg:
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
+    ee_site: str | None = None
+    """The site of the model whose pose objectives of your own compare with the recordings' ``real_ee_pose``."""
+
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
 
@@ -112,14 +122,28 @@ class PaceCfg:
     notes: tuple[str, ...] = ()
     """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
 
-    def __post_init__(self) -> None:
-        """Check the shape and order of the bounds."""
+    @property
+    def recording(self) -> Path:
+        """Where the recording of ``data_dir`` is, or is to be written."""
+        path = Path(self.data_dir)
+        beside = path.is_absolute() or path.exists() or path.parts[:1] in ((), ("data",))
+        return path if beside else "data" / path
+
+    def prepare(self) -> None:
+        """Check names and bounds; everything that uses the configuration calls this first.
+
+        Raises:
+            ValueError: If bounds, their number or a name are unusable.
+        """
+        self.joint_order = tuple(self.joint_order)
         expected = (4 * len(self.joint_order) + 1, 2)
         self.bounds_params = torch.as_tensor(self.bounds_params, dtype=torch.float64)
         if tuple(self.bounds_params.shape) != expected:
             raise ValueError(
                 f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
-                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay."
+                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay. Declare a parameter "
+                "of your own in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
+                "apply=function(env, values)),)."
             )
         if unknown := sorted(set(self.start_params) - {*PARAMETER_GROUPS, "delay"}):
             raise ValueError(

@@ -65,11 +65,25 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
     """Only the time."""
 
     def __post_init__(self) -> None:
-        """Use the identification's joint order everywhere."""
-        robot = dataclasses.replace(self.scene.robot, joint_order=tuple(self.sim2real.joint_order))
-        self.scene = dataclasses.replace(self.scene, robot=robot)
-        if self.sim2real.effects or self.sim2real.separate_dynamic_friction:
-            self.set_effects(self.sim2real.effects)
+        """Nothing; a subclass may set its fields here, with or without ``super()``."""
+
+    def prepare(self) -> None:
+        """Check the identification's settings; use its joint order, delay and effects everywhere."""
+        super().prepare()
+        pace = self.sim2real
+        pace.prepare()
+        robot = self.scene.robot
+        if robot.joint_order != pace.joint_order or not robot.fix_base:
+            robot = dataclasses.replace(robot, joint_order=pace.joint_order, fix_base=True)
+            self.scene = dataclasses.replace(self.scene, robot=robot)
+        for drive in robot.actuators.values():
+            if drive.max_delay is None:  # in the drive's own control steps
+                longest = float(pace.bounds_params[-1, 1]) * self.decimation / drive.control_decimation
+                drive.max_delay = max(longest, drive.largest_delay)
+            drive.delay = drive.delay or 0.0  # identification sets the delay; max_delay alone would be one
+        has_effects = all(drive.effects for drive in robot.actuators.values())
+        if (pace.effects or pace.separate_dynamic_friction) and not has_effects:
+            self.set_effects(pace.effects)
 
     def set_effects(self, effects: Sequence[EffectCfg | str]) -> None:
         """Give the drives effects whose parameters are identified; before a finer physics step is set.

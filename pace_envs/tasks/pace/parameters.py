@@ -95,6 +95,7 @@ class Parameter:
 
 def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     """Armature, viscous friction, Coulomb friction and encoder bias of every joint, and the delay."""
+    cfg.prepare()
     n, joints = len(cfg.joint_order), tuple(cfg.joint_order)
     apply = {
         "armature": _apply_armature,

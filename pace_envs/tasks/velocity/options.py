@@ -10,17 +10,6 @@ from pace_envs.managers import EventTermCfg, SceneEntityCfg
 from pace_envs.tasks.velocity.velocity_env_cfg import COMMAND, VelocityEnvCfg
 
 
-def use_rewards(cfg: VelocityEnvCfg, name: str) -> None:
-    """Reward by another set.
-
-    Raises:
-        ValueError: If there is no such set.
-    """
-    if name not in cfg.reward_sets:
-        raise ValueError(f"There is no reward set {name!r}. Available: {', '.join(cfg.reward_sets) or 'none'}.")
-    cfg.rewards = cfg.reward_sets[name]
-
-
 def set_drives(cfg: VelocityEnvCfg, drives: Mapping[str, PaceDCMotorCfg]) -> None:
     """Put other drives into the robot, such as identified ones."""
     cfg.scene.robot.actuators = dict(drives)
@@ -63,13 +52,6 @@ def add_randomization(
             params={"velocity_range": {"x": push, "y": push}},
         ),
     }
-
-
-def play_cfg(cfg: VelocityEnvCfg) -> None:
-    """Judge instead of training: no noise, no curriculum, commands from the whole ranges."""
-    for group in cfg.observations.values():
-        group.enable_corruption = False
-    cfg.curriculum = {}
 
 
 def fix_command(cfg: VelocityEnvCfg, command: tuple[float, float, float]) -> None:

@@ -2,46 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pace_actuators import JointValue
 from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensorCfg
-from pace_envs.manager_based_rl_env import ManagerBasedRLEnvCfg
 from pace_envs.managers import (
     CurriculumTermCfg,
     EventTermCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
-    RewardTermCfg,
     TerminationTermCfg,
     UniformNoiseCfg,
 )
-from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
 from pace_envs.scene import InteractiveSceneCfg, TerrainCfg
 from pace_envs.simulation import SimulationCfg
+from pace_envs.tasks.training_env_cfg import TrainingEnvCfg
 
 COMMAND = "base_velocity"
 """Name of the velocity command."""
 
 
 @dataclass(kw_only=True)
-class VelocityEnvCfg(ManagerBasedRLEnvCfg):
+class VelocityEnvCfg(TrainingEnvCfg):
     """Configuration of a velocity task."""
-
-    reward_sets: Mapping[str, Mapping[str, RewardTermCfg]] = field(default_factory=dict)
-    """Sets of reward terms by name; ``rewards`` is the one in use."""
 
     copper_loss: JointValue = 0.0
     """Winding losses over squared torque, R / (r² k²) of each drive [W/(N m)²]: for the cost of transport."""
 
     base_body: str = "base"
     """Name of the body whose mass is randomised."""
-
-    runner: RslRlOnPolicyRunnerCfg = field(default_factory=RslRlOnPolicyRunnerCfg)
-    """How rsl-rl trains it."""
 
 
 def velocity_env_cfg(
