@@ -10,6 +10,7 @@ from pace_optim.terminal.options import (
     add_control_option,
     add_device_option,
     add_log_options,
+    add_rate_option,
     number,
     take_common_options,
 )
@@ -33,6 +34,7 @@ def main() -> None:
         "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
     )
     add_log_options(parser)
+    add_rate_option(parser)
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",
@@ -101,7 +103,7 @@ def main() -> None:
         print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while, and so do the imports
     import torch
 
-    from pace_optim.fit import fit, help_fit, resume
+    from pace_optim.fit import fit_with_torques, help_fit, resume
     from pace_optim.problem.processes import join
     from pace_optim.run.settings import FitSettings
     from pace_optim.run.summary import summary
@@ -121,7 +123,7 @@ def main() -> None:
     else:
         if args["task"] is None:
             raise ValueError(missing_task())
-        result, folder = fit(FitSettings(**args, device=device), processes=processes)
+        result, folder = fit_with_torques(FitSettings(**args, device=device), processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
     if then_diagnose and "interrupted" not in result.stop_reasons:

@@ -33,7 +33,7 @@ from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all, tell_on_stderr
 from pace_optim.problem.stated_limits import contradicted_limits
-from pace_optim.problem.unknown_facts import lift_limits, with_unknown
+from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
@@ -173,6 +173,7 @@ def load_problem(
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
     columns: str | Path | None = None,
+    rate: float | None = None,
     strict: bool = False,
     max_duration: float | None = None,
     tell: Callable[[str], None] = tell_on_stderr,
@@ -192,6 +193,7 @@ def load_problem(
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
+        rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
         max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
             as a fit can afford.
@@ -225,13 +227,19 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings = read_all(data or [cfg.sim2real.recording], env, control_dt, columns=columns, strict=strict, tell=tell)
-    held_out = read_all(validation, env, control_dt, columns=columns, strict=strict, tell=tell)
+    recordings, held_out = (
+        read_all(paths, env, control_dt, columns=columns, rate=rate, strict=strict, tell=tell)
+        for paths in (data or [cfg.sim2real.recording], validation)
+    )
     recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
     told, bounds = lift_limits(plain, measured.recordings, unknown)
-    plain.sim2real.effect_bounds = {**plain.sim2real.effect_bounds, **bounds}
+    plain.sim2real.effect_bounds = {
+        **plain.sim2real.effect_bounds,
+        **bounds,
+        **measured.gain_bounds(unknown, GAINS),
+    }
     _narrow_delay(plain, measured)
     recordings, held_out = told[:count], told[count:]
     if unknown:
@@ -271,7 +279,7 @@ def _read_torques(
     """What the recordings' torques say of the drives, and what nobody knows even so.
 
     A fact is read if every recording has it of every joint; else it is identified, and all recordings keep what they
-    state.
+    state. Gains that are read are refined.
     """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     low, high = sim2real.bounds_params[-1].tolist()
@@ -284,13 +292,14 @@ def _read_torques(
             delay_mode=next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode,
             control_dt=control_dt,
             unknown=facts,
+            assumed=sim2real.assumed_gains,
             slides=sim2real.slide_joints,
         )
 
     measured = read(unknown)
     known = [fact for fact in unknown if len(measured.taken.get(fact, ())) == len(sim2real.joint_order)]
-    left = tuple(fact for fact in unknown if fact not in known)
-    return (read(known) if left and measured.laws else measured), left
+    measured = read(known) if len(known) < len(unknown) and measured.laws else measured
+    return measured, tuple(fact for fact in unknown if fact not in known or fact in GAINS)
 
 
 def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:
