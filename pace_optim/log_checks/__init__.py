@@ -1,0 +1,1 @@
+"""What is wrong with a log, named before anything is searched."""
