@@ -29,6 +29,8 @@ _SMOOTHING = 0.01
 """Standard deviation of the smoothing [s]; of slow recordings 1.5 samples."""
 _ROWS = 1500
 """Instants at which a recording is looked at, at most."""
+_FEW_ROWS = 200
+"""The same of a coarse look."""
 _FEWEST = 60
 """Instants without which a joint is not judged."""
 _MOVING = 0.1
@@ -37,6 +39,7 @@ _FACTOR = 4.0
 """By which stated gains or the model's masses may be wrong; assumed gains by its square and more."""
 _ASSUMED_FACTOR = 50.0
 _DELAYS = 6
+_FEW_DELAYS = 3
 """Delays that are tried; between them the torque is taken to be linear."""
 
 
@@ -80,8 +83,8 @@ class View:
     """(3,) [m/s²]."""
     ranges: np.ndarray
     """The joints' ranges in the model, (n, 2) [rad]."""
-    rows: int = _ROWS
-    """Instants that are looked at, at most."""
+    coarse: bool = False
+    """Whether few instants and delays are looked at."""
     _given: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -185,7 +188,7 @@ class Links:
         direction = view.smooth(np.sign(speed))
         edge = int(np.ceil(4 * view.width))
         first = edge + int(np.ceil(view.most_delay * view.control_dt / view.dt))
-        every = max(1, int(view.width), (len(position) - first - edge) // view.rows)
+        every = max(1, int(view.width), (len(position) - first - edge) // (_FEW_ROWS if view.coarse else _ROWS))
         rows = np.arange(first, len(position) - edge, every)
         model = copy.copy(view.model)
         model.opt.gravity[:] = view.gravity
@@ -233,7 +236,7 @@ def _balance(view: View, links: Links, j: int, moving: np.ndarray, further: np.n
         columns += list(further[moving, j].T)
     factor = _ASSUMED_FACTOR if view.assumed[j] else _FACTOR
     bias = view.stiffness[j] * view.most_bias[j]
-    delays = np.unique(np.linspace(0, view.most_delay, _DELAYS).round().astype(int))
+    delays = np.unique(np.linspace(0, view.most_delay, _FEW_DELAYS if view.coarse else _DELAYS).round().astype(int))
     between = 0.5 * max(np.diff(delays), default=1) * view.control_dt
     lower = np.array([1 / factor, 0.0, -view.damping[j], 0.0, -bias, -between])
     upper = np.array([factor, np.inf, np.inf, np.inf, bias, between])

@@ -26,10 +26,12 @@ _BETTER = 0.4
 """A change must leave at most so much of the misfit of every joint that it changes."""
 _EXPLAINED = 0.12
 """Misfit of a joint that is explained."""
-_COARSE = 200
-"""Instants that are looked at while a number is sought."""
 _WORTH = 0.6
-"""Of a misfit at these few instants: a change that leaves more is not looked at further."""
+"""Of a misfit in a coarse look: a change that leaves more is not looked at further."""
+_TWICE = 1.8
+"""Smallest factor between units, or of a gear, that is named."""
+_LEAST_TRAVEL, _MOST_TRAVEL = 0.15, 7.0
+"""Of a joint in a recording that is fitted [rad]."""
 _SCALES = np.geomspace(1 / 200, 200, 27)
 _DIRECTIONS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 _SHARE = 0.02
@@ -96,11 +98,11 @@ class Evidence:
     def is_same_motion(self, view: View) -> bool:
         """Whether another log has the same positions, so that the links move alike."""
         own = self.view
-        return all(getattr(view, name) is getattr(own, name) for name in ("position", "gravity", "used", "rows"))
+        return all(getattr(view, name) is getattr(own, name) for name in ("position", "gravity", "used", "coarse"))
 
     def coarse(self) -> Evidence:
         """The same at few instants."""
-        return Evidence.of(replace(self.view, rows=_COARSE))
+        return Evidence.of(replace(self.view, coarse=True))
 
     @property
     def doubted(self) -> list[int]:
@@ -189,21 +191,24 @@ def swapped(evidence: Evidence) -> Iterator[Change]:
 
 def scaled(evidence: Evidence) -> Iterator[Change]:
     """Series are in another unit, or on the motor's side of a gear."""
+    view = evidence.view
     for joints in _groups(evidence):
         if max(evidence.balance[j].misfit for j in joints if j in evidence.balance) < _LARGE:
             continue
-        for measured, commanded, what in (
-            (True, True, "positions and targets"), (True, False, "the positions (dof_pos)"),
-            (False, True, "the targets (des_dof_pos)"),
-        ):  # fmt: skip
+        measured, commanded = (float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target))
+        for scales, positions, targets, what in (
+            (_both_scales(min(measured, commanded)), True, True, "positions and targets"),
+            (_scales_about(measured, commanded), True, False, "the positions (dof_pos)"),
+            (_scales_about(commanded, measured), False, True, "the targets (des_dof_pos)"),
+        ):
+            if not len(scales):
+                continue
 
-            def changed(factor: float, joints=joints, measured=measured, commanded=commanded) -> View:
-                return _scaled(
-                    evidence.view, joints, 1 / factor if measured else None, 1 / factor if commanded else None
-                )
+            def changed(factor: float, joints=joints, positions=positions, targets=targets) -> View:
+                return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
 
-            factor = _known(_least(evidence, changed, _SCALES, joints))
-            if not 0.7 < factor < 1.4:
+            factor = _known(_least(evidence, changed, scales, joints))
+            if abs(np.log(factor)) > np.log(_TWICE):
                 yield Change(
                     joints=tuple(joints),
                     view=changed(factor),
@@ -211,11 +216,23 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
                 )
 
 
+def _both_scales(travel: float) -> np.ndarray:
+    """Factors that leave a joint's travel one that is usual."""
+    return _SCALES[(travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)]
+
+
+def _scales_about(one: float, other: float) -> np.ndarray:
+    """Factors about that between the travels of one series and another, where they differ."""
+    if min(one, other) <= 0 or abs(np.log(one / other)) < np.log(_TWICE):
+        return np.zeros(0)
+    return one / other * np.geomspace(0.3, 3.0, 7)
+
+
 _UNITS = (
     (180 / np.pi, "degrees"), (np.pi / 180, "radians that were taken for degrees"), (1 / (2 * np.pi), "turns"),
     (1000.0, "thousandths"), (0.001, "thousands"),
 )  # fmt: skip
-_NEAR = 0.03
+_NEAR = 0.05
 """Relative distance within which a factor is that of a unit, or a gear's whole ratio."""
 
 
@@ -373,16 +390,16 @@ def _least(evidence: Evidence, changed: Callable[[float], View], values: Sequenc
 
     coarse = evidence.coarse()
 
-    def misfit(value: float) -> float:
-        found = Evidence.of(replace(changed(float(np.exp(value))), rows=_COARSE), coarse, joints).balance
-        return float(sum(np.log(found[j].misfit) for j in joints if j in found))
+    def misfit(value: float, reference: Evidence) -> float:
+        view = replace(changed(float(np.exp(value))), coarse=reference.view.coarse)
+        links = reference.links if reference.is_same_motion(view) else Links.of(view)
+        return float(sum(np.log(each.misfit) for each in balances(view, links, joints).values()))
 
     values = np.log(sorted(values))
-    found = [misfit(value) for value in values]
-    best = int(np.argmin(found))
-    low, high = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
-    fine = minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 2e-3, "maxiter": 15})
-    return float(np.exp(fine.x if fine.fun < found[best] else values[best]))
+    best = int(np.argmin([misfit(value, coarse) for value in values]))
+    bounds = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
+    fine = minimize_scalar(misfit, bounds=bounds, args=(evidence,), method="bounded", options={"maxiter": 12})
+    return float(np.exp(fine.x))
 
 
 def standstill(view: View) -> Iterator[Change]:
@@ -541,7 +558,7 @@ def _best_change(evidence: Evidence) -> tuple[Check, Change, Evidence] | None:
 
 def _may_explain(coarse: Evidence, change: Change) -> bool:
     """Whether a change helps its own joints at the few instants that are looked at first."""
-    view = replace(change.view, rows=_COARSE)
+    view = replace(change.view, coarse=True)
     links = coarse.links if coarse.is_same_motion(view) else Links.of(view)
     found = balances(view, links, change.joints)
     ratio = [each.misfit / coarse.balance[j].misfit for j, each in found.items() if j in coarse.balance]
