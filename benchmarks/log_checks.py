@@ -326,7 +326,7 @@ def run_clean(folders: list[Path]) -> None:
             print(f"{name}: not loaded: {str(error)[:150]}", flush=True)
             continue
         count, alarms = count + 1, alarms + len(found)
-        print(f"{name}: {'; '.join(each.text for each in found) or 'nothing'}", flush=True)
+        print(f"{name}: {'; '.join(each.sentence for each in found) or 'nothing'}", flush=True)
     print(f"{alarms} alarms on {count} recordings")
 
 

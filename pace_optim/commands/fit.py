@@ -33,6 +33,9 @@ def main() -> None:
         "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
     )
     add_log_options(parser)
+    parser.add_argument(
+        "--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning"
+    )
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",

@@ -16,6 +16,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from pace_optim.log_checks.balance import Balance, Links, View, balances, views_of, without
 from pace_optim.problem.problem import Problem
+from pace_optim.problem.recordings import tell_on_stderr
 from pace_optim.recording.keys import listed
 
 _DOUBTED = 0.04
@@ -44,6 +45,8 @@ _FROZEN = 0.1
 """Shortest standstill that is looked at [s]."""
 _ABRUPT = 3.0
 """Of the largest change of a step elsewhere: one at an end of a standstill that was none."""
+_NUMERICAL = 1e-9
+"""Steps that are rounding [rad]."""
 _SPIKE = 3.0
 """Of the steps that are larger than most: the two steps of a spike."""
 _TILT = 15.0
@@ -67,15 +70,25 @@ class Finding:
     """What a check says of a recording."""
 
     check: str
-    recording: str
+    recordings: tuple[str, ...]
+    """In which it is found."""
     joints: tuple[str, ...]
-    before: float
-    """Largest misfit of these joints as logged."""
+    before: float | None
+    """Largest misfit of these joints as logged; ``None``: it is seen in the log by itself."""
     after: float
     """With the change."""
     text: str
     stops: bool
     """Whether no fit of the log can be right."""
+
+    @property
+    def sentence(self) -> str:
+        """For a user."""
+        sure = "" if self.before is None else (
+            f" (So changed, the drives' torques fit the motion to {100 * self.after:.2g} %; as logged, to "
+            f"{100 * self.before:.2g} %.)"
+        )
+        return f"{listed(self.recordings)}: {self.text}{sure}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -431,8 +444,13 @@ def frozen_encoder(view: View) -> Iterator[Change]:
         ends = [k for run in runs for k in run]
         outside = np.ones(len(jerk), dtype=bool)
         outside[[k for end in ends for k in (end - 1, end, end + 1) if k < len(jerk)]] = False
-        usual = float(jerk[outside].max(initial=0.0))
-        frozen = [(a, b) for a, b in runs if usual > 0 and max(jerk[a], jerk[b]) > _ABRUPT * usual]
+        count = float(np.abs(step)[np.abs(step) > _NUMERICAL].min(initial=np.inf))  # of an encoder, at least
+        usual = max(float(jerk[outside].max(initial=0.0)), count)
+        frozen = [
+            (a, b)
+            for a, b in runs
+            if max(jerk[a], jerk[b]) > _ABRUPT * usual and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
+        ]
         if not frozen:
             continue
         where = np.zeros(len(view.position), dtype=bool)
@@ -530,12 +548,11 @@ def explained(view: View) -> list[Finding]:
     return findings
 
 
-def _finding(check: Check, change: Change, before: float = 1.0, after: float = 0.0) -> Finding:
-    names = tuple(change.view.joints[j] for j in change.joints)
-    text = f"{change.view.name}: {change.text.format(joints=listed(names, 6))}"
+def _finding(check: Check, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
+    names = tuple(change.view.joints[j] for j in sorted(change.joints))
     return Finding(
-        check=check.name, recording=change.view.name, joints=names, before=before, after=after, text=text,
-        stops=check.stops,
+        check=check.name, recordings=(change.view.name,), joints=names, before=before, after=after,
+        text=change.text.format(joints=listed(names, 6)), stops=check.stops,
     )  # fmt: skip
 
 
@@ -576,5 +593,28 @@ def _gain(before: Evidence, after: Evidence, change: Change) -> float:
 
 
 def check_log(problem: Problem) -> list[Finding]:
-    """Look at the recordings of a problem."""
-    return [finding for view in views_of(problem) for finding in explained(view)]
+    """What is wrong with the recordings of a problem; the same of several is said once."""
+    merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
+    for view in views_of(problem):
+        for finding in explained(view):
+            merged.setdefault((finding.check, finding.joints), []).append(finding)
+    return [replace(each[0], recordings=tuple(f.recordings[0] for f in each)) for each in merged.values()]
+
+
+def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] = tell_on_stderr) -> Problem:
+    """The problem with what is wrong with its log among its contradictions.
+
+    Args:
+        problem: What is to be fitted.
+        trust: Whether a log that no fit can be right of is only warned of.
+        tell: Is told the warnings.
+
+    Raises:
+        ValueError: If no fit of the log can be right.
+    """
+    found = check_log(problem)
+    if (wrong := [each.sentence for each in found if each.stops]) and not trust:
+        raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
+    for each in found:
+        tell(f"warning: {each.sentence}")
+    return replace(problem, contradictions=(*problem.contradictions, *(each.sentence for each in found)))
