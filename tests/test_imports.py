@@ -28,6 +28,7 @@ FLOORS = {
         ["run", "experiment_design", "single_joint_fits"],
         ["report", "data_collection"],
         ["comparison"],
+        ["log_checks"],
         ["identification"],
         ["fit"],
         ["diagnosis"],

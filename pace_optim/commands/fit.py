@@ -35,6 +35,9 @@ def main() -> None:
     )
     add_log_options(parser)
     add_rate_option(parser)
+    parser.add_argument(
+        "--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning"
+    )
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",

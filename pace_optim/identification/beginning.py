@@ -8,6 +8,7 @@ from typing import Any
 
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
 from pace_envs.model_file.read import is_model_file
+from pace_optim.log_checks import checked
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.convergence import stop_rule
 from pace_optim.optimizers.own_objective import Objective, build, optimizer_class
@@ -15,6 +16,7 @@ from pace_optim.optimizers.way_down import WayDownCfg
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.processes import Processes
+from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.problem.try_out import check_size, try_out
 from pace_optim.run.open import problem_of
 from pace_optim.run.settings import FitSettings
@@ -53,7 +55,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Pro
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
-    problem = problem_of(settings, env_cfg, told)
+    problem = checked(problem_of(settings, env_cfg, told), settings.trust_log, tell_nobody if told else tell_on_stderr)
     cmaes = problem.env_cfg.sim2real.cmaes
     chosen = {
         name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None

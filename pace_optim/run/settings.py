@@ -91,6 +91,9 @@ class FitSettings:
     strict: bool = False
     """Whether one recording that cannot be used refuses all, instead of being set aside."""
 
+    trust_log: bool = False
+    """Whether a log that its checks say is faulty is fitted as it is, with a warning."""
+
     max_duration: float | None = None
     """How much of each recording is fitted at most, where it moves the joints most [s]; ``None``: as much as can be."""
 
