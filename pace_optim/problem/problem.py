@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -129,9 +130,9 @@ class Problem:
         """The same with another step of the drives' own loops, and a physics step that is no longer [s]."""
         plain = copy.deepcopy(self.plain_cfg)
         for drive in plain.scene.robot.actuators.values():
-            drive.drive_dt = drive_dt
-        set_physics_dt(plain, min(plain.sim.dt, drive_dt), "drive_dt")
-        physics_dt = min(self.physics_dt, drive_dt)
+            drive.drive_dt, drive.implicit = drive_dt, False
+        set_drive_rate(plain)
+        physics_dt = plain.sim.dt / max(1, math.ceil(plain.sim.dt / self.physics_dt * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, physics_dt, self.env_cfg.sim2real.effects))
 
     @property
