@@ -33,11 +33,10 @@ def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
         )
     if not cfg.drive_dt > physics_dt * (1 - 1e-6):
         raise ValueError(
-            f"drive_dt is {cfg.drive_dt:g} s and the physics step {physics_dt:g} s: expected at least a physics step in "
-            f"drive_dt. Make the physics step finer (--physics_dt {cfg.drive_dt:g} where a command has it, else "
+            f"drive_dt is {cfg.drive_dt:g} s and the physics step {physics_dt:g} s: expected at least a physics step "
+            f"in drive_dt. Make the physics step finer (--physics_dt {cfg.drive_dt:g} where a command has it, else "
             "sim.dt), or change drive_dt."
         )
     calls = round(cfg.drive_dt / physics_dt)
     fits = abs(calls * physics_dt - cfg.drive_dt) < 1e-9 and cfg.control_decimation % calls == 0
     return calls if fits else None
-

@@ -144,7 +144,7 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
 def _finished(run: Optimization, record: EnvironmentRecord, keep_interrupted: bool = True) -> tuple[FitResult, Path]:
     """Search, refine, conclude, write."""
     outcome = run.run(keep_interrupted)
-    result = conclude(run, record, outcome)
+    result = conclude(run, record, outcome, keep_interrupted)
     run.progress.close()
     run.log.log_result(result)
     run.log.close()
