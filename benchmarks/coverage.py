@@ -157,12 +157,21 @@ def main() -> None:
             if std:
                 scores.setdefault(name, []).append((value * scale - truth) / (std * scale))
         told = {name: f"{each[-1]:+.1f}" for name, each in scores.items()}
-        print(kind, seed, told, f"{result.rmse['train']['all'] * 1e3:.3g} mrad", result.loop_rate.get("used_s"), flush=True)
+        print(
+            kind,
+            seed,
+            told,
+            f"{result.rmse['train']['all'] * 1e3:.3g} mrad",
+            result.loop_rate.get("used_s"),
+            flush=True,
+        )
         if args.output:
             args.output.write_text("\n".join(json.dumps(row) for row in rows))
     for name, each in scores.items():
         z = np.array(each)
-        print(f"{name:18s} {np.mean(np.abs(z) < 2):6.1%} of {len(z)} within two error bars; z {z.mean():+.2f} ± {z.std():.2f}")
+        print(
+            f"{name:18s} {np.mean(np.abs(z) < 2):6.1%} of {len(z)} within two error bars; z {z.mean():+.2f} ± {z.std():.2f}"
+        )
     print(f"{time.process_time() - begin:.0f} processor seconds")
 
 

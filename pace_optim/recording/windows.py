@@ -71,6 +71,7 @@ class Windows:
             measured_vel=dataset.measured_vel[at],
             sampled=self.mask(dataset.sampled),
             train=self.mask(dataset.train),
+            settling=None if dataset.settling is None else self.mask(dataset.settling),
             torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[at],
             sample_offset=None if dataset.sample_offset is None else dataset.sample_offset[at],
             validation_only=tuple(dataset.validation_only[r] for r in recording),
