@@ -1,10 +1,10 @@
-"""Do two error bars hold the truth in 95 % of small fits? A pendulum of plain MuJoCo, its drive at 1 kHz, a log at 200 Hz.
+"""Do two error bars hold the truth in 95 % of small fits? A pendulum of plain MuJoCo, a 1 kHz drive, a 200 Hz log.
 
 python benchmarks/coverage.py --fits 200
 python benchmarks/coverage.py --fits 30 --noise quantised --drive_dt 0.001   # the loop's rate is stated
 
-Each fit draws a drive, a motion and the noise anew, and is made by the command line's own function. A value counts where
-the result has an error bar for it.
+Each fit draws a drive, a motion and the noise anew, and is made by the command line's own function. A value counts
+where the result has an error bar for it.
 """
 
 from __future__ import annotations
@@ -169,9 +169,8 @@ def main() -> None:
             args.output.write_text("\n".join(json.dumps(row) for row in rows))
     for name, each in scores.items():
         z = np.array(each)
-        print(
-            f"{name:18s} {np.mean(np.abs(z) < 2):6.1%} of {len(z)} within two error bars; z {z.mean():+.2f} ± {z.std():.2f}"
-        )
+        inside = np.mean(np.abs(z) < 2)
+        print(f"{name:18s} {inside:6.1%} of {len(z)} within two error bars; z {z.mean():+.2f} ± {z.std():.2f}")
     print(f"{time.process_time() - begin:.0f} processor seconds")
 
 
