@@ -20,6 +20,9 @@ from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
 
+_ROUNDING = 1e-3
+"""Of a period: by so much a run may come early, as sums of steps are rounded."""
+
 
 @dataclasses.dataclass
 class ControllerRun:
@@ -126,7 +129,12 @@ class Drive:
         delay, max_delay = delay_in_steps(cfg, dt)
         for note in step_notes(cfg, dt):
             warnings.warn(note, stacklevel=2)
-        self._calls_per_run = calls = calls_per_run(cfg, dt)
+        calls = calls_per_run(cfg, dt)
+        self._own_dt = cfg.drive_dt if calls is None else None
+        self._calls_per_run = calls = calls or 1
+        if self._own_dt is not None:
+            self._since_run = torch.full_like(self.stiffness, self._own_dt)
+            self._held_pos, self._held_vel = torch.zeros_like(self.stiffness), torch.zeros_like(self.stiffness)
         self._delays = DriveDelays(
             delayed,
             max_delay,
@@ -164,12 +172,24 @@ class Drive:
     @property
     def run_dt(self) -> float:
         """Time between two runs of the controller [s]; infinite where the physics step is not known."""
+        if self._own_dt is not None:
+            return self._own_dt
         return math.inf if self._physics_dt is None else self._calls_per_run * self._physics_dt
 
     @property
     def time_lags(self) -> torch.Tensor:
         """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
         return self._delays.time_lags
+
+    def _held_between_runs(
+        self, position: torch.Tensor, speed: torch.Tensor, period: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What a controller with a clock of its own saw when it last ran; it runs as soon as its period [s] is over."""
+        runs = self._since_run >= (1 - _ROUNDING) * period
+        self._since_run = torch.where(runs, self._since_run - period, self._since_run) + (self._physics_dt or 0.0)
+        self._held_pos = torch.where(runs, position, self._held_pos)
+        self._held_vel = torch.where(runs, speed, self._held_vel)
+        return self._held_pos, self._held_vel
 
     def update_effects(self) -> None:
         """Take over changed parameters of the base model and of the effects."""
@@ -182,6 +202,8 @@ class Drive:
         The controller of a drive that is reset runs at the next call, also where the others hold their torque.
         """
         self._delays.reset(env_ids)
+        if self._own_dt is not None:
+            self._since_run[slice(None) if env_ids is None else env_ids] = self._own_dt
         if env_ids is None:
             self._calls_until_control = 0
             self._first_call = True

@@ -145,6 +145,8 @@ class PaceDCMotor(DriveWithEffects):
         if self.effects is not None:
             encoder_vel, stiffness, damping = self.effects.seen_by_controller(joint_vel, stiffness, damping)
         encoder_pos = self.sensed_position(joint_pos) - self.encoder_bias
+        if self._own_dt is not None:
+            encoder_pos, encoder_vel = self._held_between_runs(encoder_pos, encoder_vel, self._own_dt)
         if self.cfg.implicit:
             encoder_pos = self._within_the_step(encoder_pos, encoder_vel, stiffness, damping)
         if position is None:  # no position target: velocity and effort control

@@ -99,8 +99,9 @@ class PaceDCMotorCfg(Config):
     torque unless ``drive_dt`` or ``implicit`` says otherwise."""
 
     drive_dt: float | None = None
-    """Time between two runs of the drive's own controller [s], a whole fraction of the control step: commands come
-    once per control step and are held. ``None`` runs it once per control step."""
+    """Time between two runs of the drive's own controller [s], at least a physics step: commands come once per control
+    step and are held. Where it does not divide the control step, the controller runs on a clock of its own. ``None``
+    runs it once per control step."""
 
     implicit: bool = False
     """Whether the controller runs continuously, as that of a position actuator in a model file: at every physics step,

@@ -193,7 +193,10 @@ def _reopened(path: Path, settings: FitSettings, task: str | None) -> Run:
 def _finished(run: Optimization, record: EnvironmentRecord, keep_interrupted: bool = True) -> tuple[FitResult, Path]:
     """Search, refine, conclude, write."""
     outcome = run.run(keep_interrupted)
-    result = (conclude_own if run.settings.has_own_objective else conclude)(run, record, outcome)
+    if run.settings.has_own_objective:
+        result = conclude_own(run, record, outcome)
+    else:
+        result = conclude(run, record, outcome, keep_interrupted)
     run.progress.close()
     run.log.log_result(result)
     run.log.close()

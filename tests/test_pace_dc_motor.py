@@ -410,11 +410,23 @@ def test_a_controller_with_a_rate_of_its_own_reads_the_encoder_at_that_rate():
 
 
 @pytest.mark.parametrize(
+    ("period", "seen"),
+    [(0.003, [0, 0, 0, 3, 3, 3, 6]), (0.0015, [0, 0, 2, 3, 3, 5, 6]), (0.006, [0, 0, 0, 0, 0, 0, 6])],
+)
+def test_a_controller_whose_period_does_not_divide_the_control_step_runs_on_its_own_clock(period, seen):
+    motor = one_joint(control_decimation=4, physics_dt=0.001, drive_dt=period)
+    for _ in range(2):
+        given = [torque(motor, 0.0, pos=0.1 * k)[0, 0].item() for k in range(7)]
+        assert given == pytest.approx([-float(k) for k in seen])
+        motor.reset()
+    assert motor.run_dt == period
+
+
+@pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"drive_dt": 0.0015}, "drive_dt is 0.0015 s and the physics step 0.001 s"),
-        ({"drive_dt": 0.0005}, "Make the physics step finer"),
-        ({"drive_dt": 0.003}, "expected a whole number of runs of the controller in a control step"),
+        ({"drive_dt": 0.0005}, "drive_dt is 0.0005 s and the physics step 0.001 s: .* Make the physics step finer"),
+        ({"drive_dt": 0.0}, "expected at least a physics step in drive_dt"),
         ({"drive_dt": 0.002, "physics_dt": None}, "set physics_dt"),
         ({"drive_dt": 0.002, "implicit": True}, "Leave out one of the two"),
         ({"implicit": True, "delay_mode": "effort"}, "it acts at once"),

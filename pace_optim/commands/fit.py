@@ -129,7 +129,7 @@ def main() -> None:
         result, folder = fit_with_torques(FitSettings(**args, device=device), processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
-    if then_diagnose and "interrupted" not in result.stop_reasons:
+    if then_diagnose and not any("interrupted" in reason for reason in result.stop_reasons):
         from pace_optim.commands.diagnose import run_and_tell
         from pace_optim.diagnosis import DiagnosisSettings
 

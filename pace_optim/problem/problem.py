@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -127,25 +128,39 @@ class Problem:
         return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
 
     def with_drive_dt(self, drive_dt: float) -> Problem:
-        """The same with another step of the drives' own loops, and a physics step that is no longer [s]."""
+        """The same with another step of the drives' own loops, and a physics step that fits it [s]."""
         plain = copy.deepcopy(self.plain_cfg)
         for drive in plain.scene.robot.actuators.values():
-            drive.drive_dt = drive_dt
-        set_physics_dt(plain, min(plain.sim.dt, drive_dt), "drive_dt")
-        physics_dt = min(self.physics_dt, drive_dt)
+            drive.drive_dt, drive.implicit = drive_dt, False
+        set_drive_rate(plain)
+        physics_dt = plain.sim.dt / max(1, math.ceil(plain.sim.dt / self.physics_dt * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, physics_dt, self.env_cfg.sim2real.effects))
+
+    def with_loop(self, drive_dt: float, physics_dt: float) -> Problem:
+        """The same with another step of the drives' own loops, and a physics step that is no longer than given [s]."""
+        other = self.with_drive_dt(drive_dt)
+        longest = other.plain_cfg.sim.dt
+        return other.with_physics_dt(longest / max(1, math.ceil(longest / physics_dt * (1 - 1e-9))))
+
+    @property
+    def loop_dt(self) -> float:
+        """Shortest time between two runs of the drives' loops [s]."""
+        drives = self.plain_cfg.scene.robot.actuators.values()
+        return min(self.control_dt if drive.drive_dt is None else drive.drive_dt for drive in drives)
 
     @property
     def assumes_loop_rate(self) -> bool:
         """Whether drives hold their torque over a control step that nobody has stated as their loops'.
 
-        So are servos of a model file with gains, for which MuJoCo knows no loop but its own step, where ``drive_dt`` is
-        not told.
+        A model file states gains at most. What a log states of its drive (gains, limits) says nothing of the rate, and
+        only ``drive_dt`` does; where even the gains are assumed, a rate is no more than they are.
         """
         drives = self.plain_cfg.scene.robot.actuators.values()
         stated = any(drive.implicit or drive.drive_dt is not None for drive in drives)
-        of_file = is_model_file(self.task) and not self.plain_cfg.sim2real.assumed_gains
-        return of_file and not stated and all(r.drive.stiffness is None for r in self.dataset.recordings)
+        gains = not self.plain_cfg.sim2real.assumed_gains or any(
+            r.drive.stiffness is not None for r in self.dataset.recordings
+        )
+        return is_model_file(self.task) and not stated and (gains or "stiffness" in self.unknown)
 
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""

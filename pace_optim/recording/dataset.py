@@ -9,8 +9,14 @@ import numpy as np
 import torch
 
 from pace_optim.recording import Recording, validation_start, with_columns
+from pace_optim.recording.keys import listed
 from pace_optim.recording.sessions import session_starts
-from pace_optim.recording.start_speed import start_speed
+from pace_optim.recording.start import start_speed
+
+_SETTLING = 1.0
+"""Time after which a wrong speed at the beginning has died out [s]."""
+_SHORTEST = 3.0
+"""A recording that is no longer than this many times that keeps its beginning."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,7 +56,10 @@ class Dataset:
     start_time: torch.Tensor
     """When its first sample was taken, since the recording began, (R,) [s]; not zero of a window."""
     start_vel: torch.Tensor
-    """Speed at the first sample, (R, n) [rad/s]: measured, or the slope of positions where it stands out of noise."""
+    """Speed at the first sample, (R, n) [rad/s]: as recorded, else the slope where it stands out of the noise."""
+    settling: torch.Tensor | None = None
+    """Samples that are neither trained on nor validated on, (T, R) bool: a recording begins in motion, and its speed
+    is not known; ``None`` where there are none."""
 
     @property
     def num_recordings(self) -> int:
@@ -60,7 +69,7 @@ class Dataset:
     @property
     def validation(self) -> torch.Tensor:
         """Where there is a sample that is not trained on, (T, R) bool."""
-        return self.sampled & ~self.train
+        return self.sampled & ~self.train if self.settling is None else self.sampled & ~self.train & ~self.settling
 
     def select(self, indices: Sequence[int]) -> Dataset:
         """Some of the recordings, by index."""
@@ -81,6 +90,7 @@ class Dataset:
             session_start=self.session_start[chosen],
             start_time=self.start_time[chosen],
             start_vel=self.start_vel[chosen],
+            settling=None if self.settling is None else self.settling[:, chosen],
         )
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Dataset:
@@ -155,6 +165,8 @@ def make_dataset(
     measured, measured_vel = torch.zeros_like(command), torch.zeros_like(command)
     sampled, train = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
     enable, offset = torch.ones(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.float64)
+    start_vel, settling = torch.zeros(len(every), n, dtype=torch.float64), torch.zeros(shape, dtype=torch.bool)
+    noted = []
     for r, recording in enumerate(every):
         _hold(command[:, r], _command(recording))
         at = torch.as_tensor(recording.sample_steps)
@@ -169,22 +181,29 @@ def make_dataset(
             whole = bool(validation) or train_fraction >= 1
             end = recording.num_samples if whole else validation_start(recording, train_fraction)
             train[at[:end], r] = True
+        speed, known = start_speed(recording)
+        start_vel[r] = torch.as_tensor(speed)
+        if not known.all() and recording.duration > _SHORTEST * _SETTLING:
+            settling[at[recording.time - recording.time[0] < _SETTLING], r] = True
+            recording = replace(recording, notes=(*recording.notes, _unknown_start(recording, known)))
+        noted.append(recording)
     return Dataset(
-        recordings=every,
+        recordings=tuple(noted),
         command=command,
         command_vel=_further([r.command_vel for r in every], command),
         command_effort=_further([r.command_effort for r in every], command),
         measured=measured,
         measured_vel=measured_vel,
         sampled=sampled,
-        train=train,
+        train=train & ~settling,
         torque_enable=None if bool(enable.all()) else enable,
         ee_pose=_poses(every, steps),
         sample_offset=offset if bool(offset.any()) else None,
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
         session_start=torch.as_tensor(session_start),
         start_time=torch.zeros(len(every), dtype=torch.float64),
-        start_vel=torch.stack([torch.as_tensor(start_speed(recording)) for recording in every]),
+        start_vel=start_vel,
+        settling=settling if bool(settling.any()) else None,
     )
 
 
@@ -226,6 +245,14 @@ def _speed(recording: Recording) -> np.ndarray:
         difference
         if recording.dof_vel is None
         else np.where(np.isnan(recording.dof_vel), difference, recording.dof_vel)
+    )
+
+
+def _unknown_start(recording: Recording, known: np.ndarray) -> str:
+    joints = listed([name for name, yes in zip(recording.joint_names, known, strict=True) if not yes], 3)
+    return (
+        f"It begins in motion, and its first samples do not tell the speed of {joints}: the first {_SETTLING:g} s are "
+        "left out. Begin at rest, or record speeds (dof_vel)."
     )
 
 

@@ -81,6 +81,7 @@ class Windows:
             measured_vel=dataset.measured_vel[at],
             sampled=self.mask(dataset.sampled),
             train=self.mask(dataset.train),
+            settling=None if dataset.settling is None else self.mask(dataset.settling),
             torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[at],
             ee_pose=None if dataset.ee_pose is None else dataset.ee_pose[at],
             sample_offset=None if dataset.sample_offset is None else dataset.sample_offset[at],

@@ -14,6 +14,7 @@ from pace_actuators.effects import use_recorded_effects
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
+from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 
 
@@ -95,13 +96,21 @@ class Run:
             own = {"data": [str(path) for path in data], "validation": []}
             settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
-            settings = replace(settings, physics_dt=physics_dt or settings.physics_dt)
+            drive_dt = settings.drive_dt or self.told_drive_dt
+            settings = replace(settings, physics_dt=physics_dt or settings.physics_dt, drive_dt=drive_dt)
             problem = problem_of(settings, self.load_cfg(), told=not data)
         except ValueError as error:
             if data or str(self.folder) in str(error):
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
         return problem if effects is None else problem.with_effects(effects)
+
+    @property
+    def told_drive_dt(self) -> float | None:
+        """Period of the drives' loops [s] that its recordings told where nobody stated one; ``None``: as assumed."""
+        path = self.folder / "result.json"
+        rate = FitResult.load(path).loop_rate if path.is_file() else {}
+        return rate["used_s"] if rate and rate["used_s"] != rate["assumed_s"] else None
 
     def load_cfg(self) -> Any:
         """A fresh configuration of its environment."""

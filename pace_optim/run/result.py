@@ -49,8 +49,10 @@ class FitResult(DriveResult):
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
     """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
     assumes_loop_rate: bool = False
-    """Whether that is so of the drives' loops too, as nobody stated their rate: they hold their torque as commands
-    come."""
+    """Whether nobody stated the rate of the drives' loops; what depends on it is in ``step_error`` and ``std``."""
+    loop_rate: dict[str, Any] = field(default_factory=dict)
+    """What the recordings say of that rate: the period that was assumed, the one that is used, those that they allow
+    [s], and the parameters at both ends; empty where it is stated."""
     std_means_nothing: bool = False
     """Whether the fit ended so far above the noise that its error bars say nothing."""
     measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -89,6 +91,10 @@ class FitResult(DriveResult):
     def save(self, path: Path) -> None:
         """Write the file atomically."""
         write_json(path, asdict(self))
+
+    def has_error_bar(self, name: str, key: str) -> bool:
+        """Whether a value would have an error bar if error bars meant anything: it is free, and moves the joints."""
+        return f"{name}/{key}" not in {*self.at_bound, *self.no_influence, *self.undetermined}
 
     def unit_of(self, name: str, key: str) -> str:
         """The unit of a parameter of a joint, or of all joints (``"all"``)."""
@@ -183,6 +189,8 @@ def make_result(
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
     trained = residuals.error[0].square()[train]
+    if facts.get("std_means_nothing"):  # then the file has none
+        uncertainty = uncertainty.without_error_bars()
     values, std = space.to_dict(physical), by_parameter(space, uncertainty.std)
     open_ = facts.get("undetermined", ())
     result = FitResult(
@@ -195,7 +203,6 @@ def make_result(
         parameters=values,
         delay_s=float(physical[space["delay"]]) * problem.control_dt,
         std=std,
-        assumes_loop_rate=problem.assumes_loop_rate,
         step_error={} if uncertainty.step is None else by_parameter(space, uncertainty.step),
         units=space.units,
         at_bound=list(uncertainty.at_bound),

@@ -21,7 +21,7 @@ def summary(result: FitResult) -> list[str]:
             if name == "delay":
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
-    if result.step_error and not result.std_means_nothing:
+    if result.step_error:
         of = f"the physics step of {1e3 * result.physics_dt:g} ms"
         if result.assumes_loop_rate:
             of += " and of a loop whose rate nobody stated"
@@ -60,7 +60,8 @@ def _value(result: FitResult, name: str, key: str) -> str:
     std = result.std[name][key]
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
-    error = "" if std is None else " ± ?" if result.std_means_nothing else f" ± {std:.1g}"
+    means_nothing = result.std_means_nothing and result.has_error_bar(name, key)
+    error = " ± ?" if means_nothing else "" if std is None else f" ± {std:.1g}"
     return f"{result.parameters[name][key]:.5g}{error}{mark}"
 
 

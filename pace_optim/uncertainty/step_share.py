@@ -1,4 +1,4 @@
-"""What a step does to a result, the physics' or the drives': the part of each value that makes up for its error."""
+"""What the physics step does to a result: the part of each value that makes up for its error."""
 
 from __future__ import annotations
 
@@ -29,27 +29,6 @@ def change_without_step(problem: Problem, physical: torch.Tensor, there: Residua
         The change; ``None`` where the finer simulation diverges.
     """
     finer = problem.with_physics_dt(problem.physics_dt / _FINER)
-    return _change(finer, physical, there)
-
-
-def change_without_steps(problem: Problem, physical: torch.Tensor, there: Residuals) -> torch.Tensor | None:
-    """How the motion would change without a physics step and with drives that hold no torque, (K, R, n) [rad].
-
-    Args:
-        problem: What was fitted.
-        physical: The result, (size,).
-        there: Its residuals.
-
-    Returns:
-        The change; ``None`` where the loops' rate is stated, or the finer simulation diverges.
-    """
-    if not problem.assumes_loop_rate:
-        return None
-    dt = problem.control_dt / _FINER
-    return _change(problem.with_drive_dt(dt).with_physics_dt(min(dt, problem.physics_dt / _FINER)), physical, there)
-
-
-def _change(finer: Problem, physical: torch.Tensor, there: Residuals) -> torch.Tensor | None:
     change = _TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
     return change if bool(change.isfinite().all()) else None
 

@@ -55,6 +55,11 @@ class Uncertainty:
     """What of each value comes from the steps of physics and drives, (size,), which ``std`` and ``correlation`` then
     know of."""
 
+    def without_error_bars(self) -> Uncertainty:
+        """The same where error bars mean nothing: there are none."""
+        nothing = np.full_like(self.std, np.nan)
+        return replace(self, std=nothing, correlation=np.full_like(self.correlation, np.nan), step=None)
+
     def with_step(self, share: np.ndarray) -> Uncertainty:
         """The same, knowing what of each value comes from a step, (size,): an error of one size for all."""
         std = np.hypot(self.std, share)

@@ -79,9 +79,8 @@ def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, fl
 def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None) -> list[str]:
     value, std = run.result.parameters[name][key], run.result.std.get(name, {}).get(key)
     label = f"{name}/{key}"
-    std = None if run.result.std_means_nothing else std
     text, error = value_and_error(value, std)
-    if run.result.std_means_nothing:
+    if run.result.std_means_nothing and run.result.has_error_bar(name, key):
         error = "?"
     plot = unit if span is None else _interval(value, std, *span)
     return [bold(title), text, error, plot, _between(run, label, value), _flags(run, label, value)]

@@ -1,0 +1,219 @@
+"""The rate of the drives' loops where nobody stated it: which rates the recordings allow, and what values depend on it.
+
+A loop that holds its torque over a period h sees the motion h / 2 late on average, which is kp h / 2 of viscous
+friction and kd h / 2 of armature. A fit with a wrong rate finds these in its values, at nearly the same error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from pace_optim.optimizers.derivatives import Jacobian
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.uncertainty import SURE, autocovariance, filtered, inverse_of
+
+_RATES = (1e3, 2e3, 4e3, 8e3, 10e3, 20e3, 40e3)
+"""Rates of servo drives' loops [Hz]."""
+_SIMULATED = (1e-3, 5e-4)
+"""Periods that are simulated beside the assumed one [s]; what the others do follows from these, as its powers."""
+_CHORD_STEPS = 4
+"""Gauss–Newton steps with the derivatives of the assumed rate, at most."""
+_NOTHING_LEFT = 1e-5
+"""They end where the next is expected to lower the score by less than this part of it."""
+_APART = 0.02
+"""Part of a period by which a log's must exceed it to be another."""
+_NAMED = 2
+"""Values that a sentence shows."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopRates:
+    """What the recordings say of the loops' period."""
+
+    periods: tuple[float, ...]
+    """Candidates, the longest first [s]."""
+    values: np.ndarray
+    """What a fit finds with each, physical (periods, size)."""
+    weights: np.ndarray
+    """How likely each is, (periods,); their sum is 1."""
+    assumed: float
+    """The period that was fitted with [s]."""
+
+    @property
+    def allowed(self) -> tuple[float, ...]:
+        """Those that the recordings do not refute, the longest first: within two standard deviations of the best."""
+        least = math.exp(-0.5 * SURE**2) * self.weights.max()
+        return tuple(p for p, weight in zip(self.periods, self.weights, strict=True) if weight >= least)
+
+    @property
+    def chosen(self) -> float:
+        """The assumed period where the recordings allow it, else the longest that they do [s]."""
+        return self.assumed if self.assumed in self.allowed else self.allowed[0]
+
+    def value_at(self, period: float) -> np.ndarray:
+        """What a fit finds with a candidate, physical (size,)."""
+        return self.values[self.periods.index(period)]
+
+    @property
+    def shares(self) -> np.ndarray:
+        """How each candidate's values differ from those of the chosen one, as its likelihood counts, (periods, size).
+
+        The sum of their squares is the variance of the values that comes from the rate.
+        """
+        return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
+
+    def to_dict(self, space: ParameterSpace) -> dict[str, Any]:
+        """For ``result.json``: the periods, and the values at both ends of what the recordings allow."""
+        ends = dict.fromkeys((self.chosen, self.allowed[-1]))
+        return {
+            "assumed_s": self.assumed,
+            "used_s": self.chosen,
+            "allowed_s": list(self.allowed),
+            "parameters": {f"{period:g}": space.to_dict(torch.from_numpy(self.value_at(period))) for period in ends},
+        }
+
+    def sentences(self, space: ParameterSpace, known: np.ndarray) -> list[str]:
+        """What is to be told of the rate.
+
+        Args:
+            space: The parameters.
+            known: Which of them have an error bar, (size,) bool.
+        """
+        slow, fast = self.chosen, self.allowed[-1]
+        begin = "Nobody stated how often the drives' loops run (--drive_dt). "
+        if slow != self.assumed:
+            begin += (
+                f"These recordings tell it from {_rate(self.assumed)} (a run each control step), and allow "
+                f"{_rate(slow)} {'and more' if fast < slow else 'alone'}; {_rate(slow)} is used. "
+            )
+        elif len(self.allowed) == 1:
+            return [f"{begin}These recordings allow a run each {1e3 * slow:g} ms alone, as the fit assumed."]
+        if fast == slow:
+            return [begin.strip()]
+        change = self.value_at(fast) - self.value_at(slow)
+        size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(slow)), 1e-12), 0.0)
+        shown = [
+            f"{space.labels[i].split('/')[0].replace('_', ' ')} of {space.labels[i].split('/')[1]} is "
+            f"{self.value_at(slow)[i]:.4g} at {_rate(slow)} and {self.value_at(fast)[i]:.4g} at {_rate(fast)}"
+            for i in np.argsort(-size)[:_NAMED].tolist()
+        ]
+        return [
+            f"{begin}These recordings do not tell {_rate(slow)} from {_rate(fast)}: {', '.join(shown)}. The error bars "
+            "hold the difference; a stated rate takes it out."
+        ]
+
+
+def _rate(period: float) -> str:
+    return f"{1e-3 / period:.3g} kHz"
+
+
+def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
+    """Compare the rates that the loops may have, at a fit that assumed one.
+
+    All are simulated with one physics step. Each is fitted again by Gauss–Newton steps with the derivatives J of the
+    assumed rate (the chord method). Residuals and values between and beyond the simulated periods follow by the
+    polynomial through these. With residuals r of a candidate and d = r - r' their difference to the best one's,
+
+        χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
+
+    is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2).
+
+    Args:
+        problem: What was fitted; its loops run once per control step because nobody stated their rate.
+        x: The result, normalised (size,).
+        there: Its residuals, and derivatives there, on the training samples.
+        known: Which parameters have an error bar, (size,) bool; the others stay.
+
+    Returns:
+        What was found; ``None`` where the rate is stated, or a candidate cannot be simulated.
+    """
+    if not problem.assumes_loop_rate or not known.any():
+        return None
+    assumed = problem.loop_dt
+    periods = [assumed, *(p for p in _SIMULATED if p < (1 - 1e-6) * assumed)]
+    while len(periods) < 3:  # a control step that is as short as a drive's
+        periods.append(periods[-1] / 2)
+    logged = max(r.command_dt or 0.0 for r in problem.dataset.recordings)
+    slower = [logged] if logged > (1 + _APART) * assumed else []
+    found = [_refitted(problem.with_loop(p, min(periods)), x, there, known) for p in [*periods, *slower]]
+    known_of = [each for each in found if each is not None]
+    if any(each is None for each in found[: len(periods)]):
+        return None
+    values, errors = np.stack([v for v, _ in known_of]), torch.stack([r.error[0] for _, r in known_of])
+    rates = [1 / f for f in _RATES if 1 / f < (1 - 1e-6) * assumed]
+    candidates = tuple(sorted({assumed, *rates, *slower[: len(known_of) - len(periods)]}, reverse=True))
+    weights = np.zeros((len(candidates), len(known_of)))
+    for row, period in zip(weights, candidates, strict=True):
+        if period > assumed:
+            row[-1] = 1.0
+        else:
+            row[: len(periods)] = _lagrange(periods, period)
+    chi2 = _against(errors, weights, there.residuals.where)
+    likelihood = np.exp(-0.5 * chi2)
+    return LoopRates(
+        periods=candidates, values=weights @ values, weights=likelihood / likelihood.sum(), assumed=assumed
+    )
+
+
+def _refitted(
+    problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray
+) -> tuple[np.ndarray, Residuals] | None:
+    """Values and residuals at the end of a few steps with known derivatives; ``None`` where a simulation diverges."""
+    evaluator, free = problem.training_evaluator(), np.flatnonzero(known)
+    hessian, _ = there.normal_equations()
+    inverse = torch.from_numpy(inverse_of(hessian.numpy()[np.ix_(free, free)])[0])
+    best: tuple[torch.Tensor, Residuals] | None = None
+    for _ in range(1 + _CHORD_STEPS):
+        residuals = evaluator.residuals(problem.space.to_physical(x)[None])
+        score = float(residuals.score[0])
+        if best is not None and not score < float(best[1].score[0]):
+            break
+        if not math.isfinite(score):
+            return None
+        best = x, residuals
+        gradient = there.transposed_times(residuals.error[0])[free]
+        step = -inverse @ gradient
+        if -float(step @ gradient) < _NOTHING_LEFT * score:
+            break
+        x = x.clone()
+        x[free] = (x[free] + step).clamp(-1.0, 1.0)
+    return None if best is None else (problem.space.to_physical(best[0]).numpy(), best[1])
+
+
+def _lagrange(nodes: Sequence[float], at: float) -> np.ndarray:
+    """Weights of values at nodes in the value of the polynomial through them elsewhere, (nodes,)."""
+    return np.array([math.prod((at - b) / (a - b) for b in nodes if b != a) for a in nodes])
+
+
+def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor) -> np.ndarray:
+    """χ² of each candidate against the best.
+
+    Args:
+        errors: Residuals at the simulated periods, (m, K, R, n).
+        weights: Of these in each candidate's, (candidates, m).
+        where: Which samples there are, (K, R) bool.
+    """
+    series = [
+        errors[:, where[:, r], r, joint].numpy() for r in range(where.shape[1]) for joint in range(errors.shape[-1])
+    ]
+    gram = sum(each @ each.T for each in series)
+    squares = np.einsum("cm,mn,cn->c", weights, gram, weights)
+    best = int(squares.argmin())
+    result = np.zeros(len(weights))
+    for c in range(len(weights)):
+        apart = weights[c] - weights[best]
+        variance = 0.0
+        for each in series if c != best else ():
+            d = (apart @ each)[None]
+            variance += float((d * filtered(d, autocovariance(weights[best] @ each))).sum())
+        if variance > 0:
+            result[c] = (squares[c] - squares[best]) * float(apart @ gram @ apart) / variance
+    return result
