@@ -254,24 +254,23 @@ def _last_line(output: str) -> str:
 def compared(result: dict, truth: dict) -> dict:
     """A result beside the truth: errors and how many parameters are right."""
     right, open_, wrong = 0, [], []
+    known = not result.get("std_means_nothing")
     for group in GROUPS:
         for joint, value in truth[group].items():
             label = f"{group}/{joint}"
-            found, bar = result["parameters"][group].get(joint), result["std"][group].get(joint)
-            if found is None or label in result["undetermined"] or bar is None:
+            found, bar = result["parameters"][group].get(joint), result["std"][group].get(joint) if known else None
+            if found is None or label in result["undetermined"]:
                 open_.append(label)
-                continue
-            off = abs(found - value)
-            if off <= 3 * bar or off <= 0.02 * abs(value):
+            elif abs(found - value) <= max(3 * (bar or 0.0), 0.02 * abs(value)):
                 right += 1
             else:
                 wrong.append([label, found, value, bar])
-    off, bar = abs(result["delay_s"] - truth["delay_s"]), result["std"]["delay"].get("all")
-    step = result["delay_s"] / (result["parameters"]["delay"].get("all") or 1) if result["delay_s"] else 0.0
-    if bar is not None and (off <= 3 * bar * step or off <= 0.02 * truth["delay_s"]):
+    steps, bar = result["parameters"]["delay"].get("all"), result["std"]["delay"].get("all") if known else None
+    bar = bar * result["delay_s"] / steps if bar and steps else None
+    if abs(result["delay_s"] - truth["delay_s"]) <= max(3 * (bar or 0.0), 0.02 * truth["delay_s"]):
         right += 1
     else:
-        wrong.append(["delay_s", result["delay_s"], truth["delay_s"], None if bar is None else bar * step])
+        wrong.append(["delay_s", result["delay_s"], truth["delay_s"], bar])
     return {
         "train_over_noise": result["rmse"]["train"]["all"] / NOISE,
         "held_out_over_noise": result["rmse"]["validation"]["all"] / NOISE,
@@ -338,8 +337,8 @@ def _worst(wrong: list) -> str:
     """The value that is most of its error bars off."""
     if not wrong:
         return ""
-    label, found, value, bar = max(wrong, key=lambda entry: abs(entry[1] - entry[2]) / (entry[3] or np.inf))
-    return f"{label} {found:.3g} ± {bar or np.nan:.1g} of {value:.3g}"
+    label, found, value, bar = max(wrong, key=lambda entry: abs(entry[1] - entry[2]) / (entry[3] or 1e-9))
+    return f"{label} {found:.3g} ± {'?' if bar is None else format(bar, '.1g')} of {value:.3g}"
 
 
 def main() -> None:
