@@ -53,9 +53,9 @@ def start_by_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) ->
 
 
 def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
-    """Mean squares of torque, speed and acceleration about their means, (3, n)."""
-    time, position = recording.time, _smooth(recording.dof_pos, recording.time)
-    speed = np.gradient(position, time, axis=0)
+    """Mean squares of torque, speed and acceleration about their means, (3, n); the ends, hardly averaged, count not."""
+    time, half = recording.time, max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
+    speed = np.gradient(_smooth(recording.dof_pos, half), time, axis=0)
     kp, kd = (
         of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
         for name in ("stiffness", "damping")
@@ -66,11 +66,11 @@ def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
     limit = of_joints(env, "effort_limit")
     torque = np.clip(torque, -limit, limit)
-    return np.array([np.var(each, axis=0) for each in (torque, speed, np.gradient(speed, time, axis=0))])
+    inner = slice(half + 2, -half - 2)
+    return np.array([np.var(each[inner], axis=0) for each in (torque, speed, np.gradient(speed, time, axis=0))])
 
 
-def _smooth(position: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Each position averaged with its neighbours, (T, n)."""
-    half = max(1, round(0.5 * _SMOOTH * (len(time) - 1) / (time[-1] - time[0])))
+def _smooth(position: np.ndarray, half: int) -> np.ndarray:
+    """Each position averaged with its neighbours on both sides, (T, n)."""
     padded = np.pad(position, ((half + 1, half), (0, 0)), mode="edge").cumsum(axis=0)
     return (padded[2 * half + 1 :] - padded[: -2 * half - 1]) / (2 * half + 1)
