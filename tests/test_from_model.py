@@ -109,6 +109,13 @@ def test_bounds_scale_with_each_joints_drive(tmp_path):
     assert upper[3].tolist() == pytest.approx([0.1, 0.1, 0.01])
 
 
+def test_placeholders_for_limits_leave_room_for_a_small_drive_and_for_its_friction(tmp_path):
+    urdf = URDF.replace('effort="23.7" velocity="30.1"', 'effort="1000" velocity="1000"')
+    bounds = cfg_of(tmp_path, urdf, "leg.urdf").sim2real.bounds_params
+    assert 0 < bounds[0, 0] < 1e-3 * 0.03  # of the hip's link, 0.03 kg m²; a part of 1000 N m / (25 rad/s²) is 4e-4
+    assert bounds[2, 1] == pytest.approx(1000 / 10)  # at 10 rad/s, not at 1000
+
+
 def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
     """In their middle a drive may have more friction than it moves against, and be late by a quarter of a period of
     its motion: either leads a descent astray."""
@@ -187,6 +194,66 @@ def test_what_no_drive_can_follow_is_refused_in_one_line(tmp_path, change, messa
         text = text.replace('<muscle name="r" joint="rail" gear="50" ctrlrange="-1 1"/>', '<muscle joint="rail"/>')
     with pytest.raises(ValueError, match=message):
         cfg_of(tmp_path, text)
+
+
+THIGH_INERTIA = 'ixx="0.006" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.001"'
+
+
+@pytest.mark.parametrize(
+    ("stated", "nearest", "note"),
+    [
+        ((1e-3, 1e-3, 3e-3), (1.5e-3, 1.5e-3, 3e-3), "changed by 16.7 % at most"),  # Σ = 1.5, 1.5, -0.5 -> 0
+        ((-1e-3, 2e-3, 2e-3), (0, 2.5e-3, 2.5e-3), "changed by 50.1 % at most"),  # Σ = 2.5, -0.5, -0.5 -> 0
+        ((0, 0, 0), (0, 0, 0), "The inertia of thigh is zero"),
+    ],
+)
+def test_an_inertia_that_no_body_can_have_becomes_the_nearest_possible_one(tmp_path, stated, nearest, note):
+    wrong = " ".join(f'i{axis}{axis}="{value}"' for axis, value in zip("xyz", stated, strict=True))
+    base = f'<link name="base"><inertial><mass value="1"/><inertia {wrong}/></inertial></link>'
+    urdf = URDF.replace(THIGH_INERTIA, wrong).replace('<link name="base"/>', base)
+    cfg = cfg_of(tmp_path, urdf, "leg.urdf")
+    told = [text for text in cfg.sim2real.notes if note in text]
+    assert told and "thigh" in told[0] and "base" not in told[0]  # the base is held: its inertia does not matter
+    env = made(cfg)
+    assert sorted(env.sim.model.body("thigh").inertia) == pytest.approx(sorted(nearest), abs=2e-6)
+    env.close()
+
+
+def test_a_link_without_mass_between_joints_is_a_point_and_a_robot_without_any_is_refused(tmp_path):
+    thigh = re.search(r"<inertial><origin.*?</inertial>", URDF, re.DOTALL)[0]
+    cfg = cfg_of(tmp_path, URDF.replace(thigh, ""), "a.urdf")
+    assert any("No mass is stated for thigh" in note for note in cfg.sim2real.notes)
+    massless = re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.DOTALL)
+    with pytest.raises(ValueError, match=r"leg\.urdf states no mass of any link that a joint moves"):
+        cfg_of(tmp_path, massless, "leg.urdf")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<robot", '\n\n<?xml version="1.0"?>\n<robot'),
+        ('effort="23.7"', 'effort="23.7" drake:acceleration="2"'),
+        ("</robot>", '<drake:declare name="a"/></robot>'),
+        ("</robot>", "</robot>\n\0"),
+        (
+            "</robot>",
+            '<link name="world"/><joint name="float" type="floating"><parent link="world"/><child link="base"/></joint>'
+            "</robot>",
+        ),
+        ('joint name="sole" type="fixed">', 'joint name="sole" type="fixed"><mimic joint="hip"/>'),
+    ],
+)
+def test_what_other_readers_of_urdf_take_is_taken(tmp_path, old, new):
+    assert cfg_of(tmp_path, URDF.replace(old, new), "leg.urdf").sim2real.joint_order == ("hip", "knee")
+
+
+def test_a_joint_that_follows_one_that_is_fixed_stays_where_it_is(tmp_path):
+    urdf = URDF.replace('<mimic joint="knee"', '<mimic joint="sole"')
+    cfg = cfg_of(tmp_path, urdf, "leg.urdf")
+    assert cfg.sim2real.joint_order == ("hip", "knee")
+    env = made(cfg)
+    assert env.sim.qpos[0, 2] == pytest.approx(0.1)
+    env.close()
 
 
 @pytest.mark.parametrize("key", ["damping", "frictionloss", "armature"])

@@ -20,11 +20,11 @@ def linear_couplings(model: mujoco.MjModel) -> Iterator[tuple[int, int, float, f
 
 
 def followers(model: mujoco.MjModel) -> set[int]:
-    """Joints whose position an active equality constraint derives from another joint's."""
+    """Joints whose position an active equality constraint derives from another joint's, or holds where it is."""
     return {
         int(model.eq_obj1id[e])
         for e in range(model.neq)
-        if int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_JOINT and model.eq_active0[e] and model.eq_obj2id[e] >= 0
+        if int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_JOINT and model.eq_active0[e]
     }
 
 

@@ -25,7 +25,7 @@ DAMPING_RATIO = 0.7
 """Where the file has no gains: damping of the joint's own inertia on that stiffness."""
 
 USUAL_SPEED = 10.0
-"""Where the file has no speed limit: speed [rad/s] (a slide: a tenth of it [m/s]) that scales viscous friction."""
+"""Highest speed [rad/s] (a slide: a tenth of it [m/s]) that scales viscous friction; the file's where it is lower."""
 
 SMALLEST_SHARE = 1 / 30
 """Where the file has no effort limit: a drive is at least this part of the robot's strongest one."""

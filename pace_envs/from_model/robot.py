@@ -67,7 +67,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
         ValueError: If the file is missing, is no model, or has no joints that a drive could move.
     """
     file = read_model_file(path)
-    model = compile_model(file.spec, path, file.notes)
+    model = compile_model(file.spec, path, file.notes if file.urdf is None else ())
     drives, notes = read_drives(model)
     names = [drive.joint for drive in drives] or _to_drive(model, file)
     if not names:

@@ -19,6 +19,8 @@ OF_BOUNDS = 0.1
 """Where a fit begins, as a part of the upper bounds: from their middle, friction that hides the rest leads astray."""
 _SEEN_BY_FILE = 10.0
 """How much larger than the file says a parameter may be."""
+_NO_ARMATURE, _BESIDE_LINK = 1e-5, 1e-3
+"""The least armature, as a part of the largest, and of the inertia of the joint's link if that is less."""
 _SAFE = 0.7
 """Part of the torque that gravity leaves, and of the speed limit, that the excitation may use."""
 _MARGIN = 0.05
@@ -70,7 +72,7 @@ def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
     effort, length = joint.effort, unit_length(joint)
     slowest = effort / (_SLIDE_ACCELERATION if joint.is_slide else _ACCELERATION)
     armature = max(_SEEN_BY_FILE * joint.armature, 0.25 * slowest) if joint.armature else slowest
-    speed = joint.velocity_limit if math.isfinite(joint.velocity_limit) else defaults.USUAL_SPEED * length
+    speed = min(joint.velocity_limit, defaults.USUAL_SPEED * length)  # of a faster drive friction may take more
     viscous = max(4.0 * joint.viscous_friction, effort / speed)
     friction = max(4.0 * joint.friction, _OF_EFFORT * effort)
     bias = defaults.LARGEST_BIAS
@@ -78,11 +80,20 @@ def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
         low, high = joint.range
         bias = min(defaults.LARGEST_SLIDE_BIAS, 0.1 * (high - low))
     return {
-        "armature": (1e-5 * armature, armature),
+        "armature": (_least_armature(joint, armature), armature),
         "viscous_friction": (0.0, viscous),
         "friction": (0.0, friction),
         "encoder_bias": (-bias, bias),
     }
+
+
+def _least_armature(joint: JointFacts, most: float) -> float:
+    """An armature that is as good as none: beside the link's own inertia, or beside the largest where it has none.
+
+    Effort limits of many a file are placeholders: a part of what they allow may be more than a small drive has.
+    """
+    least = _NO_ARMATURE * most
+    return min(least, _BESIDE_LINK * joint.inertia) if joint.inertia > 0 else least
 
 
 def start_values(joint: JointFacts) -> dict[str, float]:

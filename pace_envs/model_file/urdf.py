@@ -1,18 +1,35 @@
-"""What a URDF says that MuJoCo's reader does not take: speeds, mimic joints, which joints are driven."""
+"""What a URDF says that MuJoCo's reader does not take: speeds, mimic joints, which joints are driven.
+
+And what MuJoCo refuses although other readers of URDF take it: inertias that no body can have, names with undeclared
+prefixes, a base that floats below a fixed link.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
+
 MOVING = ("revolute", "continuous", "prismatic")
+_SMALLEST_MASS = 1e-6
+"""Of a moving link where the file gives it, and what is fixed to it, none [kg]."""
+_SMALLEST_INERTIA, _SMALLEST_AREA = 1e-9, 1e-6
+"""Where no body can have the stated inertia, it is at least this [kg m^2], and this per mass [m^2]."""
+_ZERO = 1e-15
+"""A stated inertia that is smaller everywhere is zero [kg m^2]."""
+_TOLD = 1e-3
+"""A change of an inertia by a smaller part is not told: a flat plate's moments are rounded."""
 _NUMBERS = {
     "limit": ("lower", "upper", "effort", "velocity"),
     "dynamics": ("damping", "friction"),
     "mimic": ("multiplier", "offset"),
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
 }
 
 
@@ -22,6 +39,7 @@ class Mimic:
 
     joint: str
     leader: str
+    """Empty where the leader does not move: the joint stays at the offset."""
     multiplier: float
     offset: float
 
@@ -54,13 +72,16 @@ def read_urdf(text: str, path: Path) -> UrdfFacts:
         ValueError: If it is no URDF, still a xacro, or a number in it is none.
     """
     try:
-        root = ElementTree.fromstring(text)
+        root = ElementTree.fromstring(_with_declared_prefixes(text.strip().strip("\0")))
     except ElementTree.ParseError as error:
         raise ValueError(f"{path} is no readable XML: {error}.") from None
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise ValueError(f"{path} is a xacro, not yet a URDF. Expand it first: xacro {path.name} > robot.urdf")
     _check_numbers(root, path)
     meshes = _without_meshes(root)
+    notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
+    if meshes:
+        notes.append(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
     command = _command_interfaces(root)
@@ -72,10 +93,138 @@ def read_urdf(text: str, path: Path) -> UrdfFacts:
         mimics=tuple(_mimics(root)),
         driven=tuple(name for name in moving if name in named),
         command=command,
-        notes=(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.",)
-        if meshes
-        else (),
+        notes=tuple(notes),
     )
+
+
+def _with_declared_prefixes(text: str) -> str:
+    """The same, with each prefix of a name declared that is not, such as that of ``drake:acceleration``."""
+    used = set(re.findall(r"[<\s/]([A-Za-z_][\w.-]*):[\w.-]+\s*(?:=|/?>|\s)", re.sub(r'"[^"]*"', '""', text)))
+    unknown = sorted(prefix for prefix in used - {"xml", "xmlns"} if f"xmlns:{prefix}" not in text)
+    return re.sub(r"<robot\b", " ".join(["<robot", *(f'xmlns:{p}="{p}"' for p in unknown)]), text, count=1)
+
+
+def _hold_what_floats(root: ElementTree.Element) -> list[str]:
+    """Fix each floating joint where it is, as every base is held; returns a note on what was."""
+    floating = [joint for joint in root.findall("joint") if joint.get("type") == "floating"]
+    for joint in floating:
+        joint.set("type", "fixed")
+    return [f"Held in the air: {_listed([joint.get('name', '') for joint in floating])}."] if floating else []
+
+
+def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
+    """Replace inertias that no body can have by the nearest one that a body can have; returns notes on them.
+
+    A body's second moments of mass Σ = ½ tr(I) 1 - I have no negative eigenvalue: those that have are set to 0. So no
+    principal moment is larger than the sum of the others. A moving link without any mass becomes a small point.
+    """
+    moving = [_link(joint, "child") for joint in root.findall("joint") if _moves(joint)]
+    massless = [name for name in moving if not _mass_fixed_to(root, name)]
+    if moving and len(massless) == len(moving):
+        raise ValueError(f"{path} states no mass of any link that a joint moves. Give the links their <inertial>.")
+    for link in root.findall("link"):
+        if link.get("name") in massless:
+            for old in link.findall("inertial"):
+                link.remove(old)
+            ElementTree.SubElement(ElementTree.SubElement(link, "inertial"), "mass", value=str(_SMALLEST_MASS))
+    changed: dict[str, float] = {}
+    for link in root.findall("link"):
+        inertial = link.find("inertial")
+        mass = 0.0 if inertial is None else _number_of(inertial.find("mass"), "value")
+        if inertial is None or mass <= 0:
+            continue
+        element = inertial.find("inertia")
+        stated = np.zeros((3, 3)) if element is None else _tensor(element)
+        possible = _nearest_possible(stated, mass)
+        if element is not None and possible is stated:
+            continue
+        element = ElementTree.SubElement(inertial, "inertia") if element is None else element
+        for key, (i, j) in _ENTRIES.items():
+            element.set(key, repr(float(possible[i, j])))
+        size = float(np.abs(stated).max())
+        changed[link.get("name", "")] = float(np.abs(possible - stated).max()) / size if size > _ZERO else math.inf
+    carried = _carried(root) - set(massless)
+    told = {name: change for name, change in changed.items() if change > _TOLD and name in carried}
+    notes = []
+    if massless:
+        notes.append(f"No mass is stated for {_listed(massless)}, which a joint moves: {1e6 * _SMALLEST_MASS:g} mg.")
+    if zero := [name for name, change in told.items() if math.isinf(change)]:
+        notes.append(f"The inertia of {_listed(zero)} is zero: taken as a point's.")
+    if impossible := [name for name, change in told.items() if math.isfinite(change)]:
+        most = max(told[name] for name in impossible)
+        notes.append(
+            f"No body can have the inertia that is stated for {_listed(impossible)} (a principal moment is not "
+            f"positive, or above the sum of the other two): the nearest possible one is taken, changed by "
+            f"{100 * most:.1f} % at most."
+        )
+    return notes
+
+
+_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+
+
+def _tensor(element: ElementTree.Element) -> np.ndarray:
+    tensor = np.zeros((3, 3))
+    for key, (i, j) in _ENTRIES.items():
+        tensor[i, j] = tensor[j, i] = _number_of(element, key)
+    return tensor
+
+
+def _nearest_possible(inertia: np.ndarray, mass: float) -> np.ndarray:
+    """The nearest inertia [kg m^2] that a body of that mass can have; where it can have this one, the same."""
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] > 0 and moments[0] + moments[1] > moments[2]:
+        return inertia
+    values, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    values = np.maximum(values, 0.5 * max(_SMALLEST_INERTIA, _SMALLEST_AREA * mass))
+    second = (axes * values) @ axes.T
+    return np.trace(second) * np.eye(3) - second
+
+
+def _carried(root: ElementTree.Element) -> set[str]:
+    """Links that a joint moves, itself or further up; the inertia of the others does not matter."""
+    joints = root.findall("joint")
+    found = [_link(joint, "child") for joint in joints if _moves(joint)]
+    for link in found:
+        found += [
+            child
+            for joint in joints
+            if _link(joint, "parent") == link and (child := _link(joint, "child")) not in found
+        ]
+    return set(found)
+
+
+def _mass_fixed_to(root: ElementTree.Element, name: str) -> float:
+    """Mass of a link and of all that is fixed to it [kg]."""
+    links = {link.get("name", ""): link.find("inertial/mass") for link in root.findall("link")}
+    below: dict[str, list[str]] = {}
+    for joint in root.findall("joint"):
+        if joint.get("type") == "fixed":
+            below.setdefault(_link(joint, "parent"), []).append(_link(joint, "child"))
+    found, total = [name], 0.0
+    for link in found:
+        total += max(_number_of(links.get(link), "value"), 0.0)
+        found += [child for child in below.get(link, ()) if child not in found]
+    return total
+
+
+def _moves(joint: ElementTree.Element) -> bool:
+    return joint.get("type") in MOVING
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    """The parent or child link of a joint."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def _number_of(element: ElementTree.Element | None, key: str) -> float:
+    """A number of an element; 0 where there is none."""
+    return 0.0 if element is None else float(element.get(key, 0.0))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _without_meshes(root: ElementTree.Element) -> list[str]:
@@ -95,15 +244,15 @@ def _without_meshes(root: ElementTree.Element) -> list[str]:
 
 
 def _check_numbers(root: ElementTree.Element, path: Path) -> None:
-    for joint in root.findall("joint"):
-        for element in joint:
+    for owner in [*root.findall("joint"), *root.findall("link")]:
+        for element in [*owner, *owner.findall("inertial/*")]:
             for key in _NUMBERS.get(element.tag, ()):
                 try:
                     good = not math.isnan(float(element.get(key, "0")))
                 except ValueError:
                     good = False
                 if not good:
-                    what = f"<{element.tag} {key}={element.get(key)!r}> of joint {joint.get('name', '')!r}"
+                    what = f"<{element.tag} {key}={element.get(key)!r}> of {owner.tag} {owner.get('name', '')!r}"
                     raise ValueError(f"{path}: {what} is not a number. Correct it.")
 
 
@@ -117,11 +266,12 @@ def _velocity_limits(root: ElementTree.Element) -> dict[str, float]:
 
 
 def _mimics(root: ElementTree.Element) -> list[Mimic]:
-    found = [(joint.get("name", ""), joint.find("mimic")) for joint in root.findall("joint")]
+    found = [(joint.get("name", ""), joint.find("mimic")) for joint in root.findall("joint") if _moves(joint)]
+    leaders = {joint.get("name", "") for joint in root.findall("joint") if _moves(joint)}
     return [
         Mimic(
             joint=name,
-            leader=mimic.get("joint", ""),
+            leader=leader if (leader := mimic.get("joint", "")) in leaders else "",
             multiplier=float(mimic.get("multiplier", 1.0)),
             offset=float(mimic.get("offset", 0.0)),
         )

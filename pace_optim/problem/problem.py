@@ -33,6 +33,7 @@ from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all, tell_on_stderr
+from pace_optim.problem.start import start_by_torques
 from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
@@ -265,6 +266,10 @@ def load_problem(
     recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
     for each in (plain, cfg) if not {"stiffness", "damping"} & set(unknown) else ():
         _raise_armature(each, least_armature(env, [*recordings, *held_out]))
+    if is_model_file(task):
+        start = start_by_torques(env, recordings)
+        for each in (plain, cfg):
+            each.sim2real.start_params = {**each.sim2real.start_params, **start}
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), _evaluations(cfg), max_duration, tell
