@@ -1,0 +1,37 @@
+"""A fit that is interrupted after each iteration and resumed, against one that is not; exits 1 where a bit differs."""
+
+import sys
+
+import torch
+from problems import chirp, make_problem, record
+
+from pace_optim.optimizers.derivatives import colour
+from pace_optim.optimizers.least_squares import Descent, checkpoint_of
+from pace_optim.optimizers.way_down import WayDown
+
+
+def main() -> None:
+    """Compare; the argument is the number of threads."""
+    torch.set_num_threads(int(sys.argv[1]))
+    problem = make_problem(record(chirp(1.0), noise=1e-4))
+    colouring = colour(problem.space, problem.trees, problem.joint_names)
+
+    def way(**options):
+        pieces = problem.on_pieces(0.5).training_evaluator()
+        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
+
+    kept: list = []
+    whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))
+    first = whole
+    end = whole.run([problem.space.start])
+    for checkpoint in kept[1::4]:
+        again = way()
+        again.descents = Descent.restore(checkpoint)
+        other = again.run([problem.space.start])
+        if not torch.equal(other.x, end.x) or other.scores != end.scores or not torch.equal(other.hessian, end.hessian):
+            sys.exit(1)
+    print(len(kept), "iterations")
+
+
+if __name__ == "__main__":
+    main()
