@@ -96,6 +96,4 @@ def test_logs_of_strangers_are_named(folder, says):
         pytest.skip("shared/cases/strangers is absent")
     here = STRANGERS / folder
     problem = load_problem(use_task(str(here / "arm.xml")), data=[here / "a.csv", here / "b.csv"], tell=lambda _: None)
-    import re
-
     assert re.search(says, " ".join(each.sentence for each in check_log(problem)))

@@ -5,10 +5,10 @@ For each joint, with everything but the delay linear:
     τ_drive(t - delay) = s τ_links + a q̈ + d q̇ + f sign(q̇) + b
 
 τ_drive is the PD law of the stated gains on the logged commands, cut at the stated limits. τ_links is the inverse
-dynamics of the model along the measured positions. Armature a and friction f are not negative. d may take back a damping
-that is stated too large, b is an encoder bias, and s allows gains or masses that are wrong by a factor. All terms are
-smoothed alike, which leaves the equation exact but for its non-linear terms. What remains says how well log and model
-agree; nothing is simulated.
+dynamics of the model along the measured positions. Armature a and friction f are not negative. d may take back a
+damping that is stated too large, b is an encoder bias, and s allows gains or masses that are wrong by a factor. All
+terms are smoothed alike, which leaves the equation exact but for its non-linear terms. What remains says how well log
+and model agree; nothing is simulated.
 """
 
 from __future__ import annotations
