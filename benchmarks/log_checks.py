@@ -50,8 +50,8 @@ class Robot:
     bias: np.ndarray
     delay: float
     """[s]."""
-    limit: float = np.inf
-    """[N m]."""
+    limit: np.ndarray | float = np.inf
+    """(n,) [N m]."""
     cut: np.ndarray | None = None
     """Range in which the drives take targets, (n, 2) [rad]."""
     tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -179,12 +179,15 @@ def make(kind: str, seed: int) -> Input:
     if kind == "wrapped":
         robot = replace(robot, centre=np.where(np.arange(len(robot.centre)) == j, np.pi - 0.1, robot.centre))
     if kind == "limit":
-        asked = robot.stiffness[j] * robot.amplitude[j]
-        robot = replace(robot, limit=float(rng.uniform(0.3, 0.6) * asked))
+        free = robot.record(seed)
+        asked = np.abs(robot.stiffness[j] * (free.des_dof_pos - free.dof_pos)[:, j]).max()
+        limit = np.where(np.arange(len(robot.axes)) == j, rng.uniform(0.4, 0.6) * asked, np.inf)
+        robot = replace(robot, limit=limit)
     if kind == "gravity":
         robot = replace(robot, tilt=((np.pi / 2, 0, 0), (0, np.pi / 2, 0), (0.6, 0, 0), (np.pi, 0, 0))[seed % 4])
     if kind == "range":
-        width = robot.amplitude * rng.uniform(0.4, 0.7)
+        robot = replace(robot, stiffness=6 * robot.stiffness, damping=4 * robot.damping)  # little overshoot
+        width = robot.amplitude * rng.uniform(0.5, 0.7)
         robot = replace(robot, cut=np.column_stack([robot.centre - width, robot.centre + width]))
     log = robot.record(seed)
     q, target = log.dof_pos[:, j], log.des_dof_pos[:, j]
@@ -232,7 +235,7 @@ def make(kind: str, seed: int) -> Input:
         return Input(robot=robot, recording=replace(log, **series), check="scale", joints=robot.names)
     if kind == "limit":
         stated = replace(robot, limit=np.inf)
-        return Input(robot=stated, recording=log, check="torque limit")
+        return Input(robot=stated, recording=log, check="torque limit", joints=name)
     if kind == "gravity":
         return Input(robot=replace(robot, tilt=(0.0, 0.0, 0.0)), recording=log, check="gravity")
     if kind == "spikes":
@@ -299,7 +302,12 @@ def clean(folders: list[Path]) -> Iterator[tuple[str, Callable[[], Problem]]]:
     """Recordings without faults: each robot's own sample, and those of folders of the shared kinds."""
     for task in ("Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0"):
         yield task, lambda task=task: load_problem(task, tell=lambda _: None)
-    tasks = {"xl330": "Pace-TestBench-v0", "sts3250": "Pace-TestBench-v0", "so101": "Pace-SO101-v0", "go2": "Pace-Go2-v0"}
+    tasks = {
+        "xl330": "Pace-TestBench-v0",
+        "sts3250": "Pace-TestBench-v0",
+        "so101": "Pace-SO101-v0",
+        "go2": "Pace-Go2-v0",
+    }
     for folder in folders:
         for name, case in CASES.items():
             if case.logs and (folder / case.logs[0]).exists():

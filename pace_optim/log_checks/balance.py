@@ -4,11 +4,11 @@ For each joint, with everything but the delay linear:
 
     τ_drive(t - delay) = s τ_links + a q̈ + d q̇ + f sign(q̇) + b
 
-τ_drive is the PD law of the stated gains on the logged commands, cut at the stated limits. τ_links is the inverse dynamics
-of the model along the measured positions. Armature a and friction f are not negative, d may take back a damping that is
-stated too large, b is an encoder bias, and s allows gains or masses that are wrong by a factor. All terms are smoothed
-alike, which leaves the equation exact but for its non-linear terms. What remains says how well log and model agree; no
-parameter is needed, and nothing is simulated.
+τ_drive is the PD law of the stated gains on the logged commands, cut at the stated limits. τ_links is the inverse
+dynamics of the model along the measured positions. Armature a and friction f are not negative. d may take back a
+damping that is stated too large, b is an encoder bias, and s allows gains or masses that are wrong by a factor. All
+terms are smoothed alike, which leaves the equation exact but for its non-linear terms. What remains says how well log
+and model agree; nothing is simulated.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -35,6 +36,8 @@ _FEWEST = 60
 """Instants without which a joint is not judged."""
 _MOVING = 0.1
 """Of its RMS speed: slower joints may stick, and their friction is anything up to its largest."""
+_TOUCHED = 0.01
+"""Share of samples that do not count in what is smoothed: more of them, and an instant does not count."""
 _FACTOR = 4.0
 """By which stated gains or the model's masses may be wrong; assumed gains by its square and more."""
 _ASSUMED_FACTOR = 50.0
@@ -132,14 +135,14 @@ def views_of(problem: Problem) -> list[View]:
     n, sim2real = robot.num_joints, problem.env_cfg.sim2real
     result = []
     for r, recording in enumerate(problem.dataset.recordings):
-        drive = {name: np.full(n, np.inf) for name in DRIVE_FIELDS}
+        drive: dict[str, Any] = {name: np.full(n, np.inf) for name in DRIVE_FIELDS}
         for actuator in robot.actuators.values():
             for name, values in drive.items():
                 own = getattr(actuator, name)
                 values[actuator.joint_indices] = own[min(r, len(own) - 1)].cpu().numpy()
         model = model_of(env, r)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing but its links
-        command = recording.command
+        command = np.asarray(recording.command)
         zero = np.zeros_like(command)
         on = recording.command_torque_enable
         assumed = np.isin(problem.joint_names, list(sim2real.assumed_gains))
@@ -204,13 +207,11 @@ class Balance:
 
     misfit: float
     """RMS of what is left over the standard deviation of the drive's torque."""
-    friction: float
-    """Coulomb friction [N m]."""
+    delay: int
+    """Of the commands, the nearest that was tried [control steps]."""
 
 
-def balances(
-    view: View, links: Links, joints: Iterable[int], further: np.ndarray | None = None
-) -> dict[int, Balance]:
+def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarray | None = None) -> dict[int, Balance]:
     """The balance of some joints; of one that hardly moves there is none.
 
     Args:
@@ -220,7 +221,7 @@ def balances(
         further: Torques that may have any part in each joint's, (N, n, m) [N m].
     """
     result = {}
-    still = view.smooth((~view.used).astype(float))[links.rows] > 1e-3
+    still = view.smooth((~view.used).astype(float))[links.rows] > _TOUCHED
     for j in joints:
         speed = np.abs(links.speed[:, j])
         moving = ~still & (speed > _MOVING * np.sqrt(np.square(speed).mean()))
@@ -240,21 +241,23 @@ def _balance(view: View, links: Links, j: int, moving: np.ndarray, further: np.n
     between = 0.5 * max(np.diff(delays), default=1) * view.control_dt
     lower = np.array([1 / factor, 0.0, -view.damping[j], 0.0, -bias, -between])
     upper = np.array([factor, np.inf, np.inf, np.inf, bias, between])
-    lower, upper = (np.append(each, np.full(len(columns) - 4, sign * np.inf)) for each, sign in ((lower, -1), (upper, 1)))
+    lower, upper = (
+        np.append(each, np.full(len(columns) - 4, sign * np.inf)) for each, sign in ((lower, -1), (upper, 1))
+    )
     best = None
     for delay in delays.tolist():
         given = view.smooth_given(j, delay)
         torque, slope = given[rows], (given[rows + 1] - given[rows - 1]) / (2 * view.dt)
         spread = float(np.square(torque - torque.mean()).sum())
-        found, left = _bounded(np.column_stack([*columns[:4], np.ones(len(rows)), slope, *columns[4:]]), torque, lower, upper)
+        _, left = _bounded(
+            np.column_stack([*columns[:4], np.ones(len(rows)), slope, *columns[4:]]), torque, lower, upper
+        )
         if spread > 0 and (best is None or left < best[0]):
-            best = left, Balance(misfit=float(np.sqrt(left / spread)), friction=float(found[3]))
+            best = left, Balance(misfit=float(np.sqrt(left / spread)), delay=delay)
     return None if best is None else best[1]
 
 
-def _bounded(
-    table: np.ndarray, values: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _bounded(table: np.ndarray, values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
     """Least squares within bounds: what leaves them furthest is held there, one after another; and what is left."""
     scale = np.sqrt(np.square(table).mean(axis=0)) + 1e-12
     table = table / scale

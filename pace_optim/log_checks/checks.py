@@ -7,7 +7,8 @@ with the change it does. Changes add up: two joints may both be reversed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,12 +24,12 @@ _DOUBTED = 0.04
 """Misfit from which a joint is looked at."""
 _LARGE = 0.3
 """Misfit of a joint whose scale may be wrong, or whose torque a limit that is not stated."""
-_BETTER = 0.4
-"""A change must leave at most so much of the misfit of every joint that it changes."""
+_BETTER, _NOT_WORSE = 0.4, 0.8
+"""A change must leave at most so much of the misfit of the joints that it changes: in their geometric mean, of each."""
 _EXPLAINED = 0.12
 """Misfit of a joint that is explained."""
 _WORTH = 0.6
-"""Of a misfit in a coarse look: a change that leaves more is not looked at further."""
+"""Of the misfits in a coarse look: a change that leaves more is not looked at further."""
 _TWICE = 1.8
 """Smallest factor between units, or of a gear, that is named."""
 _LEAST_TRAVEL, _MOST_TRAVEL = 0.15, 7.0
@@ -84,9 +85,13 @@ class Finding:
     @property
     def sentence(self) -> str:
         """For a user."""
-        sure = "" if self.before is None else (
-            f" (So changed, the drives' torques fit the motion to {100 * self.after:.2g} %; as logged, to "
-            f"{100 * self.before:.2g} %.)"
+        sure = (
+            ""
+            if self.before is None
+            else (
+                f" (So changed, the drives' torques fit the motion to {100 * self.after:.2g} %; as logged, to "
+                f"{100 * self.before:.2g} %.)"
+            )
         )
         return f"{listed(self.recordings)}: {self.text}{sure}"
 
@@ -136,7 +141,7 @@ class Check:
     stops: bool
 
 
-def _column(series: np.ndarray, joint: int | slice, values: np.ndarray) -> np.ndarray:
+def _column(series: np.ndarray, joint: int | list[int], values: np.ndarray) -> np.ndarray:
     result = series.copy()
     result[:, joint] = values
     return result
@@ -144,7 +149,7 @@ def _column(series: np.ndarray, joint: int | slice, values: np.ndarray) -> np.nd
 
 def _scaled(view: View, joints: list[int], measured: float | None, commanded: float | None) -> View:
     """Some joints' measured or commanded series times a factor."""
-    changes = {}
+    changes: dict[str, Any] = {}
     if measured is not None:
         changes["position"] = _column(view.position, joints, measured * view.position[:, joints])
     if commanded is not None:
@@ -182,10 +187,10 @@ def reversed_sign(evidence: Evidence) -> Iterator[Change]:
 def swapped(evidence: Evidence) -> Iterator[Change]:
     """The columns of two joints are exchanged, in all series, the positions or the targets."""
     view, doubted = evidence.view, evidence.doubted
-    for i, j in ((i, j) for i in range(len(view.joints)) for j in range(i) if i in doubted and j in doubted):
+    for i, j in itertools.combinations(sorted(doubted), 2):
         pair, other = [i, j], [j, i]
-        measured = {"position": _column(view.position, pair, view.position[:, other])}
-        commanded = {
+        measured: dict[str, Any] = {"position": _column(view.position, pair, view.position[:, other])}
+        commanded: dict[str, Any] = {
             key: _column(series, pair, series[:, other])
             for key, series in (
                 ("target", view.target), ("target_vel", view.target_vel), ("feed_forward", view.feed_forward),
@@ -208,7 +213,9 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
     for joints in _groups(evidence):
         if max(evidence.balance[j].misfit for j in joints if j in evidence.balance) < _LARGE:
             continue
-        measured, commanded = (float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target))
+        measured, commanded = (
+            float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target)
+        )
         for scales, positions, targets, what in (
             (_both_scales(min(measured, commanded)), True, True, "positions and targets"),
             (_scales_about(measured, commanded), True, False, "the positions (dof_pos)"),
@@ -217,7 +224,9 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
             if not len(scales):
                 continue
 
-            def changed(factor: float, joints=joints, positions=positions, targets=targets) -> View:
+            def changed(
+                factor: float, joints: list[int] = joints, positions: bool = positions, targets: bool = targets
+            ) -> View:
                 return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
 
             factor = _known(_least(evidence, changed, scales, joints))
@@ -231,7 +240,9 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
 
 def _both_scales(travel: float) -> np.ndarray:
     """Factors that leave a joint's travel one that is usual."""
-    return _SCALES[(travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)]
+    return _SCALES[
+        (travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)
+    ]
 
 
 def _scales_about(one: float, other: float) -> np.ndarray:
@@ -296,10 +307,11 @@ def clipped_targets(evidence: Evidence) -> Iterator[Change]:
             )
         flat = _flat_ends(target)
         if flat.any():
-            where = flat[view.steps]
+            late = evidence.balance[j].delay + view.most_delay // 10 + 1
+            heard = np.convolve(flat, np.ones(late + 1), "full")[: len(flat)] > 0.5  # until the drive has heard others
             yield Change(
                 joints=(j,),
-                view=without(view, _wide(where, view)),
+                view=without(view, heard[view.steps]),
                 text=f"the logged targets of {{joints}} are cut at {target.min():.4g} and {target.max():.4g}, first at "
                 f"{view.control_dt * float(np.flatnonzero(flat)[0]):.3g} s; the drive followed others. Log what it "
                 "gets, or leave these times out.",
@@ -311,13 +323,6 @@ def _flat_ends(target: np.ndarray) -> np.ndarray:
     return ((target == target.max()) | (target == target.min())) & (
         (np.diff(target, prepend=np.nan) == 0) | (np.diff(target, append=np.nan) == 0)
     )
-
-
-def _wide(where: np.ndarray, view: View) -> np.ndarray:
-    """With what the smoothing and the delay carry of it into other samples."""
-    edge = int(np.ceil(3 * view.width))
-    late = int(np.ceil(view.most_delay * view.control_dt / view.dt))
-    return np.convolve(where, np.ones(2 * edge + late + 1), "full")[edge : edge + len(where)] > 0.5
 
 
 def lifted_limits(evidence: Evidence) -> Iterator[Change]:
@@ -345,7 +350,7 @@ def torque_limit(evidence: Evidence) -> Iterator[Change]:
             continue
         most = np.quantile(np.abs(view.asked(j)), np.linspace(0.3, 0.995, 15))
 
-        def changed(limit: float, j=j) -> View:
+        def changed(limit: float, j: int = j) -> View:
             limits = view.effort_limit.copy()
             limits[j] = limit
             return replace(view, effort_limit=limits)
@@ -376,7 +381,7 @@ def turned_gravity(evidence: Evidence) -> Iterator[Change]:
     )
     judged = [j for j in few.balance if np.ptp(pull[:, j], axis=0).max() > 0]
     free = balances(view, links, few.doubted, pull)
-    if not any(each.misfit < _BETTER * few.balance[j].misfit for j, each in free.items()):
+    if not any(each.misfit < _WORTH * few.balance[j].misfit for j, each in free.items()):
         return
 
     def misfit(direction: np.ndarray) -> float:
@@ -398,9 +403,8 @@ def turned_gravity(evidence: Evidence) -> Iterator[Change]:
         )
 
 
-def _least(evidence: Evidence, changed: Callable[[float], View], values: Sequence[float], joints: list[int]) -> float:
+def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
     """The value of which the balance is best; refined between its neighbours."""
-
     coarse = evidence.coarse()
 
     def misfit(value: float, reference: Evidence) -> float:
@@ -408,7 +412,7 @@ def _least(evidence: Evidence, changed: Callable[[float], View], values: Sequenc
         links = reference.links if reference.is_same_motion(view) else Links.of(view)
         return float(sum(np.log(each.misfit) for each in balances(view, links, joints).values()))
 
-    values = np.log(sorted(values))
+    values = np.log(np.sort(values))
     best = int(np.argmin([misfit(value, coarse) for value in values]))
     bounds = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
     fine = minimize_scalar(misfit, bounds=bounds, args=(evidence,), method="bounded", options={"maxiter": 12})
@@ -417,13 +421,15 @@ def _least(evidence: Evidence, changed: Callable[[float], View], values: Sequenc
 
 def standstill(view: View) -> Iterator[Change]:
     """The log shows no motion: the encoder is dead, or the drive off."""
-    travel = np.maximum(np.ptp(view.target, axis=0), np.ptp(np.cumsum(view.target_vel, axis=0), axis=0) * view.control_dt)
+    travel = np.maximum(
+        np.ptp(view.target, axis=0), np.ptp(np.cumsum(view.target_vel, axis=0), axis=0) * view.control_dt
+    )
     moved = np.ptp(view.smooth(view.position), axis=0)
     still = [j for j in range(len(view.joints)) if travel[j] > _COMMANDED and moved[j] < _FOLLOWED * travel[j]]
     dead = [j for j in still if np.ptp(view.position[:, j]) == 0.0]
     for joints, what, cure in (
         (dead, "never changes", "the encoder is dead or not logged, or the joint is blocked"),
-        ([j for j in still if j not in dead], "stands still", "the drive is off, or the joint is blocked"),
+        ([j for j in still if j not in dead], "stands still", "the drive is off or too weak, or the joint is blocked"),
     ):
         for j in joints:
             yield Change(
@@ -449,7 +455,8 @@ def frozen_encoder(view: View) -> Iterator[Change]:
         frozen = [
             (a, b)
             for a, b in runs
-            if max(jerk[a], jerk[b]) > _ABRUPT * usual and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
+            if max(jerk[a], jerk[b]) > _ABRUPT * usual
+            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
         ]
         if not frozen:
             continue
@@ -459,7 +466,7 @@ def frozen_encoder(view: View) -> Iterator[Change]:
         (a, b), more = frozen[0], len(frozen) - 1
         yield Change(
             joints=(j,),
-            view=without(view, _wide(where, view)),
+            view=without(view, where),
             text=f"the position of {{joints}} is frozen from {a * view.dt:.4g} to {b * view.dt:.4g} s"
             f"{f', and {more} times more' if more else ''}: it stops or goes on {max(jerk[a], jerk[b]) / usual:.0f} "
             "times as abruptly as elsewhere. Cut the recording there.",
@@ -476,9 +483,7 @@ def spikes(view: View) -> Iterator[Change]:
             at = np.arange(len(position))
             yield Change(
                 joints=(j,),
-                view=replace(
-                    view, position=_column(view.position, j, np.interp(at, at[~found], position[~found]))
-                ),
+                view=replace(view, position=_column(view.position, j, np.interp(at, at[~found], position[~found]))),
                 text=f"{found.sum()} positions of {{joints}} are spikes, the first at {first:.4g} s. Leave those rows "
                 "out.",
             )
@@ -496,7 +501,11 @@ def _spikes_of(position: np.ndarray) -> np.ndarray:
                 break
             there, back = step[a], step[b]
             beside = max(abs(step[a - 1]), abs(step[b + 1]))
-            if there * back < 0 and abs(there + back) < 0.5 * abs(there) and min(abs(there), abs(back)) > _SPIKE * beside:
+            if (
+                there * back < 0
+                and abs(there + back) < 0.5 * abs(there)
+                and min(abs(there), abs(back)) > _SPIKE * beside
+            ):
                 found[a + 1 : b + 1] = True
     return found
 
@@ -579,7 +588,7 @@ def _may_explain(coarse: Evidence, change: Change) -> bool:
     links = coarse.links if coarse.is_same_motion(view) else Links.of(view)
     found = balances(view, links, change.joints)
     ratio = [each.misfit / coarse.balance[j].misfit for j, each in found.items() if j in coarse.balance]
-    return bool(ratio) and max(ratio) < _WORTH
+    return bool(ratio) and bool(np.exp(np.mean(np.log(ratio))) < _WORTH)
 
 
 def _gain(before: Evidence, after: Evidence, change: Change) -> float:
@@ -587,7 +596,7 @@ def _gain(before: Evidence, after: Evidence, change: Change) -> float:
     both = [j for j in before.balance if j in after.balance]
     ratio = {j: after.balance[j].misfit / before.balance[j].misfit for j in both}
     own = [ratio[j] for j in change.joints if j in ratio]
-    if not own or max(own) > _BETTER:
+    if not own or max(own) > _NOT_WORSE or np.exp(np.mean(np.log(own))) > _BETTER:
         return 0.0
     return -float(sum(np.log(ratio[j]) for j in both))
 
