@@ -94,7 +94,7 @@ def test_only_batched_environments_can_be_wrapped():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"task": "Pace-AnymalD-v0"}, "no velocity task"),
+        ({"task": "Pace-AnymalD-v0"}, "no training task"),
         ({"task": "Pace-Anymal-Velocity-v0"}, "Did you mean 'Pace-AnymalD-Velocity-v0'"),
         ({"task": TASKS[0], "reward": "enrgy"}, "no reward set 'enrgy'. Available: velocity, energy"),
         ({"task": TASKS[0], "max_iterations": 0}, "max_iterations is 0"),
