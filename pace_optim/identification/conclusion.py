@@ -108,7 +108,7 @@ def conclude(
     if outcome.is_interrupted:
         checks = (_silent_at_prior,)
     elif end.is_far:
-        checks = (_with_prior, _consistent)
+        checks = (_with_prior,)  # where physics is missing, recordings disagree: that is the diagnosis' work
     try:
         for check in checks:
             _write(run, record, end)
@@ -256,8 +256,6 @@ def _consistent(run: Optimization, end: _End) -> _End:
     train = end.problem.dataset.train[end.residuals.step]
     score = float(end.residuals.error[0].square()[train].sum(dim=1).mean())
     result = check_consistency(end.problem, end.x, score, run.progress.say, end.jacobian)
-    if end.is_far:
-        result = replace(result, std={label: [None] * len(each) for label, each in result.std.items()})
     if result.recordings:
         run.folder.write_json("consistency.json", asdict(result))
     return replace(end, consistency=result)
