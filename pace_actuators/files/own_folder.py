@@ -52,10 +52,10 @@ class OwnFolder:
 
     @classmethod
     def at(cls, path: Path) -> OwnFolder:
-        """A folder that exists, such as a temporary one.
+        """A folder by its path, such as a temporary one; it is made if it is missing.
 
         Raises:
-            OSError: If it is missing, a link, or not the user's alone.
+            OSError: If it is a link, or not the user's alone.
         """
         return cls._descend(path.parent, os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC), [path.name])
 

@@ -201,7 +201,12 @@ def _kernels(include: str | None) -> HostKernels | None:
 
 
 def _compiler() -> str | None:
-    """The machine's compiler; one of the present folder, which a relative PATH names, is not the machine's."""
+    """The machine's compiler; one of the present folder, which a relative PATH names, is not the machine's.
+
+    Systems that know no owners of files (Windows) have no place for what it makes.
+    """
+    if not hasattr(os, "getuid"):
+        return None
     found = (shutil.which(name) for name in _COMPILERS)
     return next((path for path in found if path is not None and os.path.isabs(path)), None)
 
