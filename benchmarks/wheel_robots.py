@@ -322,10 +322,11 @@ def table(rows: list[dict]) -> str:
     counts = {
         word: sum(row["verdict"] == word for row in rows) for word in dict.fromkeys(row["verdict"] for row in rows)
     }
+    seconds = sum(row.get("processor_s", 0) for row in rows)
     lines += [
         "",
         f"{len(rows)} cases: {', '.join(f'{count} {word}' for word, count in counts.items())}. "
-        f"Parameters right: {right} of {stated}. Processor time: {sum(row.get('processor_s', 0) for row in rows):.0f} s.",
+        f"Parameters right: {right} of {stated}. Processor time: {seconds:.0f} s.",
     ]
     return "\n".join(lines)
 
