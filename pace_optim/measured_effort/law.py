@@ -176,8 +176,7 @@ def _terms(table: Table, command_lag: float, feedback: int, speed: np.ndarray) -
     has = table.commands.keys()
     if "position" in has:
         term("stiffness", "position", int(table.position[feedback]))
-    if "position" in has or "velocity" in has:
-        term("damping", "velocity" if "velocity" in has else None, int(speed[feedback]))
+    term("damping", "velocity" if "velocity" in has else None, int(speed[feedback]))
     if "effort" in has:
         term("feed_forward", "effort", None)
     term("offset", None, None)

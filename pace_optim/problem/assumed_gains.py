@@ -10,6 +10,7 @@ import numpy as np
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
+from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.keys import listed
 
 _STATE = (
@@ -21,28 +22,39 @@ _STATE = (
 def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Recording:
     """The recording; a torque that it commands is all that moves a joint, where the gains are only assumed.
 
+    A damping that the recording states stays: it acts on the measured speed.
+
     Raises:
         ValueError: If a joint is told nothing but positions, and its drive has no position loop.
     """
-    stiffness, names = of_joints(env, "stiffness"), np.array(recording.joint_names)
-    if recording.drive.stiffness is not None:
-        return recording
+    drive, names = recording.drive, np.array(recording.joint_names)
+    stiffness, damping = (
+        of_joints(env, name) if (own := getattr(drive, name)) is None else own for name in ("stiffness", "damping")
+    )
     other = recording.has_velocity_command | recording.has_effort_command
-    if idle := names[recording.has_position_command & ~other & (stiffness == 0.0)].tolist():
+    idle = names[recording.has_position_command & ~other & (stiffness == 0.0)].tolist()
+    if idle and drive.stiffness is None:
         raise ValueError(
             f"{recording.source}: nothing moves {listed(idle, 3)}: there are position targets (des_dof_pos), but the "
             f"drive has no position loop: its stiffness is 0. If it has one, {_STATE}; else add what moves it "
             "(des_dof_vel, des_dof_effort)."
         )
-    torque = recording.has_effort_command & np.isin(names, _assumed(env))
-    if not torque.any():
-        return recording
-    gains = {name: np.where(torque, 0.0, of_joints(env, name)) for name in ("stiffness", "damping")}
-    note = (
-        f"{listed(names[torque], 3)}: the torque that is commanded is taken to be all that the drive gives, since "
-        "nothing states the gains of a position loop beside it."
-    )
-    return replace(recording, drive=replace(recording.drive, **gains), notes=(*recording.notes, note))
+    alone = recording.has_effort_command & np.isin(names, _assumed(env)) & (drive.stiffness is None)
+    stiffness = np.where(alone, 0.0, stiffness)
+    damping = np.where(alone & (drive.damping is None), 0.0, damping)
+    notes = []
+    if alone.any():
+        notes.append(
+            f"{listed(names[alone], 3)}: the torque that is commanded is taken to be all that the drive gives"
+            f"{'' if drive.damping is None else ', less its damping'}, since nothing states the gains of a position "
+            "loop beside it."
+        )
+        drive = replace(drive, stiffness=stiffness, damping=damping)
+    _, on_speed = acting_loops(recording, stiffness)
+    told = recording.has_position_command | recording.has_velocity_command
+    if (braked := names[on_speed & ~told & (damping > 0.0)]).size:
+        notes.append(f"{listed(braked, 3)}: the drive's damping acts on the measured speed; no speed is commanded.")
+    return replace(recording, drive=drive, notes=(*recording.notes, *notes)) if notes else recording
 
 
 def told_of_gains(env: ManagerBasedRLEnv, recordings: Sequence[Recording], unknown: Sequence[str]) -> list[str]:

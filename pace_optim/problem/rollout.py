@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.one_kernel.robot_kernel import CompiledRobot
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -363,7 +365,6 @@ class Rollout:
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]
         rows = slice(r, None, self.dataset.num_recordings)
-        position, velocity = recording.has_position_command, recording.has_velocity_command
         for actuator in self.robot.actuators.values():
             for name in DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
@@ -372,9 +373,12 @@ class Rollout:
                     if name == "saturation_effort":
                         own = own.clamp(max=torch.finfo(own.dtype).max)  # infinite: no torque-speed line
                     getattr(actuator, name)[rows] = own
-            for name, loop in (("stiffness", position), ("damping", position | velocity)):  # without a target, no loop
+            ids = actuator.joint_indices
+            stiffness = np.zeros(recording.num_joints)
+            stiffness[ids] = actuator.stiffness[r].cpu().numpy()
+            for name, acts in zip(("stiffness", "damping"), acting_loops(recording, stiffness), strict=True):
                 gain = getattr(actuator, name)[rows]
-                gain[:, ~torch.as_tensor(loop, device=gain.device)[actuator.joint_indices]] = 0.0
+                gain[:, ~torch.as_tensor(acts, device=gain.device)[ids]] = 0.0
         load = {
             key: value
             for key in ("load_mass", "load_length", "arm_mass")

@@ -48,6 +48,23 @@ def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) ->
     return result
 
 
+def acting_loops(recording: Recording, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which joints' drives act on the position and on the speed, (n,) bool each.
+
+        τ = kp (q* − q) + kd (q̇* − q̇) + τ_ff
+
+    A position loop needs a target. Damping that the recording states, or that stands alone (kp = 0), acts on the
+    measured speed whether or not a speed is commanded. The damping of a configured position loop goes with that loop.
+
+    Args:
+        recording: What is commanded, and what it states of its drives.
+        stiffness: kp in force, (n,) [N m/rad].
+    """
+    position = recording.has_position_command
+    alone = np.full(recording.num_joints, recording.drive.damping is not None) | (stiffness == 0.0)
+    return position, position | recording.has_velocity_command | alone
+
+
 def command_interval(recording: Recording) -> float:
     """Time from one command to the next, as they were logged [s]: a command that is repeated is none.
 
