@@ -24,12 +24,13 @@ from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean, listed
 SUFFIXES = (".pt", ".npz", ".csv")
 
 
-def load_recording(path: str | os.PathLike[str]) -> Recording:
+def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording:
     """Read a recording and check that it is one; its samples stay as they are in the file.
 
     Args:
         path: A `.pt` (dict of tensors, numbers, text), `.npz` or `.csv` file. A JSON file of the same stem
             beside it may hold the facts (joint_names, stiffness, added_mass, ...).
+        rate: Samples per second of a file without time [Hz]; 0: it has time.
 
     Raises:
         ValueError: If the file is missing, unreadable, or not a sound recording; the message says what to do.
@@ -46,6 +47,8 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     else:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
     fields = add_json_facts(fields, path)
+    if rate and "time" not in fields and "dof_pos" in fields:
+        fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
     return check_recording(fields, source=str(path), default_name=path.stem, found=found)
 
 

@@ -9,6 +9,10 @@ import numpy as np
 _UNITS = {"s": 1.0, "ms": 1e3, "µs": 1e6, "ns": 1e9}
 _YEARS = (9e8, 4.2e9)  # Unix time of mid-1998 and of 2103 [s]
 _STEPS = (1e-6, 100.0)  # of stamps that follow each other [s]
+_LEAST_REPEATED = 0.2  # of the rows, where stamps are rounded to more than a step
+_ROUNDED = 1.3  # times the resolution that stamps may be from even ones
+_LASTING = 5  # rows that follow a clock that was set back, below what it had shown
+_FEW = 0.02  # of the rows, where it goes back: more are rows in no order
 _ZONE = re.compile(r"(?:Z|[+-]\d{2}:?\d{2})$", re.IGNORECASE)
 
 
@@ -47,6 +51,48 @@ def unix_unit(values: np.ndarray) -> str | None:
         if all(low <= x / per_second <= high for x, (low, high) in ((at, _YEARS), (step, _STEPS))):
             return unit
     return None
+
+
+def unrounded(time: np.ndarray) -> tuple[np.ndarray, str]:
+    """Stamps that were rounded to more than a step, evenly spaced again, and a note; others as they are.
+
+    Rows of an even timer at t₀ + k Δ show the multiples of a resolution r > Δ, each several times. The line through
+    them is the timer's, if no stamp is further than r from it.
+
+    Args:
+        time: Stamps in the order of the rows, (T,) [s].
+    """
+    step = np.diff(time)
+    if len(time) < 3 or not np.isfinite(time).all() or np.any(step < 0) or np.mean(step == 0) < _LEAST_REPEATED:
+        return time, ""
+    distinct = step[step > 0]
+    if not len(distinct):
+        return time, ""
+    resolution = float(np.median(distinct))
+    row = np.arange(len(time))
+    slope, start = np.polyfit(row, time - time[0], 1)
+    if slope <= 0 or np.ptp(time - time[0] - slope * row) > _ROUNDED * resolution:
+        return time, ""
+    note = (
+        f"The time stamps are rounded to {1e3 * resolution:.3g} ms, and several rows share one: read as an even clock "
+        f"of {1 / slope:.5g} Hz."
+    )
+    return time[0] + slope * row, note
+
+
+def set_back(time: np.ndarray) -> np.ndarray:
+    """Rows at which the clock was set back, (K,): those before and after show the same time twice.
+
+    Single late rows, and rows in no order, are none.
+
+    Args:
+        time: Stamps in the order of the rows, (T,) [s].
+    """
+    back = np.flatnonzero(np.diff(time) < 0) + 1
+    if not len(back) or len(back) > max(3.0, _FEW * len(time)):
+        return back[:0]
+    shown = np.maximum.accumulate(time)
+    return np.array([k for k in back if np.all(time[k : k + _LASTING] < shown[k - 1])], dtype=int)
 
 
 def _dates(values: np.ndarray) -> np.ndarray:

@@ -39,8 +39,7 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         notes.append("Positions of the joints were logged at different instants: put on those of one by cubics.")
     if len(time) < 2:
         raise ValueError(f"{log.name}: the positions of {listed(joint_names)} have no time in common. Check the log.")
-    first, notes_of_time = _beginning(time)
-    notes += notes_of_time
+    first = float(time[0])
     fields: dict[str, Any] = {"joint_names": list(joint_names)}
     for series in MEASURED_SERIES:
         interpolate = interpolate_linear if series == "dof_effort" else interpolate_smooth
@@ -64,24 +63,42 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         des_time = time
     for series, part in commands.items():
         fields[series] = _columns(part, joint_names, lambda p: p[1][np.searchsorted(p[0], des_time, side="right") - 1])
+    if columns.torque_enable:
+        switch = log.channels.get(columns.torque_enable)
+        if switch is None:
+            raise ValueError(_unknown_channel(log, columns.torque_enable))
+        at = np.searchsorted(switch.time, time, side="right") - 1
+        fields["torque_enable"] = switch.values[np.clip(at, 0, None)]
     fields["time"] = time - first
     if log.time_origin or first:
         fields["time_origin"] = log.time_origin + first
     return {**fields, **columns.facts}, notes
 
 
-def _beginning(time: np.ndarray) -> tuple[float, list[str]]:
-    """The first instant, from which time is counted."""
-    return float(time[0]), []
+def unused(log: Log, columns: ColumnMap) -> str:
+    """The channels that no series comes from, in a sentence; a topic of which nothing is used as one."""
+    used = {source.channel for by in columns.joints.values() for source in by.values()} | {columns.torque_enable}
+    tables = {log.channels[key].table for key in used if key in log.channels}
+    left: dict[str, int] = {}
+    for key, channel in log.channels.items():
+        if key not in used:
+            whole = bool(channel.table) and channel.table not in tables
+            left[channel.table if whole else key] = left.get(channel.table, 0) + 1 if whole else 1
+    names = [name if count == 1 else f"{name} ({count} columns)" for name, count in left.items()]
+    return f"Not used: {listed(names, len(names))}." if names else ""
+
+
+def _unknown_channel(log: Log, channel: str) -> str:
+    return (
+        f"{log.name}: the column map names '{channel}', which the log has not. It has: {listed(log.channels)}. Correct "
+        "the map."
+    )
 
 
 def _scaled(log: Log, series: str, source: Source) -> tuple[np.ndarray, np.ndarray]:
     """Instants and values in SI units at the joint."""
     if (channel := log.channels.get(source.channel)) is None:
-        raise ValueError(
-            f"{log.name}: the column map names '{source.channel}', which the log has not. It has: "
-            f"{listed(log.channels)}. Correct the map."
-        )
+        raise ValueError(_unknown_channel(log, source.channel))
     return channel.time, channel.values * source.scale(series) + source.offset
 
 

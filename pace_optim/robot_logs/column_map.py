@@ -12,7 +12,7 @@ from typing import Any
 from pace_actuators.files import file_at, write_atomically
 from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean, listed
 
-from .words import CURRENTS, TIME_UNITS, UNITS
+from .words import NEED_FACTOR, TIME_UNITS, UNITS
 
 _ENTRY = ("from", "unit", "sign", "offset", "gear_ratio", "factor")
 
@@ -45,7 +45,7 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnMap:
-    """A whole map; joints in the order of the recording's columns."""
+    """A whole map; joints in the order of the recording's columns. Without joints, these are guessed."""
 
     joints: Mapping[str, Mapping[str, Source]]
     """{joint: {series: source}}."""
@@ -53,6 +53,10 @@ class ColumnMap:
     """The column of time; "": as guessed, or the topics' stamps."""
     time_unit: str = ""
     """Its unit: s, ms, us or ns; "": as guessed."""
+    rate: float = 0.0
+    """Rows per second of a log without time [Hz]; 0: it has time."""
+    torque_enable: str = ""
+    """The column that says whether the drives give torque; "": they always do."""
     facts: Mapping[str, Any] = field(default_factory=dict)
     """Facts of the recording: stiffness, added_mass, ..."""
     source: str = field(default="", compare=False)
@@ -72,14 +76,15 @@ def read_map(path: Path) -> ColumnMap:
         content = tomllib.loads(file_at(path, _CURE).read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: is not TOML ({error}). Correct it.") from None
-    _check_keys(path, "the map", content, ("time", "joints", "facts"))
+    _check_keys(path, "the map", content, ("time", "torque_enable", "joints", "facts"))
+    if not content:
+        raise ValueError(f'{path}: is empty; expected [joints."NAME"] with dof_pos = {{from = "COLUMN"}}, or [time].')
     joints = _table(path, "joints", content.get("joints", {}))
-    if not joints:
-        raise ValueError(
-            f'{path}: has no joints; expected [joints."NAME"] with dof_pos = {{from = "COLUMN"}}. Add them.'
-        )
     time = _table(path, "time", content.get("time", {}))
-    _check_keys(path, "time", time, ("column", "unit"))
+    _check_keys(path, "time", time, ("column", "unit", "rate"))
+    rate = time.get("rate", 0.0)
+    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0 <= rate < 1e6:
+        raise ValueError(f"{path}: time.rate is {rate!r}; expected rows per second [Hz]. Correct it.")
     if (unit := time.get("unit", "")) not in ("", *TIME_UNITS):
         raise ValueError(f"{path}: time.unit is {unit!r}; expected one of {listed(TIME_UNITS)}. Correct it.")
     facts = _table(path, "facts", content.get("facts", {}))
@@ -88,6 +93,8 @@ def read_map(path: Path) -> ColumnMap:
         joints={joint: _sources(path, joint, _table(path, joint, entries)) for joint, entries in joints.items()},
         time=str(time.get("column", "")),
         time_unit=unit,
+        rate=float(rate),
+        torque_enable=str(content.get("torque_enable", "")),
         facts=facts,
         source=str(path),
     )
@@ -107,8 +114,8 @@ def _source(path: Path, where: str, series: str, entry: Any) -> Source:
     unit = entry.get("unit", next(iter(units)))
     if unit not in units:
         raise ValueError(f"{path}: {where}.unit is {unit!r}; expected one of {listed(units)}. Correct it.")
-    if unit in CURRENTS and "factor" not in entry:
-        raise ValueError(f"{path}: {where} is a current; expected factor = N m per A beside it. Add it.")
+    if unit in NEED_FACTOR and "factor" not in entry:
+        raise ValueError(f"{path}: {where} is in {unit}; expected factor = N m per {NEED_FACTOR[unit]} beside it. Add it.")
     numbers = {key: entry[key] for key in ("sign", "offset", "gear_ratio", "factor") if key in entry}
     for key, value in numbers.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
@@ -147,10 +154,12 @@ def write_map(path: Path, columns: ColumnMap, comments: tuple[str, ...] = ()) ->
 def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
     """A map as TOML."""
     lines = [f"# {printable(comment)}" for comment in comments]
-    if columns.time or columns.time_unit:
+    lines += ["", f"torque_enable = {json.dumps(columns.torque_enable)}"] if columns.torque_enable else []
+    if columns.time or columns.time_unit or columns.rate:
         lines += ["", "[time]"]
         lines += [f"column = {json.dumps(columns.time)}"] if columns.time else []
         lines += [f'unit = "{columns.time_unit}"'] if columns.time_unit else []
+        lines += [f"rate = {columns.rate:g}"] if columns.rate else []
     if columns.facts:
         lines += ["", "[facts]", *(f"{key} = {_value(value)}" for key, value in columns.facts.items())]
     for joint, sources in columns.joints.items():
@@ -161,7 +170,7 @@ def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
                 f"{key} = {value!r}"
                 for key in ("sign", "offset", "gear_ratio", "factor")
                 if (value := getattr(source, key)) != (0.0 if key == "offset" else 1.0)
-                or (key == "factor" and source.unit in CURRENTS)
+                or (key == "factor" and source.unit in NEED_FACTOR)
             ]
             lines.append(f"{series} = {{{', '.join(entry)}}}")
         lines += [f'# {series} = {{from = "COLUMN", unit = "rad"}}' for series in _left_open(sources)]

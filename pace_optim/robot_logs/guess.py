@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from pace_actuators.joint_units import JointType
-from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, listed
+from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, MEASURED_SERIES, listed
 
 from .column_map import ColumnMap, Source
 from .joints import match, only_numbers
 from .log import Channel, Log
-from .units import guessed_unit
-from .words import CURRENTS, meaning
+from .units import Known, guessed_units
+from .words import CURRENTS, GAINS, NEED_FACTOR, meaning
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives are told."""
@@ -33,11 +34,29 @@ class Robot:
     """Lower and upper limit of each joint, (n, 2) [rad]; infinite where there is none."""
     joint_types: tuple[JointType, ...] = ()
     """Whether each joint turns or slides; none where it is not known."""
+    stiffness: np.ndarray | None = None
+    """kp of each joint's drive, (n,) [N m/rad]; NaN where nobody states it."""
+    effort_limit: np.ndarray | None = None
+    """Largest torque of each joint's drive, (n,) [N m]; infinite where nobody states it."""
 
     def joint_type(self, joint: str) -> JointType:
         """Whether a joint turns or slides; what is not known turns."""
         types = dict(zip(self.joint_names, self.joint_types, strict=False))
         return types.get(joint, "hinge")
+
+    def known(self, joint: str, stated: Mapping[str, Channel], given: Mapping[str, Channel]) -> Known:
+        """What is known of a joint, beside its series in SI units and as logged."""
+        j = self.joint_names.index(joint) if joint in self.joint_names else None
+        numbers: dict[str, Any] = {}
+        if j is not None:
+            numbers = {
+                name: float(values[j])
+                for name in ("stiffness", "effort_limit")
+                if (values := getattr(self, name)) is not None
+            }
+            if self.limits is not None:
+                numbers["limits"] = (float(self.limits[j, 0]), float(self.limits[j, 1]))
+        return Known(joint_type=self.joint_type(joint), stated=stated, given=given, **numbers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +83,9 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     Args:
         log: The log.
         robot: The robot, as far as it is known.
+
+    Raises:
+        ValueError: If a joint's numbers fit two units.
     """
     candidates = [found for channel in log.channels.values() if (found := _candidate(channel)) is not None]
     names = robot.joint_names or _own_names(candidates)
@@ -72,34 +94,70 @@ def guess_map(log: Log, robot: Robot) -> Guess:
         groups[each.channel.table, each.series].append(each)
     notes: list[str] = []
     chosen: dict[str, dict[str, tuple[tuple[float, int, int], _Candidate]]] = {name: {} for name in names}
-    for series in JOINT_SERIES:
-        for (_, of), group in groups.items():
+    named = {c.channel.table for c in candidates if not only_numbers([c.label]) and match(c.label, names)}
+    for series in (*JOINT_SERIES, *GAINS.values()):
+        for (table, of), group in groups.items():
             if of != series:
                 continue
-            pairs = _by_name(group, names) or _by_place(group, names, chosen, notes)
+            if series in GAINS.values() and [each.label for each in group] == [""]:  # one for all
+                pairs = [(name, 0.3, group[0]) for name in names]
+            else:
+                pairs = _by_name(group, names) or _by_place(group, names, chosen, table in named, notes)
             for name, score, each in pairs:
                 rank = (score, len(pairs), len(each.channel.time))
                 if series not in chosen[name] or rank > chosen[name][series][0]:
                     chosen[name][series] = (rank, each)
     picked = {name: {s: c for s, (_, c) in sorted(by.items(), key=_order)} for name, by in chosen.items()}
+    facts, more = _gains(picked)
+    notes += more
     picked = _without_plans(picked, notes)
     sources, more = _with_units(picked, robot, names)
     notes += more
     if not any(s in COMMAND_SERIES for by in sources.values() for s in by):
         _effort_as_command(sources, notes)
-    left = sorted(
-        {c.label or c.channel.key for c in candidates}
-        - {c.label or c.channel.key for by in picked.values() for c in by.values()}
-    )
-    if left:
-        notes.append(f"Not used: {listed(left, 12)}.")
+    enable, more = _enable([c.channel for c in candidates if c.series == "torque_enable"])
     return Guess(
-        columns=ColumnMap(joints=sources), notes=tuple(notes), missing=tuple(_missing(sources, names, candidates))
+        columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable),
+        notes=(*notes, *more),
+        missing=tuple(_missing(sources, names, candidates)),
     )
+
+
+def _enable(channels: Sequence[Channel]) -> tuple[str, list[str]]:
+    """The column that says whether the drives give torque; columns of several joints must say the same."""
+    switches = [each for each in channels if np.all((each.values == 0) | (each.values == 1))]
+    if not switches:
+        return "", []
+    first = switches[0]
+    if any(not np.array_equal(first.values, other.values) for other in switches):
+        raise ValueError(
+            f"{listed(each.key for each in switches)}: the drives of some joints are off while others' are on, which "
+            "no recording can say. Cut the log there, or leave these columns out."
+        )
+    off = float(np.mean(first.values == 0))
+    return first.key, [f"{first.key} says whether the drives give torque: they are off in {off:.0%} of the rows."]
+
+
+def _gains(picked: Mapping[str, Mapping[str, _Candidate]]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Gains that the log has as columns, where they stay the same, and notes."""
+    facts: dict[str, dict[str, float]] = {}
+    notes = []
+    for fact in dict.fromkeys(GAINS.values()):
+        found = {name: by[fact].channel for name, by in picked.items() if fact in by}
+        if changing := [channel.key for channel in found.values() if np.ptp(channel.values) > 0]:
+            notes.append(
+                f"{listed(changing)}: the gain changes in the log, and a recording has one {fact} for each joint: "
+                "not used. Cut the log there."
+            )
+        elif len(found) == len(picked) > 0:
+            facts[fact] = {name: float(channel.values[0]) for name, channel in found.items()}
+            values = listed((f"{value:g} ({name})" for name, value in facts[fact].items()), 6)
+            notes.append(f"{fact}, by the log's own columns: {values}.")
+    return facts, notes
 
 
 def _order(entry: tuple[str, object]) -> int:
-    return JOINT_SERIES.index(entry[0])
+    return (*JOINT_SERIES, *GAINS.values()).index(entry[0])
 
 
 def _candidate(channel: Channel) -> _Candidate | None:
@@ -110,15 +168,16 @@ def _candidate(channel: Channel) -> _Candidate | None:
         )
     name = channel.key.removeprefix(channel.table + ":") if channel.table else channel.key
     said = meaning(name, channel.table)
-    if said.quantity not in ("dof_pos", "dof_vel", "dof_effort"):
+    if not said.quantity:
         return None
     label = "_".join(said.joint)
     if channel.table and (not label or only_numbers([label]) or label == "data"):
         around = meaning(channel.table.strip("/").replace("/", "_")).joint
         place = [word for word in said.joint if word.isdigit()]
         label = "_".join(place or [word for word in around if word not in ("controller", "controllers", "forward")])
+    commanded = said.commanded and said.quantity in MEASURED_SERIES
     return _Candidate(
-        channel=channel, series=("des_" if said.commanded else "") + said.quantity, label=label, unit=said.unit
+        channel=channel, series=("des_" if commanded else "") + said.quantity, label=label, unit=said.unit
     )
 
 
@@ -150,10 +209,21 @@ def _by_place(
     group: Sequence[_Candidate],
     names: Sequence[str],
     chosen: dict[str, dict[str, tuple[tuple[float, int, int], _Candidate]]],
+    has_names: bool,
     notes: list[str],
 ) -> list[tuple[str, float, _Candidate]]:
-    """Columns without names of joints: in the robot's order, or in that in which they follow the motion."""
+    """Columns without names of joints: in the robot's order, or in that in which they follow the motion.
+
+    Not where the log names joints elsewhere, or where numbers are left out: then places could mislead.
+    """
     if len(group) != len(names) or not only_numbers(each.label for each in group):
+        return []
+    if len(names) > 1 and (has_names or not _counted([each.label for each in group])):
+        why = "the log names joints in other columns" if has_names else "their numbers leave some out"
+        notes.append(
+            f"{listed(each.channel.key for each in group)} name no joint of the robot, and {why}: not taken by their "
+            "places. If they are in the robot's order, say so in a column map."
+        )
         return []
     what = f"{group[0].channel.key} … {group[-1].channel.key}" if len(group) > 1 else group[0].channel.key
     measured = [chosen[name].get("dof_pos") for name in names]
@@ -166,6 +236,14 @@ def _by_place(
     if len(names) > 1:
         notes.append(f"{what} name no joints: taken in the order {listed(names)}.")
     return [(name, 0.4, each) for name, each in zip(names, group, strict=True)]
+
+
+def _counted(labels: Sequence[str]) -> bool:
+    """Whether labels count through: 0, 1, 2 or 1, 2, 3, in their order, or have no number at all."""
+    numbers = [int(digits[-1]) if (digits := re.findall(r"\d+", label)) else None for label in labels]
+    if all(number is None for number in numbers):
+        return len(labels) == 1
+    return numbers in (list(range(len(labels))), list(range(1, len(labels) + 1)))
 
 
 def _distance(command: Channel, position: Channel) -> float:
@@ -197,32 +275,44 @@ def _with_units(
     picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str]
 ) -> tuple[dict[str, dict[str, Source]], list[str]]:
     groups: dict[tuple[str, str, JointType], dict[str, _Candidate]] = defaultdict(dict)
+    stated: dict[str, dict[str, Channel]] = {name: {} for name in names}
     for name, by in picked.items():
         for series, each in by.items():
+            if series not in JOINT_SERIES:
+                continue
             groups[series, each.unit or each.channel.table, robot.joint_type(name)][name] = each
+            if each.unit and each.unit not in NEED_FACTOR:
+                stated[name][series] = _scaled(each.channel, series, each.unit)
+    given = {name: {series: each.channel for series, each in by.items()} for name, by in picked.items()}
     sources: dict[str, dict[str, Source]] = {name: {} for name in names}
     scaled: dict[str, Channel] = {}
-    notes = []
-    for (series, _, joint_type), group in sorted(groups.items(), key=_order_of_group):
-        stated = next(iter(group.values())).unit
-        channels = {name: each.channel for name, each in group.items()}
-        told = (stated, "") if stated else guessed_unit(series, channels, scaled, robot.limits, names, joint_type)
-        unit, note = told
-        notes += [note] if note else []
-        if unit in CURRENTS:
-            keys = listed(channel.key for channel in channels.values())
-            notes.append(f"{keys}: a current; left out, unless a column map gives its factor [N m/A].")
+    of_positions: dict[str, str] = {}
+    notes: list[str] = []
+    for (series, _, _), group in sorted(groups.items(), key=_order_of_group):
+        unit = next(iter(group.values())).unit
+        if unit in NEED_FACTOR:
+            keys = listed(each.channel.key for each in group.values())
+            what = "a current" if unit in CURRENTS else "part of a largest load, as servos' registers hold it"
+            notes.append(f"{keys}: {what}, no torque; left out, unless a column map gives its factor.")
             continue
+        units = dict.fromkeys(group, unit)
         if not unit:
-            continue
-        for name, channel in channels.items():
-            source = Source(channel=channel.key, unit=unit)
-            sources[name][series] = source
+            known = {name: robot.known(name, stated[name], given[name]) for name in group}
+            units, more = guessed_units(series, known, scaled, of_positions)
+            notes += more
+        for name, each in group.items():
+            if not units[name]:
+                continue
+            sources[name][series] = Source(channel=each.channel.key, unit=units[name])
             if series == "dof_pos":
-                scaled[name] = Channel(
-                    key="", table="", time=channel.time, values=channel.values * source.scale(series)
-                )
+                scaled[name] = _scaled(each.channel, series, units[name])
+                of_positions[name] = units[name]
     return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes
+
+
+def _scaled(channel: Channel, series: str, unit: str) -> Channel:
+    """A channel in SI units."""
+    return replace(channel, values=channel.values * Source(channel="", unit=unit).scale(series))
 
 
 def _order_of_group(entry: tuple[tuple[str, str, str], object]) -> tuple[int, str, str]:

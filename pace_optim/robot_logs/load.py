@@ -14,7 +14,7 @@ from pace_optim.recording.checks import check_recording
 from pace_optim.recording.files import SUFFIXES, add_json_facts
 from pace_optim.recording.keys import listed
 
-from .build import fields_of, rates_of
+from .build import fields_of, rates_of, unused
 from .column_map import ColumnMap, map_text, printable, write_map
 from .guess import Robot, guess_map
 from .log import Log
@@ -60,7 +60,7 @@ def load_recordings(
     """
     path = Path(path)
     if not is_log(path, columns):
-        return [load_recording(path)]
+        return [load_recording(path, columns.rate if columns else 0.0)]
     found = understood(path, robot or Robot(), columns)
     if tell and columns is None:
         for line in found[0].lines:
@@ -70,7 +70,7 @@ def load_recordings(
 
 def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
     """Whether a path is a log of another program, and not a recording in this project's own form."""
-    if columns is not None and path.suffix.lower() not in (".npz", ".pt"):
+    if columns is not None and (columns.joints or columns.time) and path.suffix.lower() not in (".npz", ".pt"):
         return True
     if path.is_dir() or path.suffix.lower() in LOG_SUFFIXES or (_JOIN in str(path) and not path.exists()):
         return True
@@ -97,17 +97,24 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
     result = []
     for log in _logs(path, columns):
         used, notes = columns, list(log.notes)
-        if used is None:
+        beside = Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path
+        if used is None or not used.joints:
             guess = guess_map(log, robot)
-            used, notes = guess.columns, [*notes, *guess.notes]
+            own = guess.columns
+            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable)
+            notes += guess.notes
             if guess.missing:
                 raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
+            used = replace(used, facts={**own.facts, **used.facts})
+            if twice := [key for key in own.facts if key in add_json_facts({}, beside)]:
+                notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
+                used = replace(used, facts={key: value for key, value in used.facts.items() if key not in twice})
         names = robot.joint_names or tuple(used.joints)
         _check_map(path, used, names)
         fields, more = fields_of(log, used, names)
-        facts = add_json_facts(fields, Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path)
-        recording = check_recording(facts, source=str(path), default_name=log.name)
-        if len(log.name) > len(path.stem):  # an episode
+        more += [left] if (left := unused(log, used)) else []
+        recording = check_recording(add_json_facts(fields, beside), source=str(path), default_name=log.name)
+        if len(log.name) > len(path.stem):  # an episode, or a part
             recording = replace(recording, name=log.name)
         lines = [printable(line) for line in (f"{path}: read as", *rates_of(log, used), *notes, *more)]
         result.append(
@@ -203,7 +210,12 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
 
 def _joined(paths: Sequence[Path], columns: ColumnMap | None) -> Log:
     """CSV files of one clock as one log."""
-    logs = [read_csv_log(path, columns)[0] for path in paths]
+    logs = []
+    for path in paths:
+        log, *parts = read_csv_log(path, columns)
+        if parts:
+            raise ValueError(f"{path}: {log.notes[-1]} A half of a log must be of one clock: cut both files there.")
+        logs.append(log)
     origins = {bool(log.time_origin) for log in logs}
     if len(origins) > 1:
         raise ValueError(f"{_JOIN.join(map(str, paths))}: one has Unix time and one has not. Give both on one clock.")

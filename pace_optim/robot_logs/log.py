@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,8 +40,6 @@ class Log:
     """By key."""
     time_origin: float = 0.0
     """Unix time where the channels' time is zero [s]; 0 where the log does not say."""
-    lists: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Tables whose columns have numbers for names, not joints: {table: keys}."""
     notes: tuple[str, ...] = ()
     """What happened while reading."""
 
@@ -49,7 +47,9 @@ class Log:
 def cleaned(
     table: str, time: np.ndarray, columns: Mapping[str, np.ndarray], **what: Mapping[str, str]
 ) -> tuple[list[Channel], list[str]]:
-    """Channels of a table: rows in the order of time, each instant once, each channel without its empty cells.
+    """Channels of a table: each in the order of time, without its empty cells, each instant once.
+
+    Rows of one instant whose cells complete each other are one row. Of two values of one instant the last counts.
 
     Args:
         table: The topic or file.
@@ -62,27 +62,28 @@ def cleaned(
     if np.any(np.diff(time[order]) < 0.0):
         order = order[np.argsort(time[order], kind="stable")]
         notes.append(f"{where}rows out of order were sorted by time.")
-    fresh = np.ones(len(order), dtype=bool)
-    fresh[:-1] = np.diff(time[order]) > 0.0  # of one instant, the last
-    if repeated := int(np.sum(~fresh)):
-        order = order[fresh]
-        notes.append(f"{where}{repeated} rows of an instant that comes again were left out.")
     unchanged = len(order) == len(time) and np.array_equal(order, np.arange(len(time)))
     shared = time if unchanged else time[order]
-    clocks: dict[bytes, np.ndarray] = {}
-    channels, empty = [], 0
+    clocks: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    channels, empty, repeated = [], 0, 0
     for key, column in columns.items():
         values = np.asarray(column, dtype=np.float64)
         values = values if unchanged else values[order]
         filled = np.isfinite(values)
-        own = shared
-        if not filled.all():
-            empty += int(np.sum(~filled))
-            own = clocks.setdefault(filled.tobytes(), shared[filled])
-            values = values[filled]
-        if len(values):
+        if (mask := filled.tobytes()) not in clocks:
+            rows = np.flatnonzero(filled)
+            last = np.append(np.diff(shared[rows]) > 0.0, [True] * bool(len(rows)))
+            rows = rows[last]
+            clocks[mask] = rows, shared if len(rows) == len(shared) else shared[rows]
+        rows, own = clocks[mask]
+        empty += len(values) - int(filled.sum())
+        repeated = max(repeated, int(filled.sum()) - len(rows))
+        if len(rows):
             said = {name: by_key.get(key, "") for name, by_key in what.items()}
-            channels.append(Channel(key=key, table=table, time=own, values=values, **said))
+            kept = values if own is shared else values[rows]
+            channels.append(Channel(key=key, table=table, time=own, values=kept, **said))
+    if repeated:
+        notes.append(f"{where}{repeated} rows were left out: their instants come again with other values.")
     if empty:
         notes.append(f"{where}{empty} empty cells were left out, each in its column alone.")
     return channels, notes

@@ -15,7 +15,7 @@ import numpy as np
 from pace_actuators.files import parsed_json
 from pace_actuators.memory import check_memory
 from pace_optim.recording.keys import listed
-from pace_optim.recording.stamps import seconds_of, unix_unit
+from pace_optim.recording.stamps import seconds_of, set_back, unix_unit, unrounded
 
 from .column_map import ColumnMap
 from .log import Log, cleaned
@@ -29,7 +29,13 @@ _BYTES_PER_VALUE = 64
 """Memory of a value of a parquet file while lists of it are read."""
 _BYTES_PER_BYTE = 12
 """Memory of a CSV's cells as text, for each of its bytes."""
-_NANO = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
+_WHOLE = ("s", "sec", "secs", "second", "seconds")
+_FRACTIONS = {
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds"), 1),
+    **dict.fromkeys(("us", "usec", "usecs", "microsec", "microsecs", "micros", "microseconds"), 1_000),
+    **dict.fromkeys(("ms", "msec", "msecs", "millisec", "millisecs", "millis", "milliseconds"), 1_000_000),
+}
+"""What a column of the part of a second beside one of whole seconds may be called, in nanoseconds."""
 
 
 def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
@@ -38,7 +44,7 @@ def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     Raises:
         ValueError: If it cannot be read as a table over time.
     """
-    return [_log(path.stem, path, _csv_columns(path), columns)]
+    return _logs(path.stem, path, _csv_columns(path), columns)
 
 
 def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
@@ -73,7 +79,7 @@ def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
                 every |= dict(_unfolded(name, table.column(name), _names_of(info, name)))
         for episode, part in _episodes(every):
             name = path.stem if episode is None else f"{path.stem} episode {episode}"
-            logs.append(_log(name, path, _with_exact_time(part, info), columns))
+            logs += _logs(name, path, _with_exact_time(part, info), columns)
     if len(logs) == 1:
         logs = [replace(logs[0], name=path.stem)]
     return logs
@@ -158,7 +164,8 @@ def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[
         [row if row is not None and len(row) == length else [np.nan] * length for row in rows], dtype=float
     )
     for i in range(length):
-        yield f"{name}[{names[i] if len(names) == length else i}]", values[:, i]
+        place = f"{i} of {length}, {len(names)} names" if names else str(i)  # whose names these are is not known
+        yield f"{name}[{names[i] if len(names) == length else place}]", values[:, i]
 
 
 def _info(root: Path) -> Mapping[str, Any]:
@@ -172,11 +179,23 @@ def _info(root: Path) -> Mapping[str, Any]:
 
 
 def _names_of(info: Mapping[str, Any], feature: str) -> tuple[str, ...]:
-    """The names of a feature's items: a list, or a list within a dict, as the versions of LeRobot have them."""
+    """The names of a feature's items: in a list, or in lists and tables within each other, or {name: place}."""
     names: Any = info.get("features", {}).get(feature, {}).get("names")
-    while isinstance(names, Mapping) and names:
-        names = next(iter(names.values()))
-    return tuple(str(name) for name in names) if isinstance(names, list) else ()
+    if isinstance(names, Mapping) and names and all(isinstance(place, int) for place in names.values()):
+        return tuple(sorted(names, key=lambda name: names[name]))
+    return tuple(_texts(names))
+
+
+def _texts(names: Any) -> Iterator[str]:
+    """Every text in lists and tables within each other, in order."""
+    if isinstance(names, str):
+        yield names
+    elif isinstance(names, Mapping):
+        for each in names.values():
+            yield from _texts(each)
+    elif isinstance(names, list):
+        for each in names:
+            yield from _texts(each)
 
 
 def _episodes(columns: dict[str, np.ndarray]) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
@@ -200,46 +219,98 @@ def _with_exact_time(columns: dict[str, np.ndarray], info: Mapping[str, Any]) ->
     return columns
 
 
-def _log(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> Log:
-    column, unit = _time_column(path, columns, chosen)
-    time, origin, note = _seconds(path, column, columns[column], unit)
-    numbers = {
-        key: values
-        for key, values in columns.items()
-        if key != column and values.dtype.kind in "biuf" and not is_time(key)
-    }
-    channels, notes = cleaned("", time, numbers)
-    return Log(
-        name=name,
-        channels={channel.key: channel for channel in channels},
-        time_origin=origin,
-        notes=(note, *notes),
+def _logs(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> list[Log]:
+    """The log of a table; several where its clock was set back in between."""
+    column, time, origin, note = _time(path, columns, chosen)
+    numbers, text = {}, []
+    for key, values in columns.items():
+        if key == column or is_time(key):
+            continue
+        if values.dtype.kind in "biuf":
+            numbers[key] = values
+        else:
+            text.append(key)
+    notes = [note] + ([f"Not used, because they are text: {listed(text)}."] if text else [])
+    back = _set_back(time, numbers)
+    parts = [slice(a, b) for a, b in zip([0, *back], [*back, len(time)], strict=True)]
+    if len(back):
+        jumps = [f"by {time[k - 1] - time[k]:.4g} s after row {k} ({time[k - 1] - time[0]:.4g} s)" for k in back]
+        notes.append(f"The clock goes back {listed(jumps, 4)}: read as {len(parts)} recordings.")
+    logs = []
+    for number, rows in enumerate(parts, start=1):
+        stamps, rounding = time[rows], ""
+        if all(np.isfinite(values[rows]).all() or not np.isfinite(values[rows]).any() for values in numbers.values()):
+            stamps, rounding = unrounded(stamps)
+        channels, more = cleaned("", stamps, {key: values[rows] for key, values in numbers.items()})
+        logs.append(
+            Log(
+                name=name if len(parts) == 1 else f"{name} part {number}",
+                channels={channel.key: channel for channel in channels},
+                time_origin=origin,
+                notes=(*(notes if number == 1 else []), *([rounding] if rounding else []), *more),
+            )
+        )
+    return logs
+
+
+def _set_back(time: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[int]:
+    """Rows at which the clock was set back, where the same columns go on: not of channels one after another."""
+    filled = np.array([np.isfinite(values) for values in columns.values()]).reshape(len(columns), -1)
+    return [k for k in set_back(time).tolist() if np.any(filled[:, :k].any(axis=1) & filled[:, k:].any(axis=1))]
+
+
+def _time(
+    path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None
+) -> tuple[str, np.ndarray, float, str]:
+    """The column of time, stamps [s], Unix time at zero, and a note on what they were taken for."""
+    if chosen and chosen.time and chosen.time not in columns:
+        raise ValueError(f"{path}: has no column '{chosen.time}' for the time. Columns: {listed(columns)}.")
+    joined = _join_seconds(columns)
+    named = [chosen.time] if chosen and chosen.time else [name for name in columns if is_time(name)]
+    usable = [name for name in named if (chosen and chosen.time) or _mostly_rises(columns[name])]
+    if usable:
+        best = max(usable, key=lambda name: _share_rising(columns[name]))
+        unit = (chosen.time_unit if chosen else "") or ("ns" if best in joined else time_unit(best))
+        return best, *_seconds(path, best, columns[best], unit)
+    if chosen and chosen.rate:
+        count = len(next(iter(columns.values())))
+        return "", np.arange(count) / chosen.rate, 0.0, f"Time is the row's number at the stated {chosen.rate:g} Hz."
+    raise ValueError(
+        f"{path}: no column of time found. Columns: {listed(columns)}. Name it time, or write a column map: [time] "
+        'column = "NAME", unit = "s". If the log has none, state its rate: --rate HZ.'
     )
 
 
-def _time_column(path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> tuple[str, str]:
-    if chosen and chosen.time:
-        if chosen.time not in columns:
-            raise ValueError(f"{path}: has no column '{chosen.time}' for the time. Columns: {listed(columns)}.")
-        return chosen.time, chosen.time_unit
-    unit = chosen.time_unit if chosen else ""
-    pairs = [name for name in columns if set(re.split(r"[^a-z]+", name.lower())) & _NANO]
-    for nano in pairs:
-        whole = next(
-            (n for n in columns if re.fullmatch(re.sub(r"nano|n(?=secs?$)", "", nano) + r"(onds)?s?", n)), None
-        )
-        if whole and whole != nano:
-            stamp = columns[whole].astype(np.int64) * 1_000_000_000 + columns[nano].astype(np.int64)
-            columns[whole] = stamp
-            return whole, "ns"
-    times = [name for name in columns if is_time(name)]
-    rising = [n for n in times if columns[n].dtype.kind in "UM" or np.mean(np.diff(columns[n].astype(float)) > 0) > 0.5]
-    if not rising:
-        raise ValueError(
-            f"{path}: no column of time found. Columns: {listed(columns)}. Name them time, dof_pos/<joint>, "
-            'des_dof_pos/<joint>, or write a column map: [time] column = "NAME", unit = "s".'
-        )
-    return rising[0], unit or time_unit(rising[0])
+def _join_seconds(columns: dict[str, np.ndarray]) -> set[str]:
+    """Make whole seconds and their parts, in columns of their own, one column of nanoseconds; names of those."""
+    tokens = {name: re.split(r"[^a-z]+", name.lower()) for name in columns}
+    joined = set()
+    for part, own in tokens.items():
+        unit = next((_FRACTIONS[word] for word in own if word in _FRACTIONS), 0)
+        if not unit or columns[part].dtype.kind not in "iuf" or not 0 <= np.nanmax(columns[part]) * unit < 1e9:
+            continue
+        forms = [[whole if word in _FRACTIONS else word for word in own] for whole in _WHOLE]
+        whole = next((name for name, words in tokens.items() if words in forms), None)
+        if whole is None or columns[whole].dtype.kind not in "iuf" or np.any(columns[whole] % 1):
+            continue
+        nano = columns.pop(part)
+        columns[whole] = columns[whole].astype(np.int64) * 1_000_000_000 + (nano * unit).astype(np.int64)
+        joined.add(whole)
+    return joined
+
+
+def _mostly_rises(values: np.ndarray) -> bool:
+    """Whether a column may be time: it hardly ever falls, and does not stand still."""
+    if values.dtype.kind in "UM":
+        return True
+    step = np.diff(values.astype(np.float64))
+    step = step[np.isfinite(step)]
+    return len(step) > 0 and float(np.mean(step < 0)) < 0.5 and bool(np.any(step > 0))
+
+
+def _share_rising(values: np.ndarray) -> float:
+    """In how many rows a column rises; dates always."""
+    return 1.0 if values.dtype.kind in "UM" else float(np.mean(np.diff(values.astype(np.float64)) > 0))
 
 
 def _seconds(path: Path, column: str, values: np.ndarray, unit: str) -> tuple[np.ndarray, float, str]:

@@ -1,127 +1,268 @@
-"""Units that nobody wrote down, from the numbers: joint limits, commands, slopes of positions."""
+"""Units that the log does not state, joint by joint: from ranges, speeds beside slopes, efforts beside gains, noise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pace_actuators.joint_units import JointType, units_for
+from pace_optim.recording.keys import listed
+from pace_optim.recording.noise import noise_floor
 
 from .log import Channel
 from .words import UNITS
 
-_BEYOND = {"dof_pos": 0.2, "des_dof_pos": 2.0 * np.pi}
-"""How far beyond a joint's limits positions in rad may be [rad]."""
+_BEYOND = 0.2
+"""How far beyond a joint's limits positions may be [rad]."""
 _TURNS = 4.0 * np.pi
-"""Where no limits are known, positions beyond this are degrees (up to 360), of a slide millimetres [rad, m]."""
+"""Where no limits are known, positions that are commanded beyond this are degrees (up to 360), of a slide mm [rad, m]."""
 _POSITIONS: dict[JointType, tuple[str, str]] = {"hinge": ("rad", "deg"), "slide": ("m", "mm")}
 """What positions are in, and what else they may be in."""
 _WORDS = {"deg": "degrees", "mm": "millimetres"}
 _NEAR = 1.3
 """Ratio of a speed to its position's slope, of that of a unit."""
+_STILL = 0.05
+"""Positions within this are of a joint that stands: they say the same in degrees [rad]."""
+_CLEAR = 3.0
+"""How many times nearer one unit must be than the other, to be it."""
+_MOVES = 0.05
+"""Root mean square of a slope that a speed can be held against [rad/s]."""
 
 
-def guessed_unit(
-    series: str,
-    channels: Mapping[str, Channel],
-    positions: Mapping[str, Channel],
-    limits: np.ndarray | None,
-    names: Sequence[str],
-    joint_type: JointType = "hinge",
-) -> tuple[str, str]:
-    """The unit of one series that a table has of some joints, and a note where it is not SI ("" leaves it out).
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of a joint beside the numbers of one series."""
+
+    joint_type: JointType = "hinge"
+    """Whether it turns or slides."""
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    """Lower and upper limit [rad, of slides m]; infinite where there is none."""
+    stiffness: float = np.nan
+    """kp [N m/rad]; NaN where it is not known."""
+    effort_limit: float = np.inf
+    """Largest torque [N m]."""
+    stated: Mapping[str, Channel] = field(default_factory=dict)
+    """Its series whose unit the log states, in SI units."""
+    given: Mapping[str, Channel] = field(default_factory=dict)
+    """All its series, as logged."""
+
+
+def guessed_units(
+    series: str, known: Mapping[str, Known], positions: Mapping[str, Channel], of_positions: Mapping[str, str]
+) -> tuple[dict[str, str], list[str]]:
+    """The unit of one series of a table's joints of one type ("" leaves it out), and notes where it is not SI.
 
     Args:
         series: `dof_pos`, ...
-        channels: Its channels, by joint.
-        positions: The positions that are known already [rad, of slides m], by joint.
-        limits: Of each of `names`, (n, 2) [rad, of slides m].
-        names: The robot's joints.
-        joint_type: Whether they turn or slide: degrees beside radians, or millimetres beside metres.
+        known: The joints that have it, by name.
+        positions: Positions whose unit was found before, in SI units, by joint.
+        of_positions: Their units.
+
+    Raises:
+        ValueError: If a joint may be in either of two units.
     """
+    joint_type = next(iter(known.values())).joint_type
+    channels = {name: joint.given[series] for name, joint in known.items()}
     if series == "dof_pos":
-        return _of_positions(channels, limits, names, joint_type)
+        return _of_positions(known, channels, joint_type)
     if series == "des_dof_pos":
-        return _of_commands(channels, positions, joint_type)
+        return _of_commands(channels, positions, of_positions, joint_type)
     if series in ("dof_vel", "des_dof_vel"):
         return _of_speeds(series, channels, positions, joint_type)
-    return units_for("N m", [joint_type]), ""
+    return _of_efforts(series, known, channels, joint_type)
 
 
 def _of_positions(
-    channels: Mapping[str, Channel], limits: np.ndarray | None, names: Sequence[str], joint_type: JointType
-) -> tuple[str, str]:
+    known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
+) -> tuple[dict[str, str], list[str]]:
     whole, small = _POSITIONS[joint_type]
-    word = _WORDS[small]
-    largest = max(float(np.abs(channel.values).max()) for channel in channels.values())
-    beyond = [0.0, 0.0]
-    known = False
-    if limits is not None:
-        for name, channel in channels.items():
-            low, high = limits[list(names).index(name)]
-            if np.isfinite(low) and np.isfinite(high):
-                known = True
-                for i, unit in enumerate((1.0, UNITS["dof_pos"][small])):
-                    outside = max(low - unit * channel.values.min(), unit * channel.values.max() - high)
-                    beyond[i] = max(beyond[i], float(outside))
-    if known and beyond[0] > _BEYOND["dof_pos"] >= beyond[1]:
-        return (
-            small,
-            f"Positions reach {largest:.4g}, {beyond[0]:.3g} beyond the joints' limits in {whole}: read as {word}.",
+    units: dict[str, str] = {}
+    why: dict[str, str] = {}
+    for name, channel in channels.items():
+        joint = known[name]
+        beyond, within = (_outside(channel.values * UNITS["dof_pos"][unit], joint.limits) for unit in (whole, small))
+        limited = all(np.isfinite(joint.limits))
+        if limited and beyond > _BEYOND >= within:
+            units[name], why[name] = small, f"{beyond:.3g} beyond its limits in {whole}"
+        elif by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small):
+            units[name], why[name] = by, "by its speeds or torques"
+        elif not limited:
+            far = _TURNS < np.abs(channel.values).max() <= (360.0 if small == "deg" else np.inf)
+            units[name] = small if far and "des_dof_pos" in joint.given else whole
+            why[name] = "and it follows a position" if units[name] == small else ""
+    if small not in units.values():
+        return {name: units.get(name, whole) for name in channels}, []
+    open_ones = [name for name in channels if name not in units]
+    for name in open_ones:
+        units[name] = _like_others(name, channels, units, small)
+    notes = [
+        f"Positions of {name} reach {np.abs(channels[name].values).max():.4g}"
+        f"{', ' + why[name] if why.get(name) else ''}: read as {_WORDS[small]}."
+        for name in channels
+        if units[name] == small
+    ]
+    if mixed := [name for name in open_ones if units[name] == whole]:
+        notes.append(f"Positions of {listed(mixed)} are read in {whole}: only so their noise is like the others'.")
+    return units, notes
+
+
+def _outside(values: np.ndarray, limits: tuple[float, float]) -> float:
+    return float(max(limits[0] - values.min(), values.max() - limits[1]))
+
+
+def _by_speeds(joint: Known, whole: str, small: str) -> str:
+    """The unit of positions whose slopes are the speeds that the log states in SI units; "" where that is not said."""
+    speed, position = joint.stated.get("dof_vel"), joint.given["dof_pos"]
+    if speed is None or len(position.time) < 3:
+        return ""
+    slope = np.gradient(position.values, position.time)
+    there = np.interp(position.time, speed.time, speed.values)
+    if not np.sqrt(np.mean(there**2)) > _MOVES or not slope @ slope:
+        return ""
+    return _nearer(float(slope @ there / (slope @ slope)), whole, small)
+
+
+def _by_gains(joint: Known, whole: str, small: str) -> str:
+    """The unit of positions and commands with which the torque's kp is the drive's; "" where that is not said."""
+    effort, position, command = (joint.given.get(key) for key in ("dof_effort", "dof_pos", "des_dof_pos"))
+    if effort is None or command is None or position is None or not joint.stiffness > 0:
+        return ""
+    error = held(command, position.time) - position.values
+    torque = np.interp(position.time, effort.time, effort.values)
+    columns = np.stack([error, np.gradient(position.values, position.time), np.ones(len(error))], axis=1)
+    gain = float(np.linalg.lstsq(columns, torque, rcond=None)[0][0]) if len(error) > 3 else 0.0
+    return _nearer(gain / joint.stiffness, whole, small) if gain > 0 else ""
+
+
+def _nearer(ratio: float, whole: str, small: str) -> str:
+    """The unit of which one is a ratio of SI units; "" where neither is clearly nearer."""
+    away = {unit: abs(np.log(max(ratio, 1e-12) / UNITS["dof_pos"][unit])) for unit in (whole, small)}
+    near = min(away, key=lambda unit: away[unit])
+    return near if away[near] < np.log(_CLEAR) else ""
+
+
+def _like_others(name: str, channels: Mapping[str, Channel], units: Mapping[str, str], small: str) -> str:
+    """The unit of a joint whose numbers fit both, beside joints in the smaller one: their encoders are alike.
+
+    Raises:
+        ValueError: If its noise does not tell.
+    """
+    own = channels[name]
+    if np.ptp(own.values) < _STILL:
+        return small
+    whole = "rad" if small == "deg" else "m"
+    others = [_noise(channels[other]) * UNITS["dof_pos"][units[other]] for other in units if units[other] == small]
+    noise, usual = _noise(own), float(np.median(others))
+    away = {u: abs(np.log(max(noise * UNITS["dof_pos"][u], 1e-12) / max(usual, 1e-12))) for u in (whole, small)}
+    near, far = sorted(away, key=lambda unit: away[unit])
+    if away[far] - away[near] < np.log(_CLEAR) or away[near] > np.log(10.0):
+        there = listed(other for other in units if units[other] == small)
+        raise ValueError(
+            f"{there}: positions are in {_WORDS[small]}, by the joints' limits. {name} goes from "
+            f"{own.values.min():.3g} to {own.values.max():.3g}, which fits {whole} and {_WORDS[small]}. State its unit "
+            "in a column map (pace import --write_map)."
         )
-    if not known and _TURNS < largest <= (360.0 if small == "deg" else np.inf):
-        return small, f"Positions reach {largest:.4g}: read as {word}."
-    return whole, ""
+    return near
+
+
+def _noise(channel: Channel) -> float:
+    step = float(np.median(np.diff(channel.time))) if len(channel.time) > 1 else 1.0
+    return noise_floor(channel.values, step).sigma
 
 
 def _of_commands(
-    channels: Mapping[str, Channel], positions: Mapping[str, Channel], joint_type: JointType
-) -> tuple[str, str]:
+    channels: Mapping[str, Channel],
+    positions: Mapping[str, Channel],
+    of_positions: Mapping[str, str],
+    joint_type: JointType,
+) -> tuple[dict[str, str], list[str]]:
+    """A joint moves as far as its command; one that stands is told in the unit of its position."""
     whole, small = _POSITIONS[joint_type]
-    moved = asked = 0.0
-    far = {whole: 0.0, small: 0.0}
+    units = {}
     for name, channel in channels.items():
+        units[name] = whole
         if (position := positions.get(name)) is None:
             continue
-        command = _held(channel, position.time)
-        moved, asked = moved + float(position.values.var()), asked + float(command.var())
-        for unit in far:
-            far[unit] += float(np.mean((command * UNITS["dof_pos"][unit] - position.values) ** 2))
-    if moved and asked:  # a joint that follows late or too far is as far from its command as from none
-        ratio = np.sqrt(moved / asked)
-        far = {unit: abs(np.log(ratio / UNITS["dof_pos"][unit])) for unit in far}
-    note = f"Commands follow the positions as {_WORDS[small]}: read so."
-    return (small, note) if far[small] < far[whole] else (whole, "")
+        command = held(channel, position.time)
+        moved, asked = float(np.std(position.values)), float(np.std(command))
+        if moved > 0 and asked > 0:  # a joint that follows late or too far is as far from its command as from none
+            away = {unit: abs(np.log(moved / asked / UNITS["dof_pos"][unit])) for unit in (whole, small)}
+        else:
+            mean = float(position.values.mean())
+            away = {unit: abs(float(command.mean()) * UNITS["dof_pos"][unit] - mean) for unit in (whole, small)}
+        if of_positions.get(name) in away:  # which is likelier than another one
+            away[of_positions[name]] *= 0.5
+        units[name] = min(away, key=lambda unit: away[unit])
+    told = [name for name, unit in units.items() if unit == small]
+    return units, [f"Commands of {listed(told)} follow the positions as {_WORDS[small]}: read so."] if told else []
 
 
 def _of_speeds(
     series: str, channels: Mapping[str, Channel], positions: Mapping[str, Channel], joint_type: JointType
-) -> tuple[str, str]:
-    """By how much speeds are more than the slopes of positions, all joints together."""
-    both = power = 0.0
+) -> tuple[dict[str, str], list[str]]:
+    """By how much speeds are more than the slopes of positions: each joint's that moves, the others' as all together."""
+    sums: dict[str, np.ndarray] = {}
     for name, channel in channels.items():
-        if (position := positions.get(name)) is None or len(position.time) < 3:
-            continue
-        slope = np.gradient(position.values, position.time)
-        speed = np.interp(position.time, channel.time, channel.values)
-        both, power = both + float(slope @ speed), power + float(slope @ slope)
-    ratio = both / power if power > 0.0 else 1.0
+        sums[name] = np.zeros(3)
+        if (position := positions.get(name)) is not None and len(position.time) >= 3:
+            slope = np.gradient(position.values, position.time)
+            speed = np.interp(position.time, channel.time, channel.values)
+            sums[name] = np.array([slope @ speed, slope @ slope, len(slope)])
+    both, power, _ = np.sum(list(sums.values()), axis=0)
+    every = both / power if power > 0 else 1.0
     whole, slides = units_for("rad/s", [joint_type]), joint_type == "slide"
-    near = {
-        unit: abs(np.log(max(ratio, 1e-9) * factor))
-        for unit, factor in UNITS["dof_vel"].items()
-        if ("m/s" in unit) == slides
-    }
-    unit = min(near, key=lambda each: near[each])
-    if series == "des_dof_vel":
-        return (whole, "") if near[whole] < 1.0 or near[unit] > 0.5 else (unit, f"Speeds commanded: read as {unit}.")
-    if near[unit] < np.log(_NEAR):
-        return unit, "" if unit == whole else f"Speeds are {ratio:.3g} times the slopes of positions: read as {unit}."
-    if not any(np.any(channel.values) for channel in channels.values()):
-        return "", ""
-    return "", f"Speeds are {ratio:.3g} times the slopes of positions, of no known unit: left out."
+    units: dict[str, str] = {}
+    strange: dict[str, float] = {}
+    for name, (own, square, count) in sums.items():
+        ratio = own / square if count and square / count > _MOVES**2 else every
+        away = {
+            unit: abs(np.log(max(ratio, 1e-9) * factor))
+            for unit, factor in UNITS["dof_vel"].items()
+            if ("m/s" in unit) == slides
+        }
+        unit = min(away, key=lambda each: away[each])
+        if series == "des_dof_vel":
+            units[name] = whole if away[whole] < 1.0 or away[unit] > 0.5 else unit
+        elif away[unit] < np.log(_NEAR):
+            units[name] = unit
+        else:
+            units[name] = ""
+            if np.any(channels[name].values):
+                strange[name] = ratio
+    word = "Speeds commanded" if series == "des_dof_vel" else "Speeds"
+    notes = [
+        f"{word} of {listed(n for n in units if units[n] == unit)}, beside the slopes of positions: read as {unit}."
+        for unit in dict.fromkeys(units.values())
+        if unit not in ("", whole)
+    ]
+    if strange:
+        ratios = listed(f"{name} ({ratio:.3g})" for name, ratio in strange.items())
+        notes.append(f"Speeds are no slopes of positions in any known unit: left out. Times the slope: {ratios}.")
+    return units, notes
 
 
-def _held(channel: Channel, at: np.ndarray) -> np.ndarray:
+def _of_efforts(
+    series: str, known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
+) -> tuple[dict[str, str], list[str]]:
+    """N m, unless the numbers are those of a register: whole, and beyond what the drive can give."""
+    whole = units_for("N m", [joint_type])
+    units, registers = {}, []
+    for name, channel in channels.items():
+        values, limit = channel.values, known[name].effort_limit
+        largest = float(np.abs(values).max())
+        is_register = bool(np.all(values == np.round(values))) and largest > (3 * limit if np.isfinite(limit) else 100)
+        units[name] = "" if is_register else whole
+        registers += [f"{channel.key} (up to {largest:.4g})"] if is_register else []
+    if not registers:
+        return units, []
+    return units, [
+        f"{listed(registers)}: whole numbers, as of a register in permille, percent or mA, and no {whole}: left out. If "
+        "you know what one is, give unit and factor in a column map."
+    ]
+
+
+def held(channel: Channel, at: np.ndarray) -> np.ndarray:
+    """A channel's values as they are in force at some instants."""
     return channel.values[np.clip(np.searchsorted(channel.time, at, side="right") - 1, 0, None)]

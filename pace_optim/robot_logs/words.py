@@ -17,13 +17,38 @@ UNITS: dict[str, dict[str, float]] = {
         "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "m/s": 1.0, "cm/s": 1e-2,
         "mm/s": 1e-3,
     },
-    EFFORT: {"N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3},
+    EFFORT: {
+        "N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3, "%": 1e-2, "permille": 1e-3,
+    },
 }  # fmt: skip
-"""Units of each quantity, in SI units; currents want a factor [N m/A] too."""
+"""Units of each quantity, in SI units; those of ``NEED_FACTOR`` want a factor too."""
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_TIME_WORDS = {
+    unit: named
+    for named, spelt in (
+        ("s", "s sec secs second seconds"),
+        ("ms", "ms msec msecs millis milliseconds"),
+        ("us", "us usec usecs micros microseconds"),
+        ("ns", "ns nsec nsecs nanosec nanosecs nanos nanoseconds"),
+    )
+    for unit in spelt.split()
+}
 CURRENTS = ("A", "mA")
+NEED_FACTOR = {"A": "A", "mA": "A", "%": "100 %", "permille": "1000 permille"}
+"""Units of efforts that are no torques, and what their factor [N m] is for one of."""
+GAINS = {"kp": "stiffness", "stiffness": "stiffness", "kd": "damping", "damping": "damping"}
+"""Columns of gains: the word, and the fact that it is."""
 
-_TIMES = {"t", "time", "timestamp", "timestamps", "stamp", "ts", "clock", "datetime", "date"}
+_TIMES = {
+    "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "clock", "datetime", "date", "sec",
+    "secs", "second", "seconds", "msec", "msecs", "millis", "milliseconds", "usec", "usecs", "micros", "microseconds",
+    "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds", "elapsed",
+}  # fmt: skip
+_OF_TIMES = {
+    "header", "ros", "log", "unix", "epoch", "since", "start", "utc", "from", "relative", "rel", "sim", "wall",
+    "system", "sys", "boot", "monotonic", "host", "received", "recv", "rx", "local", "sample", "abs",
+}  # fmt: skip
+"""Words beside those."""
 _COMMAND = {
     "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets", "goal", "ref",
     "reference", "setpoint", "set", "action", "actions", "sp", "ctrl", "input", "lowcmd",
@@ -43,7 +68,7 @@ _VELOCITY = {"vel", "velocity", "velocities", "dq", "qd", "qvel", "speed", "spee
 _EFFORT = {"effort", "efforts", "torque", "torques", "tau", "trq", "tq", "moment", "ff", "feedforward", "load"}
 _AMPERES = {"amp", "amps", "ampere", "amperes", "iq", "currents"}
 _OTHER = {
-    "error", "err", "errors", "temp", "temperature", "voltage", "volt", "volts", "kp", "kd", "ki", "gain", "gains",
+    "error", "err", "errors", "temp", "temperature", "voltage", "volt", "volts", "ki", "gain", "gains", "duty",
     "accel", "acc", "acceleration", "accelerations", "ddq", "qdd", "imu", "quat", "quaternion", "gyro", "index",
     "frame", "episode", "task", "limit", "min", "max", "status", "fault", "mode", "std", "pwm", "power", "id",
     "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum",
@@ -58,6 +83,8 @@ _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"\bmm[ _]?(/|per)[ _]?s(ec)?\b|mm_s\b", VELOCITY, "mm/s"),
     (r"\bcm[ _]?(/|per)[ _]?s(ec)?\b|cm_s\b", VELOCITY, "cm/s"),
     (r"\bm[ _]?(/|per)[ _]?s(ec)?\b|[ _]m_s\b", VELOCITY, "m/s"),
+    (r"‰|\bper[ _]?mille?\b", EFFORT, "permille"),
+    (r"%|\bpercent\b|\bpct\b", EFFORT, "%"),
     (r"\bmn[ _.·*]?m\b", EFFORT, "mN m"),
     (r"\bn[ _.·*]?m\b", EFFORT, "N m"),
     (r"\bma\b|milliamps?", EFFORT, "mA"),
@@ -72,7 +99,7 @@ _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
 )
 _UNIT_WORDS = {
     "deg", "degree", "degrees", "rad", "radian", "radians", "rpm", "nm", "mnm", "ms", "us", "ns", "ma", "turn",
-    "turns", "rev", "dps", "per", "sec", "mrad", "rps", "mm", "cm",
+    "turns", "rev", "dps", "per", "sec", "mrad", "rps", "mm", "cm", "percent", "pct", "mille", "permille",
 }  # fmt: skip
 """Not the letters n, m, s and a, which name joints (A1): they are units only where a pattern above says so."""
 
@@ -82,7 +109,7 @@ class Meaning:
     """What a name says; "" and () where it says nothing."""
 
     quantity: str
-    """`dof_pos`, `dof_vel`, `dof_effort`, `torque_enable` or ""."""
+    """`dof_pos`, `dof_vel`, `dof_effort`, `torque_enable`, `stiffness`, `damping` or ""."""
     commanded: bool
     unit: str
     joint: tuple[str, ...]
@@ -118,8 +145,10 @@ def meaning(name: str, table: str = "") -> Meaning:
     )
     if said & _OTHER:
         quantity = ""
-    elif said >= {"torque", "enable"} or said & {"enabled", "enable"}:
+    elif said & {"enabled", "enable"} or ("on" in said and said & {"torque", "servo", "motor", "drive", "power"}):
         quantity = "torque_enable"
+    elif gain := [GAINS[word] for word in own if word in GAINS]:
+        quantity = gain[0]
     elif current or said & _EFFORT:
         quantity = EFFORT
     elif said & _VELOCITY:
@@ -131,26 +160,29 @@ def meaning(name: str, table: str = "") -> Meaning:
     commanded = bool((said | set(around)) & _COMMAND) and not (said & _MEASURED - {"current"} and not said & _COMMAND)
     if quantity == EFFORT and said & {"ff", "feedforward"}:
         commanded = True
-    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(around)
+    if of_unit == EFFORT and unit in ("%", "permille") and quantity != EFFORT:
+        quantity = ""  # part of a range that nothing states
+    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(around)
+    if quantity == "torque_enable":
+        spoken |= {"enable", "enabled", "on"}
     joint = tuple(word for word in words(without_unit) if word not in spoken)
     if not unit and current and quantity == EFFORT:
         unit = "A"
+    if not unit and quantity == EFFORT and said & _EFFORT == {"load"}:
+        unit, of_unit = "%", EFFORT  # a servo's register, of a duty or of its largest torque
     return Meaning(quantity=quantity, commanded=commanded, unit=unit if of_unit in ("", quantity) else "", joint=joint)
 
 
 def is_time(name: str) -> bool:
     """Whether a column is called as time is."""
-    own = set(words(name)) - _UNIT_WORDS - {"s"}
-    return bool(own & _TIMES) and not own - _TIMES - {"header", "ros", "log", "unix", "epoch", "since", "start", "utc"}
+    own = set(words(name))
+    return bool(own & _TIMES) and not own - _TIMES - _OF_TIMES - _UNIT_WORDS - {"s"}
 
 
 def time_unit(name: str) -> str:
     """The unit that a column of time states, or ""."""
-    found = [
-        word for word in words(name) if word in (*TIME_UNITS, "sec", "secs", "seconds", "milliseconds", "nanoseconds")
-    ]
-    spelt = {"sec": "s", "secs": "s", "seconds": "s", "milliseconds": "ms", "nanoseconds": "ns"}
-    return spelt.get(found[-1], found[-1]) if found else ""
+    found = [unit for word in words(name) if (unit := _TIME_WORDS.get(word))]
+    return found[-1] if found else ""
 
 
 def _of_table(said: set[str], around: set[str]) -> str:
