@@ -10,6 +10,7 @@ from pace_optim.terminal.options import (
     add_control_option,
     add_device_option,
     add_log_options,
+    add_rate_option,
     number,
     take_common_options,
 )
@@ -33,6 +34,7 @@ def main() -> None:
         "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
     )
     add_log_options(parser)
+    add_rate_option(parser)
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",

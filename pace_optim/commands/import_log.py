@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pace_actuators.files import refuse_taken
 from pace_optim.recording import SUFFIXES, save_recording, written_files
-from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, write_map
+from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, with_rate, write_map
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
+from pace_optim.terminal.options import add_common_options, add_overwrite_option, add_rate_option, take_common_options
 
 
 def main() -> None:
@@ -23,13 +23,14 @@ def main() -> None:
     parser.add_argument("--columns", metavar="MAP", help="column map (.toml); without it, it is guessed")
     parser.add_argument("--output", metavar="FILE", help="recording to write (.csv, .npz, .pt); episodes get numbers")
     parser.add_argument("--write_map", metavar="MAP", help="write the map that was used, to correct it")
+    add_rate_option(parser)
     add_overwrite_option(parser)
     args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
 
     path = Path("+".join(args.log))
-    columns = read_map(Path(args.columns)) if args.columns else None
+    columns = with_rate(read_map(Path(args.columns)) if args.columns else None, args.rate)
     if not is_log(path, columns):
-        found = load_recordings(path)
+        found = load_recordings(path, columns=columns)
         print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
         parts = [(recording, columns) for recording in found]
     else:

@@ -173,6 +173,7 @@ def load_problem(
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
     columns: str | Path | None = None,
+    rate: float | None = None,
     strict: bool = False,
     max_duration: float | None = None,
     tell: Callable[[str], None] = tell_on_stderr,
@@ -192,6 +193,7 @@ def load_problem(
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
+        rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
         max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
             as a fit can afford.
@@ -225,8 +227,10 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings = read_all(data or [cfg.sim2real.recording], env, control_dt, columns=columns, strict=strict, tell=tell)
-    held_out = read_all(validation, env, control_dt, columns=columns, strict=strict, tell=tell)
+    recordings, held_out = (
+        read_all(paths, env, control_dt, columns=columns, rate=rate, strict=strict, tell=tell)
+        for paths in (data or [cfg.sim2real.recording], validation)
+    )
     recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)

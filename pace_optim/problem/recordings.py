@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pace_optim.recording import Recording, conform_recording
-from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, paired_files, read_map
+from pace_optim.recording.gaps import split_at_gaps
+from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -29,6 +30,7 @@ def read_all(
     control_dt: float,
     *,
     columns: str | Path | None = None,
+    rate: float | None = None,
     strict: bool = False,
     tell: Callable[[str], None] = tell_on_stderr,
 ) -> list[Recording]:
@@ -40,13 +42,14 @@ def read_all(
         env: The robot.
         control_dt: Control step [s].
         columns: Column map of the logs among them; ``None``: guessed.
+        rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one that cannot be used refuses all, instead of being set aside.
         tell: Is told what was understood of logs, and what was set aside.
 
     Raises:
         ValueError: If none can be used, or one cannot and ``strict``.
     """
-    chosen = None if columns is None else read_map(Path(columns))
+    chosen = with_rate(None if columns is None else read_map(Path(columns)), rate)
     names = paired_files([str(path) for path in paths])
     result: list[Recording] = []
     faults: list[str] = []
@@ -82,5 +85,6 @@ def _conformed(
             load_bodies=robot.body_names,
             accepts_load=sim2real.apply_load is not None,
         )
-        for recording in load_recordings(name, known, columns, tell)
+        for whole in load_recordings(name, known, columns, tell)
+        for recording in split_at_gaps(whole)
     ]

@@ -10,6 +10,7 @@ import torch
 
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.sessions import session_starts
+from pace_optim.recording.start_speed import start_speed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,7 +50,7 @@ class Dataset:
     start_time: torch.Tensor
     """When its first sample was taken, since the recording began, (R,) [s]; not zero of a window."""
     start_vel: torch.Tensor
-    """Speed at the first sample, (R, n) [rad/s]; zero where speeds were not recorded."""
+    """Speed at the first sample, (R, n) [rad/s]: measured, or the slope of positions where it stands out of noise."""
 
     @property
     def num_recordings(self) -> int:
@@ -183,7 +184,7 @@ def make_dataset(
         validation_only=tuple(r >= len(recordings) for r in range(len(every))),
         session_start=torch.as_tensor(session_start),
         start_time=torch.zeros(len(every), dtype=torch.float64),
-        start_vel=torch.stack([_start_vel(v, r) for v, r in zip(measured_vel[0], every, strict=True)]),
+        start_vel=torch.stack([torch.as_tensor(start_speed(recording)) for recording in every]),
     )
 
 
@@ -226,11 +227,6 @@ def _speed(recording: Recording) -> np.ndarray:
         if recording.dof_vel is None
         else np.where(np.isnan(recording.dof_vel), difference, recording.dof_vel)
     )
-
-
-def _start_vel(speed: torch.Tensor, recording: Recording) -> torch.Tensor:
-    recorded = np.zeros(recording.num_joints) if recording.dof_vel is None else ~np.isnan(recording.dof_vel[0])
-    return speed * torch.as_tensor(recorded)
 
 
 def _command(recording: Recording) -> np.ndarray:

@@ -3,7 +3,7 @@
 >>> for recording in load_recordings("leg_mcap", Robot(joint_names=("hip", "knee"))): ...
 """
 
-from .column_map import ColumnMap, read_map, write_map
+from .column_map import ColumnMap, read_map, with_rate, write_map
 from .load import Robot, is_log, load_recordings, paired_files, understood
 
 __all__ = [
@@ -14,5 +14,6 @@ __all__ = [
     "paired_files",
     "read_map",
     "understood",
+    "with_rate",
     "write_map",
 ]

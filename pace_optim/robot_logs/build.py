@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,9 +75,16 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
     return {**fields, **columns.facts}, notes
 
 
-def unused(log: Log, columns: ColumnMap) -> str:
-    """The channels that no series comes from, in a sentence; a topic of which nothing is used as one."""
-    used = {source.channel for by in columns.joints.values() for source in by.values()} | {columns.torque_enable}
+def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> str:
+    """The channels that no series comes from, in a sentence; a topic of which nothing is used as one.
+
+    Args:
+        log: The log.
+        columns: What is used of it.
+        facts_from: Channels that facts were read from.
+    """
+    used = {source.channel for by in columns.joints.values() for source in by.values()}
+    used |= {columns.torque_enable, *facts_from}
     tables = {log.channels[key].table for key in used if key in log.channels}
     left: dict[str, int] = {}
     for key, channel in log.channels.items():

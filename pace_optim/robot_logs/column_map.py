@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import file_at, write_atomically
 from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean, listed
 
-from .words import NEED_FACTOR, TIME_UNITS, UNITS
+from .words import CURRENTS, NEED_FACTOR, TIME_UNITS, UNITS
 
 _ENTRY = ("from", "unit", "sign", "offset", "gear_ratio", "factor")
 
@@ -100,6 +100,13 @@ def read_map(path: Path) -> ColumnMap:
     )
 
 
+def with_rate(columns: ColumnMap | None, rate: float | None) -> ColumnMap | None:
+    """A map, or none, that also says how many rows a second a log without time has [Hz]."""
+    if rate is None:
+        return columns
+    return ColumnMap(joints={}, rate=rate) if columns is None else replace(columns, rate=rate)
+
+
 def _sources(path: Path, joint: str, entries: Mapping[str, Any]) -> dict[str, Source]:
     _check_keys(path, f"joints.{joint}", entries, JOINT_SERIES)
     return {series: _source(path, f"joints.{joint}.{series}", series, entry) for series, entry in entries.items()}
@@ -115,7 +122,10 @@ def _source(path: Path, where: str, series: str, entry: Any) -> Source:
     if unit not in units:
         raise ValueError(f"{path}: {where}.unit is {unit!r}; expected one of {listed(units)}. Correct it.")
     if unit in NEED_FACTOR and "factor" not in entry:
-        raise ValueError(f"{path}: {where} is in {unit}; expected factor = N m per {NEED_FACTOR[unit]} beside it. Add it.")
+        what = "a current" if unit in CURRENTS else "part of a largest load"
+        raise ValueError(
+            f"{path}: {where} is {what}; expected factor = N m per {NEED_FACTOR[unit]} beside it. Add it."
+        )
     numbers = {key: entry[key] for key in ("sign", "offset", "gear_ratio", "factor") if key in entry}
     for key, value in numbers.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:

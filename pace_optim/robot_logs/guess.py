@@ -67,6 +67,8 @@ class Guess:
     notes: tuple[str, ...]
     missing: tuple[str, ...]
     """All that a recording needs and that was not found."""
+    facts_from: tuple[str, ...] = ()
+    """Channels that facts were read from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,17 +111,21 @@ def guess_map(log: Log, robot: Robot) -> Guess:
                     chosen[name][series] = (rank, each)
     picked = {name: {s: c for s, (_, c) in sorted(by.items(), key=_order)} for name, by in chosen.items()}
     facts, more = _gains(picked)
+    facts_from = {by[fact].channel.key for by in picked.values() for fact in facts if fact in by}
     notes += more
     picked = _without_plans(picked, notes)
     sources, more = _with_units(picked, robot, names)
     notes += more
     if not any(s in COMMAND_SERIES for by in sources.values() for s in by):
         _effort_as_command(sources, notes)
-    enable, more = _enable([c.channel for c in candidates if c.series == "torque_enable"])
+    switches = [c.channel for c in candidates if c.series == "torque_enable"]
+    enable, more = _enable(switches)
+    facts_from |= {channel.key for channel in switches} if enable else set()
     return Guess(
         columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable),
         notes=(*notes, *more),
         missing=tuple(_missing(sources, names, candidates)),
+        facts_from=tuple(facts_from),
     )
 
 

@@ -96,11 +96,11 @@ def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> li
 def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Understood]:
     result = []
     for log in _logs(path, columns):
-        used, notes = columns, list(log.notes)
+        used, notes, facts_from = columns, list(log.notes), ()
         beside = Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path
         if used is None or not used.joints:
             guess = guess_map(log, robot)
-            own = guess.columns
+            own, facts_from = guess.columns, guess.facts_from
             used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable)
             notes += guess.notes
             if guess.missing:
@@ -112,7 +112,7 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
         names = robot.joint_names or tuple(used.joints)
         _check_map(path, used, names)
         fields, more = fields_of(log, used, names)
-        more += [left] if (left := unused(log, used)) else []
+        more += [left] if (left := unused(log, used, facts_from)) else []
         recording = check_recording(add_json_facts(fields, beside), source=str(path), default_name=log.name)
         if len(log.name) > len(path.stem):  # an episode, or a part
             recording = replace(recording, name=log.name)

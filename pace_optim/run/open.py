@@ -93,7 +93,7 @@ class Run:
         settings = self.settings
         if data:
             own = {"data": [str(path) for path in data], "validation": []}
-            settings = replace(settings, **own, columns=columns, strict=strict)  # type: ignore[arg-type]
+            settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
             settings = replace(settings, physics_dt=physics_dt or settings.physics_dt)
             problem = problem_of(settings, self.load_cfg(), told=not data)
@@ -144,6 +144,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         unknown=settings.unknown,
         env_cfg=env_cfg,
         columns=settings.columns,
+        rate=settings.rate,
         strict=settings.strict,
         max_duration=settings.max_duration,
         tell=tell_nobody if told else tell_on_stderr,

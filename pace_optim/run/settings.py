@@ -85,6 +85,9 @@ class FitSettings:
     columns: str | None = None
     """Column map of logs that are not in this project's own form; ``None``: guessed."""
 
+    rate: float | None = None
+    """Rows per second of logs that have no column of time [Hz]."""
+
     strict: bool = False
     """Whether one recording that cannot be used refuses all, instead of being set aside."""
 
@@ -116,7 +119,7 @@ class FitSettings:
             value = getattr(self, name)
             if value is not None and value < lowest:
                 raise ValueError(f"{name} is {value}, expected at least {lowest}.")
-        for name in ("epsilon", "sigma", "physics_dt", "drive_dt", "control_dt", "max_duration"):
+        for name in ("epsilon", "sigma", "physics_dt", "drive_dt", "control_dt", "max_duration", "rate"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")

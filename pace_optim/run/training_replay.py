@@ -109,7 +109,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
     paths = settings.data or [str(fitted_cfg.sim2real.recording)]
     trained, held_out = (
-        read_all(each, env, control_dt, columns=settings.columns, strict=settings.strict)
+        read_all(each, env, control_dt, columns=settings.columns, rate=settings.rate, strict=settings.strict)
         for each in (paths, settings.validation)
     )
     dataset = make_dataset(trained, held_out)

@@ -105,6 +105,11 @@ def add_overwrite_option(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
 
 
+def add_rate_option(parser: argparse.ArgumentParser) -> None:
+    """Of commands that read logs for the first time; a column map says it too ([time] rate)."""
+    parser.add_argument("--rate", type=number, metavar="HZ", help="rows per second of logs that have no column of time")
+
+
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that reads recordings."""
     parser.add_argument(
