@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +27,14 @@ _LEVELS = np.linspace(0.4, 1.0, 31)
 """Quantiles of the torque's size that are tried as its limit."""
 _HALF = 0.5
 """Quantile of the torque's size below which one start takes it to be free, in case most of the rest is cut."""
+_FEW = 2000
+"""Samples that tell when a drive runs."""
+_PHASES = 8
+_FINEST_PHASE = 0.01
+"""Instants in a control step that are tried at first, and how near to each other they are at last [steps]."""
+_NEAR = 9
+"""Lags of commands that are tried with lags of position and speed of their own."""
+_HALVINGS = 20
 _PLATEAU = 0.05
 """A limit that is one is held to within this part of it; one that is not depends on something, as on the speed."""
 
@@ -50,6 +59,8 @@ class MeasuredLaw:
     """How much later a command is in the torque than the position that is [control steps]."""
     feedback_lag: float
     """How old the position in the torque is [control steps]; < 0 where a log has a torque before its position."""
+    speed_lag: float
+    """How old the speed in it is [control steps]."""
     resolution: float
     """What the delay can be told to [control steps]: commands count from one sample to the next."""
     limit: float | None
@@ -72,7 +83,7 @@ def read_law(recording: Recording, joint: int, longest_delay: float) -> Measured
         joint: Its column.
         longest_delay: Up to where the delay of commands is sought [control steps].
     """
-    table = Table.of(recording, joint, longest_delay)
+    table = Table.of(recording, joint, longest_delay, _phase(recording, joint, longest_delay))
     if table is None:
         return None
     size = np.abs(table.torque)
@@ -82,11 +93,36 @@ def read_law(recording: Recording, joint: int, longest_delay: float) -> Measured
     return _law(recording.joint_names[joint], table, fit, limit)
 
 
+def _phase(recording: Recording, joint: int, longest_delay: float) -> float | None:
+    """When in a control step a drive runs whose samples the log does not have; ``None``: with each sample."""
+    if recording.logged is None:
+        return None
+    tried: list[tuple[float, float | None]] = []
+    spacing, phases = 1.0 / _PHASES, [None, *np.arange(_PHASES) / _PHASES]
+    while spacing > _FINEST_PHASE and phases:
+        tried += [(_least_left(Table.of(recording, joint, longest_delay, each, _FEW)), each) for each in phases]
+        _, best = min(tried, key=lambda each: each[0])
+        spacing /= 2
+        phases = [] if best is None else [(best - spacing) % 1, (best + spacing) % 1]
+    return min(tried, key=lambda each: each[0])[1]
+
+
+def _least_left(table: Table | None) -> float:
+    """What a law without lags of feedback leaves of the smaller half of the torques, which no limit cuts [N² m²]."""
+    if table is None:
+        return np.inf
+    size = np.abs(table.torque)
+    below = size <= np.quantile(size, _HALF)
+    moments = _Moments(table, below)
+    lags = _refined(moments, _least(moments, [(0.0, 0.0)], table.command_lags[:-1], (("command",),)))
+    return moments.error(lags) / float(below.sum())
+
+
 def _settled(table: Table, below: np.ndarray) -> tuple[_Fit, float | None]:
     """Lags and limit that agree with each other, from samples that may be below the limit."""
     limit = None
     for _ in range(_ROUNDS):
-        limit, new = _limit(table, _best_lags(table, below))
+        limit, new = _limit(table, _best_lags(table, below, of_their_own=False))
         if np.array_equal(new, below):
             break
         below = new
@@ -98,6 +134,19 @@ def has_offset(law: MeasuredLaw) -> bool:
     return abs(law.offset) > max(SURE * law.std["offset"], APART * law.peak)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Lags:
+    """How old what a torque was made of is in it [control steps]."""
+
+    command: float
+    position: float
+    speed: float
+    variant: int
+    """Which of the table's speeds it is."""
+    free: tuple[tuple[str, ...], ...]
+    """Those that were found, and not taken to be zero; of equal ones, both."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Fit:
     """A linear fit at chosen lags."""
@@ -105,19 +154,22 @@ class _Fit:
     table: Table
     below: np.ndarray
     """Samples that it was fitted to, (K,) bool."""
-    names: tuple[str, ...]
-    """Its coefficients."""
-    terms: np.ndarray
-    """Their columns as combinations of the table's, (m, p)."""
-    command_lag: float
-    """[control steps]."""
-    feedback_lag: float
-    """[control steps]."""
+    lags: _Lags
+
+    @cached_property
+    def terms(self) -> dict[str, np.ndarray]:
+        """Columns as combinations of the table's, (m,), by coefficient."""
+        return _terms(self.table, self.lags)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return tuple(self.terms)
 
     @cached_property
     def columns(self) -> np.ndarray:
         """(K, p)."""
-        return self.table.columns @ self.terms
+        return self.table.columns @ np.stack(list(self.terms.values()), axis=1)
 
     @cached_property
     def coefficients(self) -> np.ndarray:
@@ -130,15 +182,54 @@ class _Fit:
         return self.columns @ self.coefficients
 
     def std(self) -> np.ndarray:
-        """Standard deviations of the coefficients, (p,): residuals that go on from sample to sample count less."""
-        own = self.columns[self.below]
+        """Standard deviations of the coefficients, (p,), with what the lags leave open.
+
+        (J^T J)^-1 J^T S J (J^T J)^-1 with J the columns and the slopes of the prediction over the free lags, and S the
+        products of residuals that are up to a quarter of a second apart, by Bartlett's window (Newey and West 1987):
+        residuals that go on from sample to sample count as few.
+        """
+        whole = np.concatenate([self.columns, self._lag_slopes()], axis=1)
+        scale = np.linalg.norm(whole[self.below], axis=0)
+        whole = whole / np.where(scale > 0, scale, 1.0)
         residual = np.where(self.below, self.table.torque - self.predicted, 0.0)
-        pairs = self.table.follows & self.below[1:] & self.below[:-1]
-        variance = float(residual[self.below] @ residual[self.below]) / max(1, len(own) - len(self.names))
-        alike = float((residual[1:] * residual[:-1])[pairs].mean()) / variance if variance and pairs.any() else 0.0
-        rho = min(max(alike, 0.0), 0.99)
-        covariance = np.linalg.pinv(own.T @ own) * variance * (1 + rho) / (1 - rho)
-        return np.sqrt(np.diag(covariance))
+        scores = whole * residual[:, None]
+        middle = scores.T @ scores
+        reach = min(self.table.memory, len(scores) // 10)
+        for apart in range(1, reach + 1):
+            cross = scores[apart:].T @ scores[:-apart]
+            middle += (1 - apart / (reach + 1)) * (cross + cross.T)
+        inverse = np.linalg.pinv(whole[self.below].T @ whole[self.below], rcond=1e-10, hermitian=True)
+        own = slice(len(self.names))
+        variance = np.maximum(np.diag(inverse @ middle @ inverse)[own], 0.0) / np.where(scale > 0, scale, 1.0)[own] ** 2
+        return np.sqrt(variance + self._between_lags())
+
+    def _between_lags(self) -> np.ndarray:
+        """Variances of the coefficients from lags between which a log that does not sample the drive cannot tell, (p,).
+
+        A lag of position or speed is known to half of what lies between two of the table's.
+        """
+        table, spread = self.table, np.zeros(len(self.names))
+        if table.sampled or table.phase is not None:
+            return spread
+        half = 0.5 * float(table.feedback_lags[1] - table.feedback_lags[0])
+        for name in ("position", "speed"):
+            ends = [
+                replace(self, lags=replace(self.lags, **{name: getattr(self.lags, name) + side * half})).coefficients
+                for side in (-1.0, 1.0)
+            ]
+            spread += (0.5 * (ends[1] - ends[0])) ** 2
+        return spread
+
+    def _lag_slopes(self) -> np.ndarray:
+        """Slopes of the prediction over each free lag, (K, number)."""
+        step = 0.25 * float(self.table.command_lags[1] - self.table.command_lags[0])
+        result = [np.zeros((len(self.table.torque), 0))]
+        for names in self.lags.free:
+            moved = [{name: getattr(self.lags, name) + side * step for name in names} for side in (-1.0, 1.0)]
+            ends = [_terms(self.table, replace(self.lags, **each)) for each in moved]
+            change = sum((ends[1][n] - ends[0][n]) * c for n, c in zip(self.names, self.coefficients, strict=True))
+            result.append((self.table.columns @ change)[:, None] / (2 * step))
+        return np.concatenate(result, axis=1)
 
 
 class _Moments:
@@ -147,84 +238,133 @@ class _Moments:
     def __init__(self, table: Table, below: np.ndarray):
         self.table, self.below = table, below
         scale = np.abs(table.columns).max(axis=0)
-        self._scale = np.where(scale > 0, scale, 1.0)
+        self._scale = np.where(scale > 1e-9, scale, 1.0)
         columns, torque = table.columns[below] / self._scale, table.torque[below]
         self._gram, self._moment, self._square = columns.T @ columns, columns.T @ torque, float(torque @ torque)
 
-    def error(self, terms: np.ndarray) -> float:
-        """Sum of squares that a fit leaves [N² m²]."""
+    def errors(self, lags: Sequence[_Lags]) -> np.ndarray:
+        """Sums of squares that fits at some lags leave, (B,) [N² m²]."""
+        terms = np.stack([np.stack(list(_terms(self.table, each).values()), axis=1) for each in lags])
         scaled = terms * self._scale[:, None]
-        moment = scaled.T @ self._moment
-        return self._square - float(moment @ np.linalg.lstsq(scaled.T @ self._gram @ scaled, moment, rcond=None)[0])
+        moment = np.einsum("bmp,m->bp", scaled, self._moment)
+        gram = np.swapaxes(scaled, 1, 2) @ (self._gram @ scaled)
+        size = np.sqrt(np.maximum(np.einsum("bpp->bp", gram), 1e-30))
+        gram = gram / (size[:, :, None] * size[:, None, :]) + 1e-12 * np.eye(gram.shape[1])
+        solved = np.linalg.solve(gram, (moment / size)[:, :, None])[:, :, 0]
+        return np.maximum(self._square - (moment / size * solved).sum(axis=1), 0.0)
+
+    def error(self, lags: _Lags) -> float:
+        """Sum of squares that a fit at some lags leaves [N² m²]."""
+        return float(self.errors([lags])[0])
 
 
-def _terms(table: Table, command_lag: float, feedback: int, speed: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
-    """Coefficients and their columns, where commands are so many control steps late: a mix of two whole ones."""
-    at = (command_lag - table.command_lags[0]) / (table.command_lags[1] - table.command_lags[0])
-    whole = int(np.clip(np.floor(at), 0, len(table.command_lags) - 2))
-    weights = (1 - (at - whole), at - whole)
+def _terms(table: Table, lags: _Lags) -> dict[str, np.ndarray]:
+    """Coefficients and their columns as combinations of the table's, (m,) each.
+
+    A lag between two of the table's is a mix of both.
+    """
     found: dict[str, np.ndarray] = {}
+    size = table.columns.shape[1]
 
-    def term(name: str, commanded: str | None, fed_back: int | None) -> None:
-        column = np.zeros(table.columns.shape[1])
+    def mix(column: np.ndarray, places: np.ndarray, at: float, sign: float, grid: np.ndarray) -> None:
+        where = float(np.clip((at - grid[0]) / (grid[1] - grid[0]), 0, len(grid) - 1))
+        whole = min(int(where), len(grid) - 2)
+        column[places[whole]] += sign * (1 - (where - whole))
+        column[places[whole + 1]] += sign * (where - whole)
+
+    def term(name: str, commanded: str | None, fed_back: np.ndarray | None = None, lag: float = 0.0) -> None:
+        column = np.zeros(size)
         if commanded is not None:
-            column[table.commands[commanded][whole : whole + 2]] = weights
+            mix(column, table.commands[commanded], lags.command, 1.0, table.command_lags)
         if fed_back is not None:
-            column[fed_back] = -1.0
+            mix(column, fed_back, lag, -1.0, table.feedback_lags)
         found[name] = column
 
     has = table.commands.keys()
     if "position" in has:
-        term("stiffness", "position", int(table.position[feedback]))
-    term("damping", "velocity" if "velocity" in has else None, int(speed[feedback]))
+        term("stiffness", "position", table.position, lags.position)
+    term("damping", "velocity" if "velocity" in has else None, table.speeds[lags.variant], lags.speed)
     if "effort" in has:
-        term("feed_forward", "effort", None)
-    term("offset", None, None)
+        term("feed_forward", "effort")
+    found["offset"] = np.zeros(size)
     found["offset"][-1] = 1.0
-    return tuple(found), np.stack(list(found.values()), axis=1)
+    return found
 
 
-def _best_lags(table: Table, below: np.ndarray) -> _Fit:
-    """The lags of commands and feedback at which the law leaves least: whole ones, then between them.
+def _best_lags(table: Table, below: np.ndarray, of_their_own: bool = True) -> _Fit:
+    """The lags at which the law leaves least, and no more of them than explain more than chance does.
 
-    Feedback is that of the torque's own sample unless another explains more than chance does (the information criterion
-    of Bayes).
+    Position and speed are those of the torque's own sample (both lags 0), or as old as each other, or each has a lag of
+    its own. Another lag must lower Bayes' criterion, in which residuals that go on from sample to sample count as few.
+    No command is newer than the position that it is compared with, and no speed, which is made of positions, is newer.
+
+    Args:
+        table: Torque and its causes.
+        below: Samples that may be below a limit, (K,) bool.
+        of_their_own: Whether position and speed may be of different age.
     """
     moments = _Moments(table, below)
-    lags = table.command_lags[:-1]
+    grid = table.feedback_lags
+    best = _refined(moments, _least(moments, [(0.0, 0.0)], table.command_lags[:-1], (("command",),)))
+    count = below.sum() / _alike(_Fit(table=table, below=below, lags=best))
+
+    def criterion(lags: _Lags) -> float:
+        error = max(moments.error(lags), float(np.finfo(float).tiny))
+        return float(count * np.log(error) + len(lags.free) * np.log(count))
+
+    same = _least(moments, [(a, a) for a in grid], table.command_lags[:-1], (("command",), ("position", "speed")))
+    best = min(best, _refined(moments, same), key=criterion)
+    if of_their_own:
+        lags = table.command_lags[:-1]
+        near = lags[np.argsort(np.abs(lags - best.command), kind="stable")[:_NEAR]]
+        later = grid[grid >= 0.0]
+        positions = later if "position" in table.commands else [0.0]
+        own = _least(
+            moments,
+            [(a, b) for a in positions for b in later if b >= a],
+            near,
+            (("command",), ("position",), ("speed",)),
+        )
+        best = min(best, _refined(moments, own), key=criterion)
+    return _Fit(table=table, below=below, lags=best)
+
+
+def _least(
+    moments: _Moments, feedback: Sequence[tuple[float, float]], commands: np.ndarray, free: tuple[tuple[str, ...], ...]
+) -> _Lags:
+    """The best of lags that the table has, whose commands are not newer than their positions."""
     tried = [
-        (moments.error(_terms(table, lag, f, speed)[1]), lag, f, s)
-        for s, speed in enumerate(table.speeds)
-        for f in range(len(table.feedback_lags))
-        for lag in lags
-    ]
-    of_now = min(each for each in tried if table.feedback_lags[each[2]] == 0)
-    best = min(tried)
-    least = np.finfo(float).tiny  # of a sum of squares that may be zero
-    evidence = below.sum() * (np.log(max(of_now[0], least)) - np.log(max(best[0], least)))
-    _, lag, f, s = best if evidence > np.log(below.sum()) else of_now
-    step = lags[1] - lags[0]
-    finer = _minimum(lambda at: moments.error(_terms(table, at, f, table.speeds[s])[1]), lag - step, lag + step)
-    names, terms = _terms(table, finer, f, table.speeds[s])
-    return _Fit(
-        table=table,
-        below=below,
-        names=names,
-        terms=terms,
-        command_lag=float(finer),
-        feedback_lag=float(table.feedback_lags[f]),
-    )
+        _Lags(command=float(command), position=float(position), speed=float(speed), variant=variant, free=free)
+        for variant in range(len(moments.table.speeds))
+        for command in commands
+        for position, speed in feedback
+        if command >= position - 1e-9
+    ] or [_Lags(command=0.0, position=0.0, speed=0.0, variant=0, free=free)]
+    return tried[int(moments.errors(tried).argmin())]
 
 
-def _minimum(error, low: float, high: float) -> float:  # type: ignore[no-untyped-def]
-    """Where a function of one number is least between two, by ternary search; it may have a kink there."""
-    for _ in range(30):
+def _refined(moments: _Moments, lags: _Lags) -> _Lags:
+    """The lag of commands between those of the table, by ternary search: it may have a kink where it is best.
+
+    Positions and speeds keep lags of the table: between its samples noise is less, which would draw them there.
+    """
+    step = float(moments.table.command_lags[1] - moments.table.command_lags[0])
+    low, high = max(lags.command - step, lags.position), lags.command + step
+    for _ in range(_HALVINGS):
         third = (high - low) / 3
-        if error(low + third) <= error(high - third):
-            high -= third
-        else:
-            low += third
-    return (low + high) / 2
+        first, second = moments.errors([replace(lags, command=x) for x in (low + third, high - third)])
+        low, high = (low, high - third) if first <= second else (low + third, high)
+    return replace(lags, command=(low + high) / 2)
+
+
+def _alike(fit: _Fit) -> float:
+    """How many samples say as much as one of residuals that did not go on: (1 + ρ) / (1 - ρ), ρ between neighbours."""
+    residual = np.where(fit.below, fit.table.torque - fit.predicted, 0.0)
+    pairs = fit.table.follows & fit.below[1:] & fit.below[:-1]
+    variance = float(residual[fit.below] @ residual[fit.below]) / max(1, int(fit.below.sum()))
+    rho = float((residual[1:] * residual[:-1])[pairs].mean()) / variance if variance and pairs.any() else 0.0
+    rho = min(max(rho, 0.0), 0.99)
+    return (1 + rho) / (1 - rho)
 
 
 def _limit(table: Table, fit: _Fit) -> tuple[float | None, np.ndarray]:
@@ -269,8 +409,9 @@ def _law(joint: str, table: Table, fit: _Fit, limit: float | None) -> MeasuredLa
         feed_forward=value.get("feed_forward"),
         offset=value["offset"],
         std=std,
-        delay=fit.command_lag - fit.feedback_lag,
-        feedback_lag=fit.feedback_lag,
+        delay=fit.lags.command - fit.lags.position,
+        feedback_lag=fit.lags.position,
+        speed_lag=fit.lags.speed,
         resolution=max(1.0, table.stride),
         limit=limit,
         peak=float(np.abs(table.torque).max()),

@@ -7,14 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from pace_optim.recording import Recording
+from pace_optim.recording.resample import interpolate_smooth
 
-_FEEDBACK_LAGS = (-1.0, 0.0, 1.0, 2.0, 3.0)
-"""Samples by which a log's torque may come later than the position that it was made of."""
-_BETWEEN = (-0.5, 0.5, 1.5)
-"""More of them where a log's samples are not those of the drive."""
-_MOST_SAMPLES = 20_000
+_FEEDBACK_LAGS = np.arange(-1.0, 4.0)
+"""Samples by which a log's torque may come later than the position or speed that it was made of."""
+_BETWEEN = np.arange(-1.0, 3.5, 0.5)
+"""The same where a log's samples are not those of the drive: their noise tells whole samples from others."""
+_MOST_SAMPLES = 10_000
 """More say nothing new of six numbers."""
 _LEAST_SAMPLES = 100
+_MEMORY = 0.25
+"""Time over which residuals may go on [s]."""
+_IDLE = 1e-6
+"""A joint whose position and commands change by less says nothing [rad, rad/s, N m]."""
 _TOLERANCE = 1e-3
 """Part of a command's period by which stamps of one instant may differ."""
 _SMOOTH = np.array([-2, -1, 0, 1, 2]) / 10
@@ -35,6 +40,12 @@ class Table:
     """Whether a sample comes right after the one before, (K - 1,) bool."""
     stride: float
     """Control steps in a sample."""
+    sampled: bool
+    """Whether the samples are those of the drive."""
+    phase: float | None
+    """When the drive is taken to run [control steps]; ``None``: whenever there is a sample."""
+    memory: int
+    """Samples over which residuals may go on."""
     commands: dict[str, np.ndarray]
     """Columns of each commanded series ("position", "velocity", "effort") at each of ``command_lags``."""
     command_lags: np.ndarray
@@ -44,10 +55,12 @@ class Table:
     speeds: list[np.ndarray]
     """The same of the speed; more than one where it is taken from positions, in more than one way."""
     feedback_lags: np.ndarray
-    """[control steps]."""
+    """Evenly rising [control steps]."""
 
     @classmethod
-    def of(cls, recording: Recording, j: int, longest_delay: float) -> Table | None:
+    def of(
+        cls, recording: Recording, j: int, longest_delay: float, phase: float | None = None, most: int = _MOST_SAMPLES
+    ) -> Table | None:
         """The table of a joint; ``None`` where its torque is not known, or too little of it.
 
         It is made of the samples as they were logged, which belong to the torques that came with them.
@@ -56,6 +69,8 @@ class Table:
             recording: On the control grid.
             j: Column of the joint.
             longest_delay: Longest delay of commands [control steps].
+            phase: When the drive runs, once a control step, of a log that does not sample it [control steps].
+            most: Samples at most.
         """
         log = recording if recording.logged is None else recording.logged
         if log.dof_effort is None:
@@ -63,9 +78,9 @@ class Table:
         control_dt = float(recording.time[1] - recording.time[0]) / recording.sample_stride
         stride = float(np.median(np.diff(log.time))) / control_dt
         sampled = log is recording
-        feedback = stride * np.array(_FEEDBACK_LAGS if sampled else sorted((*_FEEDBACK_LAGS, *_BETWEEN)))
+        feedback = np.arange(3.0) if phase is not None else stride * (_FEEDBACK_LAGS if sampled else _BETWEEN)
         steps = np.ceil(longest_delay) + feedback[-1]
-        lags = np.arange(-np.ceil(stride), steps + 1, 1.0 if sampled else 0.5)
+        lags = np.arange(-np.ceil(stride), steps + 1, 1.0 if sampled or phase is not None else 0.5)
         time, torque, position = log.time, log.dof_effort[:, j], log.dof_pos[:, j]
         given, speeds = _commands(recording, j), _speeds(log, j)
         before = int(np.ceil(steps / stride)) + 2
@@ -75,8 +90,12 @@ class Table:
             off = np.convolve(~log.torque_enable.astype(bool), np.ones(before))[: len(torque)]
             usable &= off == 0
         rows = np.flatnonzero(usable)
-        rows = rows[:: max(1, len(rows) // _MOST_SAMPLES)]
+        rows = rows[:: max(1, len(rows) // most)]
+        at = time[rows] if phase is None else control_dt * (np.floor(time[rows] / control_dt - phase + 1e-6) + phase)
         if not given or len(rows) < _LEAST_SAMPLES or np.ptp(torque[rows]) == 0:
+            return None
+        told = any(np.ptp(values) > _IDLE for _, values in given.values())
+        if not told and np.ptp(position[rows]) <= _IDLE:  # an idle joint's torque is no law's
             return None
         columns: list[np.ndarray] = []
 
@@ -85,13 +104,14 @@ class Table:
             return np.arange(len(columns) - len(new), len(columns))
 
         def seen(series: np.ndarray) -> list[np.ndarray]:
-            return [np.interp(time[rows] - lag * control_dt, time, series) for lag in feedback]
+            there = np.isfinite(series)  # the slope has no ends
+            return [
+                interpolate_smooth(time[there], series[there, None], at - lag * control_dt)[:, 0] for lag in feedback
+            ]
 
         return cls(
             torque=torque[rows],
-            commands={
-                name: add([_held(*c, time[rows] - lag * control_dt) for lag in lags]) for name, c in given.items()
-            },
+            commands={name: add([_held(*c, at - lag * control_dt) for lag in lags]) for name, c in given.items()},
             command_lags=lags,
             position=add(seen(position)),
             speeds=[add(seen(speed)) for speed in speeds],
@@ -99,6 +119,9 @@ class Table:
             columns=np.stack([*columns, np.ones(len(rows))], axis=1),
             follows=np.diff(rows) == rows[1] - rows[0],
             stride=stride,
+            sampled=sampled,
+            phase=phase,
+            memory=round(_MEMORY / (float(np.median(np.diff(time))) * float(rows[1] - rows[0]))),
         )
 
 
