@@ -32,6 +32,11 @@ from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds
 from pace_optim.terminal.progress import ProgressLine
 
+_NOISY = 1.5
+"""Times the noise above which a fit leaves something that other facts may explain."""
+_BETTER = 0.9
+"""Part of the error that facts from torques must leave at most, to be used instead of those that are stated."""
+
 
 def fit(
     settings: FitSettings,
@@ -76,6 +81,38 @@ def fit(
     on_start(folder.path)
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     return _finished(run, record, assess_interrupted)
+
+
+def fit_with_torques(
+    settings: FitSettings, progress: ProgressLine | None = None, processes: Processes | None = None
+) -> tuple[FitResult, Path]:
+    """Identify a robot; where recordings' torques contradict what is stated, by that which fits better.
+
+    A fit with what is stated comes first. If it ends at the noise, the torques are not needed. Else another one takes
+    the facts from the torques, and is kept if it leaves less.
+
+    Args:
+        settings: As for :func:`fit`; so are the others.
+        progress: Shows how far it is.
+        processes: Who shares the search's candidates; where there are several, only the first fit is made.
+    """
+    result, folder = fit(settings, progress, processes=processes)
+    alone = processes is None or processes.count == 1
+    if not result.contested or not alone or "interrupted" in result.stop_reasons or (result.times_noise or 0) < _NOISY:
+        return result, folder
+    facts = ", ".join(result.contested)
+    told = progress or ProgressLine()
+    told.tell(f"The torques in the recordings contradict what is stated ({facts}): fitting with what they say too.")
+    unknown = [*settings.unknown, *(fact for fact in result.contested if fact not in settings.unknown)]
+    other, other_folder = fit(replace(settings, unknown=unknown), progress)
+    before, after = (1e3 * each.rmse["train"]["all"] for each in (result, other))
+    if after < _BETTER * before:
+        told.tell(
+            f"With {facts} from the torques the error is {after:.4g} mrad instead of {before:.4g}: they are used."
+        )
+        return other, other_folder
+    told.tell(f"With {facts} from the torques the error is {after:.4g} mrad, not {before:.4g}: what is stated is used.")
+    return result, folder
 
 
 def resume(

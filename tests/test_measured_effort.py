@@ -13,7 +13,7 @@ from pace_optim.recording import Drive, Recording, conform_recording
 
 BENCH, DT = "Pace-TestBench-v0", 0.0025
 CASE = Path(__file__).parents[2] / "shared/cases/bench/measured_effort_and_speed.csv"
-CONFIGURED = {"stiffness": np.array([85.0]), "damping": np.array([0.6]), "effort_limit": np.array([80.0])}
+CONFIGURED = {"stiffness": np.array([85.0]), "damping": np.array([0.6]), "effort_limit": np.array([np.inf])}
 
 
 def sines(time: np.ndarray, seed: int, size: float) -> np.ndarray:
@@ -23,7 +23,7 @@ def sines(time: np.ndarray, seed: int, size: float) -> np.ndarray:
 
 
 def recorded(
-    *, kp=40.0, kd=1.0, delay=3, lag=0, limit=np.inf, noise=0.0, offset=0.0, feed_forward=None, seconds=8.0,
+    *, kp=40.0, kd=1.0, delay=3, lag=0, speed_lag=0, limit=np.inf, noise=0.0, offset=0.0, feed_forward=None, seconds=8.0,
     measured_speed=True, stated=None, position=True,
 ) -> Recording:  # fmt: skip
     """A motion and the torque that a drive asks for along it; commands and positions come so many steps late in it."""
@@ -32,7 +32,7 @@ def recorded(
     speed = np.gradient(moved, DT)
     late = np.maximum(np.arange(len(time)) - delay - lag, 0)
     now = np.maximum(np.arange(len(time)) - lag, 0)
-    torque = kp * (target[late] - moved[now]) - kd * speed[now] + offset
+    torque = kp * (target[late] - moved[now]) - kd * speed[np.maximum(now - speed_lag, 0)] + offset
     given = None
     if feed_forward is not None:
         given = sines(time, 3, 1.0)
@@ -52,9 +52,15 @@ def recorded(
     return conform_recording(recording, joint_order=("servo",), control_dt=DT)
 
 
-def drives(*recordings: Recording, unknown=()):
+def drives(*recordings: Recording, unknown=(), assumed=("servo",)):
     return read_drives(
-        recordings, CONFIGURED, delay_bounds=(0.0, 10.0), delay_mode="command", control_dt=DT, unknown=unknown
+        recordings,
+        CONFIGURED,
+        delay_bounds=(0.0, 10.0),
+        delay_mode="command",
+        control_dt=DT,
+        unknown=unknown,
+        assumed=assumed,
     )
 
 
@@ -72,6 +78,31 @@ def test_the_speed_may_be_that_of_the_positions():
 def test_a_log_may_have_its_torques_late():
     law = read_law(recorded(lag=2), 0, 10)
     assert (law.stiffness, law.delay, law.feedback_lag) == pytest.approx((40, 3, 2), abs=1e-2)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_drives_speed_may_be_older_than_its_position(noise):
+    law = read_law(recorded(kp=400.0, kd=8.0, delay=0, speed_lag=1, noise=noise), 0, 10)
+    assert (law.feedback_lag, law.speed_lag) == pytest.approx((0, 1)) and 0 <= law.delay < 0.01
+    assert (law.stiffness, law.damping) == pytest.approx((400, 8), rel=2e-3)
+
+
+def test_no_delay_is_negative():
+    assert read_law(recorded(delay=0, lag=1, speed_lag=1, noise=0.3), 0, 10).delay >= 0
+
+
+def test_torques_commanded_beside_a_damping_say_that_damping():
+    law = read_law(recorded(kp=0, kd=0.5, feed_forward=1.0, position=False), 0, 10)
+    assert (law.damping, law.feed_forward) == pytest.approx((0.5, 1.0), rel=1e-3) and law.r_squared > 0.9999
+
+
+def test_an_idle_joints_torque_is_no_law():
+    recording = recorded(kp=0, kd=0, feed_forward=1.0, position=False)
+    still = np.full_like(recording.dof_pos, 0.001)
+    none = np.zeros_like(recording.des_dof_effort)
+    noise = 0.01 * np.random.default_rng(0).normal(size=still.shape)
+    idle = replace(recording, dof_pos=still, dof_vel=None, des_dof_effort=none, command_effort=none, dof_effort=noise)
+    assert read_law(idle, 0, 10) is None
 
 
 @pytest.mark.parametrize(("limit", "noise"), [(8.0, 0.0), (4.0, 0.0), (6.0, 0.3)])
@@ -113,7 +144,21 @@ def test_what_nobody_stated_is_taken_from_the_torque():
     assert (drive.stiffness[0], drive.damping[0], drive.effort_limit[0]) == pytest.approx((40, 1, 8), rel=0.01)
     assert found.taken["stiffness"] == {"servo"} and found.delay_bounds == pytest.approx((2, 4), abs=0.01)
     assert len(found.notes) == 2 and "kp 40 " in found.notes[0] and "7.5 ms" in found.notes[0]
+    assert not found.contested
+
+
+def test_what_the_robot_states_holds_until_a_fit_says_better():
+    found = drives(recorded(), assumed=())
+    assert found.recordings[0].drive.stiffness is None and found.contested == ("stiffness", "damping")
     assert "configured as 85" in found.warnings[0] and "says 40" in found.warnings[0] and "is used" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "word"), [(180 / np.pi, "180/pi times that"), (1 / (2 * np.pi), "2 pi times less"), (1000.0, "mN m")]
+)
+def test_a_gain_that_is_off_by_a_unit_says_so(factor, word):
+    found = drives(recorded(stated={"stiffness": 40.0 / factor, "damping": 1.0}))
+    assert word in found.warnings[0]
 
 
 def test_what_is_stated_holds_and_a_contradiction_is_told_with_both_numbers():
@@ -171,9 +216,13 @@ def test_a_log_with_its_drives_own_torque_says_gains_and_delay(tmp_path):
     facts = json.loads(CASE.with_suffix(".json").read_text())
     del facts["stiffness"], facts["damping"]
     target.with_suffix(".json").write_text(json.dumps(facts))
-    problem = load_problem(BENCH, data=[target])
+    problem = load_problem(BENCH, data=[target], unknown=["stiffness", "damping"])
     (recording,) = problem.dataset.recordings
     assert (recording.drive.stiffness[0], recording.drive.damping[0]) == pytest.approx((40, 1), rel=1e-3)
+    low, high = (
+        float(bound[problem.space["proportional_gain.gain"]]) for bound in (problem.space.lower, problem.space.upper)
+    )
+    assert (low, high) == pytest.approx((0.99, 1.01), abs=1e-6)
     law = problem.measured.to_dict()["servo"]["log"]
     assert DT * law["delay"] == pytest.approx(0.005, abs=1e-5) and law["limit"] is None
     low, high = (float(bound[problem.space["delay"]]) for bound in (problem.space.lower, problem.space.upper))

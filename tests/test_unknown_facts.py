@@ -110,7 +110,7 @@ def test_a_limit_that_was_found_is_that_of_the_drive(tmp_path):
     assert PaceDCMotorCfg.from_result(folder).effort_limit == result.drive["effort_limit"]["servo"]
 
 
-def test_what_the_torque_says_is_no_longer_unknown(tmp_path, soft):
+def test_what_the_torque_says_is_refined(tmp_path, soft):
     path = tmp_path / "log.csv"
     rows = np.genfromtxt(soft[0], delimiter=",", names=True)
     time, q, target = (rows[name] for name in rows.dtype.names)
@@ -119,7 +119,7 @@ def test_what_the_torque_says_is_no_longer_unknown(tmp_path, soft):
     np.savetxt(path, np.column_stack([time, q, target, torque]), "%.7f", ",", header=header, comments="")
     path.with_suffix(".json").write_text(soft[0].with_suffix(".json").read_text())
     problem = load_problem(BENCH, data=[path], unknown=["stiffness"])
-    assert problem.unknown == () and problem.effects == []
+    assert problem.unknown == ("stiffness",) and problem.effects == ["proportional_gain"]
     assert problem.dataset.recordings[0].drive.stiffness[0] == pytest.approx(40.0, rel=0.02)
     both = load_problem(BENCH, data=[path, soft[1]], unknown=["stiffness"])  # one has no torque
     assert both.unknown == ("stiffness",) and both.effects == ["proportional_gain"]

@@ -103,7 +103,7 @@ def main() -> None:
         print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while, and so do the imports
     import torch
 
-    from pace_optim.fit import fit, help_fit, resume
+    from pace_optim.fit import fit_with_torques, help_fit, resume
     from pace_optim.problem.processes import join
     from pace_optim.run.settings import FitSettings
     from pace_optim.run.summary import summary
@@ -123,7 +123,7 @@ def main() -> None:
     else:
         if args["task"] is None:
             raise ValueError(missing_task())
-        result, folder = fit(FitSettings(**args, device=device), processes=processes)
+        result, folder = fit_with_torques(FitSettings(**args, device=device), processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
     if then_diagnose and "interrupted" not in result.stop_reasons:

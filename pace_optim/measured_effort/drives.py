@@ -10,6 +10,7 @@ import numpy as np
 
 from pace_actuators.joint_units import JointType
 from pace_optim.recording import Recording
+from pace_optim.recording.commands import acting_loops
 
 from .law import APART, SURE, MeasuredLaw, has_offset, read_law
 from .words import contradiction, delay_sentence, line_of_joint
@@ -17,6 +18,8 @@ from .words import contradiction, delay_sentence, line_of_joint
 FOLLOWS = 0.9
 """A torque of which the law explains less is not that of this law: a current with much else in it, or another unit."""
 _OF_THE_LAW = ("stiffness", "damping")
+_LEAST_ROOM, _MOST_ROOM = 0.01, 0.5
+"""Parts of a gain that is read within which a fit refines it, at least and at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +38,24 @@ class MeasuredDrives:
     """What was read, a line for each joint."""
     warnings: tuple[str, ...] = ()
     """What contradicts what is stated."""
+    contested: tuple[str, ...] = ()
+    """Facts that are stated and that a torque contradicts: what is stated is used."""
+
+    def gain_bounds(self, facts: Collection[str], factors: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+        """Within what unknown gains are refined that torques say: lower, start and upper factor, by label and joint.
+
+        Args:
+            facts: What nobody knows.
+            factors: The parameter that is a factor of each gain.
+        """
+        result: dict[str, dict[str, Any]] = {}
+        for fact in facts:
+            for joint in self.taken.get(fact, ()) if fact in factors else ():
+                laws = self.laws[joint].values()
+                off = max(law.std[fact] / abs(getattr(law, fact)) for law in laws if getattr(law, fact))
+                width = min(max(SURE * off, _LEAST_ROOM), _MOST_ROOM)
+                result.setdefault(factors[fact], {})[joint] = (1 - width, 1.0, 1 + width)
+        return result
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """The laws for a JSON file, by joint and recording."""
@@ -53,6 +74,7 @@ def read_drives(
     delay_mode: str,
     control_dt: float,
     unknown: Collection[str] = (),
+    assumed: Collection[str] = (),
     slides: Collection[str] = (),
 ) -> MeasuredDrives:
     """Read the law of every joint in every recording that has its torque, and take what nobody stated.
@@ -63,21 +85,24 @@ def read_drives(
         delay_bounds: Between what the delay is sought [control steps].
         delay_mode: What the drives delay.
         control_dt: Control step [s].
-        unknown: Facts that recordings state and that are not to be believed.
+        unknown: Facts that are stated and that are not to be believed.
+        assumed: Joints whose gains nobody states: those that are configured are assumed.
         slides: Joints that slide.
     """
     laws: dict[str, dict[str, MeasuredLaw]] = {}
     changed: list[Recording] = []
     warnings: dict[str, str] = {}
     taken_in: list[dict[str, set[str]]] = []
+    contested: dict[str, None] = {}
     for recording in recordings:
         own = {j: law for j in range(recording.num_joints) if (law := read_law(recording, j, delay_bounds[1]))}
         for law in own.values():
             laws.setdefault(law.joint, {})[recording.name] = law
         good = {j: law for j, law in own.items() if follows(law)}
-        new, taken, said = _with_facts(recording, good, configured, unknown, slides)
-        for key, text in said:
-            warnings.setdefault(key, f"{recording.name}: {text}")
+        new, taken, said = _with_facts(recording, good, configured, unknown, assumed, slides)
+        for fact, joint, text in said:
+            warnings.setdefault(f"{fact} {joint}", f"{recording.name}: {text}")
+            contested |= {} if joint in taken.get(fact, ()) else {fact: None}
         changed.append(new)
         taken_in.append(taken)
     every = [law for by_recording in laws.values() for law in by_recording.values() if follows(law)]
@@ -93,6 +118,7 @@ def read_drives(
         delay_bounds=bounds,
         notes=(*lines, *([sentence] if sentence else [])),
         warnings=tuple(warnings.values()),
+        contested=tuple(contested),
     )
 
 
@@ -102,7 +128,8 @@ def _type(joint: str, slides: Collection[str]) -> JointType:
 
 def follows(law: MeasuredLaw) -> bool:
     """Whether a torque is that of a PD law."""
-    return law.r_squared >= FOLLOWS and law.stiffness >= 0 and law.damping >= 0
+    gains = ((law.stiffness, law.std.get("stiffness", 0.0)), (law.damping, law.std.get("damping", 0.0)))
+    return law.r_squared >= FOLLOWS and all(gain >= -SURE * std for gain, std in gains)
 
 
 def _with_facts(
@@ -110,23 +137,34 @@ def _with_facts(
     laws: Mapping[int, MeasuredLaw],
     configured: Mapping[str, np.ndarray],
     unknown: Collection[str],
+    assumed: Collection[str],
     slides: Collection[str],
-) -> tuple[Recording, dict[str, set[str]], list[tuple[str, str]]]:
-    """A recording with what its torques say and nobody stated; what was taken; and what contradicts, with a key."""
+) -> tuple[Recording, dict[str, set[str]], list[tuple[str, str, str]]]:
+    """A recording with what its torques say and nobody states; what was taken; and what contradicts: fact, joint, text.
+
+    What the recording or the robot's configuration states holds, unless it is declared unknown.
+    """
     facts: dict[str, np.ndarray] = {}
     taken: dict[str, set[str]] = {}
-    said: list[tuple[str, str]] = []
+    said: list[tuple[str, str, str]] = []
     for fact in (*_OF_THE_LAW, "effort_limit"):
         stated = getattr(recording.drive, fact)
-        holds = stated is not None and fact not in unknown
         values = np.array(configured[fact] if stated is None else stated, dtype=np.float64, copy=True)
+        if stated is None and fact == "damping":  # a position loop without targets does not act, nor does its damping
+            values = np.where(acting_loops(recording, np.asarray(configured["stiffness"]))[1], values, np.nan)
         for j, law in laws.items():
             value, std = _value(law, fact)
             if value is None:
                 continue
-            if apart(value, std, float(values[j])):
-                text = contradiction(law, fact, float(values[j]), value, std, holds, _type(law.joint, slides))
-                said.append((f"{fact} {law.joint} {values[j]:.3g}", text))
+            known = stated is not None or (
+                np.isfinite(values[j]) and (law.joint not in assumed or fact not in _OF_THE_LAW)
+            )
+            holds = known and fact not in unknown
+            if known and apart(value, std, float(values[j])):
+                text = contradiction(
+                    law, fact, float(values[j]), value, std, stated is not None, holds, _type(law.joint, slides)
+                )
+                said.append((fact, law.joint, text))
             if not holds:
                 values[j] = value
                 taken.setdefault(fact, set()).add(law.joint)

@@ -32,6 +32,8 @@ _FEW = 2000
 _PHASES = 8
 _FINEST_PHASE = 0.01
 """Instants in a control step that are tried at first, and how near to each other they are at last [steps]."""
+_FELT = 1e-3
+"""Part of a torque that a term must be to be one of the law."""
 _NEAR = 9
 """Lags of commands that are tried with lags of position and speed of their own."""
 _HALVINGS = 20
@@ -90,7 +92,11 @@ def read_law(recording: Recording, joint: int, longest_delay: float) -> Measured
     starts = [np.ones(len(size), dtype=bool), size < _START_BELOW * np.quantile(size, _HALF)]
     found = [_settled(table, below) for below in starts if below.sum() >= len(size) // 10]
     fit, limit = min(found, key=lambda each: _error(table, each[0].columns, each[0].below, each[1] or np.inf))
-    return _law(recording.joint_names[joint], table, fit, limit)
+    sides = [] if table.phase is None else [-_FINEST_PHASE, _FINEST_PHASE]
+    moved = [Table.of(recording, joint, longest_delay, table.phase, shift=shift) for shift in sides]
+    ends = [replace(fit, table=other).coefficients for other in moved if other is not None]
+    between = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else np.zeros(len(fit.names))
+    return _law(recording.joint_names[joint], fit, limit, np.hypot(fit.std(), between))
 
 
 def _phase(recording: Recording, joint: int, longest_delay: float) -> float | None:
@@ -397,10 +403,14 @@ def _error(table: Table, columns: np.ndarray, below: np.ndarray, limit: float) -
     return float(np.mean((np.clip(columns @ coefficients, -limit, limit) - table.torque) ** 2))
 
 
-def _law(joint: str, table: Table, fit: _Fit, limit: float | None) -> MeasuredLaw:
+def _law(joint: str, fit: _Fit, limit: float | None, stds: np.ndarray) -> MeasuredLaw:
+    table = fit.table
     value = dict(zip(fit.names, fit.coefficients.tolist(), strict=True))
-    std = dict(zip(fit.names, fit.std().tolist(), strict=True))
+    std = dict(zip(fit.names, stds.tolist(), strict=True))
     torque = table.torque[fit.below]
+    share = np.std(fit.columns[fit.below][:, fit.names.index("damping")]) * abs(value["damping"]) / np.std(torque)
+    if table.commands.keys() == {"effort"} and not (value["damping"] > SURE * std["damping"] and share > _FELT):
+        del value["damping"], std["damping"]  # a drive that is told torques has none unless it shows
     left = torque - fit.predicted[fit.below]
     return MeasuredLaw(
         joint=joint,

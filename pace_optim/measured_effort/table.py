@@ -59,7 +59,13 @@ class Table:
 
     @classmethod
     def of(
-        cls, recording: Recording, j: int, longest_delay: float, phase: float | None = None, most: int = _MOST_SAMPLES
+        cls,
+        recording: Recording,
+        j: int,
+        longest_delay: float,
+        phase: float | None = None,
+        most: int = _MOST_SAMPLES,
+        shift: float = 0.0,
     ) -> Table | None:
         """The table of a joint; ``None`` where its torque is not known, or too little of it.
 
@@ -71,6 +77,7 @@ class Table:
             longest_delay: Longest delay of commands [control steps].
             phase: When the drive runs, once a control step, of a log that does not sample it [control steps].
             most: Samples at most.
+            shift: By how much later its position and speed are taken [control steps].
         """
         log = recording if recording.logged is None else recording.logged
         if log.dof_effort is None:
@@ -91,7 +98,9 @@ class Table:
             usable &= off == 0
         rows = np.flatnonzero(usable)
         rows = rows[:: max(1, len(rows) // most)]
-        at = time[rows] if phase is None else control_dt * (np.floor(time[rows] / control_dt - phase + 1e-6) + phase)
+        at = time[rows]
+        if phase is not None:
+            at = control_dt * (np.floor(at / control_dt - phase + 1e-6) + phase)
         if not given or len(rows) < _LEAST_SAMPLES or np.ptp(torque[rows]) == 0:
             return None
         told = any(np.ptp(values) > _IDLE for _, values in given.values())
@@ -106,7 +115,8 @@ class Table:
         def seen(series: np.ndarray) -> list[np.ndarray]:
             there = np.isfinite(series)  # the slope has no ends
             return [
-                interpolate_smooth(time[there], series[there, None], at - lag * control_dt)[:, 0] for lag in feedback
+                interpolate_smooth(time[there], series[there, None], at - (lag - shift) * control_dt)[:, 0]
+                for lag in feedback
             ]
 
         return cls(

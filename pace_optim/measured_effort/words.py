@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from pace_actuators.joint_units import JointType, units_for
 
 from .law import MeasuredLaw, has_offset
 
 _WORDS = {"stiffness": "stiffness", "damping": "damping", "effort_limit": "torque limit"}
+_EXACT = 0.02
+"""How near a ratio is to one of units."""
+_FACTORS = (
+    (180 / np.pi, ("180/pi", "positions or speeds may be in degrees, or the gain per degree")),
+    (2 * np.pi, ("2 pi", "positions or speeds may be in turns, or the gain per turn")),
+    (1000.0, ("1000", "a series may be in thousandths (mrad, mN m, permille)")),
+)
 _UNITS = {"stiffness": "N m/rad", "damping": "N m s/rad", "effort_limit": "N m"}
 
 
@@ -48,17 +57,36 @@ def line_of_joint(
 
 
 def contradiction(
-    law: MeasuredLaw, fact: str, stated: float, value: float, std: float, holds: bool, joint_type: JointType
+    law: MeasuredLaw,
+    fact: str,
+    stated: float,
+    value: float,
+    std: float,
+    by_recording: bool,
+    holds: bool,
+    joint_type: JointType,
 ) -> str:
-    """What is stated, what the torque says, and which of the two counts."""
+    """What is stated, what the torque says, which of the two counts, and whether a unit is the reason."""
     error = f" ± {std:.1g}" if std else ""
-    text = f"{_WORDS[fact]} of {law.joint} is {'stated' if holds else 'configured'} as {stated:.4g} {_UNITS[fact]}, "
-    text += f"and its dof_effort says {value:.4g}{error}"
+    where = "stated" if by_recording else "configured"
+    text = f"{_WORDS[fact]} of {law.joint} is {where} as {stated:.4g} {_UNITS[fact]}, and its dof_effort says "
+    text += f"{value:.4g}{error}"
+    if unit := _unit_between(value / stated if stated else 0.0):
+        text += f", {unit}"
     if holds:
-        text += f": what is stated is used. Correct {fact}, or fit with --unknown {fact}."
+        text += f": what is {where} is used. Correct {fact}, or fit with --unknown {fact}."
     else:
         text += ": that is used."
     return units_for(text, [joint_type])
+
+
+def _unit_between(ratio: float) -> str:
+    """The units that a ratio of a gain by torque to that which is stated may come from; "" for none."""
+    for factor, words in _FACTORS:
+        for own, what in ((factor, f"{words[0]} times that"), (1 / factor, f"{words[0]} times less")):
+            if abs(ratio / own - 1) < _EXACT:
+                return f"{what}: {words[1]}"
+    return ""
 
 
 def delay_sentence(

@@ -33,7 +33,7 @@ from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import read_all, tell_on_stderr
 from pace_optim.problem.stated_limits import contradicted_limits
-from pace_optim.problem.unknown_facts import lift_limits, with_unknown
+from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
@@ -235,7 +235,11 @@ def load_problem(
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
     told, bounds = lift_limits(plain, measured.recordings, unknown)
-    plain.sim2real.effect_bounds = {**plain.sim2real.effect_bounds, **bounds}
+    plain.sim2real.effect_bounds = {
+        **plain.sim2real.effect_bounds,
+        **bounds,
+        **measured.gain_bounds(unknown, GAINS),
+    }
     _narrow_delay(plain, measured)
     recordings, held_out = told[:count], told[count:]
     if unknown:
@@ -275,7 +279,7 @@ def _read_torques(
     """What the recordings' torques say of the drives, and what nobody knows even so.
 
     A fact is read if every recording has it of every joint; else it is identified, and all recordings keep what they
-    state.
+    state. Gains that are read are refined.
     """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     low, high = sim2real.bounds_params[-1].tolist()
@@ -288,13 +292,14 @@ def _read_torques(
             delay_mode=next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode,
             control_dt=control_dt,
             unknown=facts,
+            assumed=sim2real.assumed_gains,
             slides=sim2real.slide_joints,
         )
 
     measured = read(unknown)
     known = [fact for fact in unknown if len(measured.taken.get(fact, ())) == len(sim2real.joint_order)]
-    left = tuple(fact for fact in unknown if fact not in known)
-    return (read(known) if left and measured.laws else measured), left
+    measured = read(known) if len(known) < len(unknown) and measured.laws else measured
+    return measured, tuple(fact for fact in unknown if fact not in known or fact in GAINS)
 
 
 def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:

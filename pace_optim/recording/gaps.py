@@ -113,7 +113,9 @@ def _part(recording: Recording, first: int, end: int, number: int, note: str, co
     """Samples from first to end, with the commands in force while they were taken."""
     begin, last = recording.time[first], recording.time[end - 1]
     rows: dict[str, Any] = {
-        key: value[first:end] for key in (*MEASURED_SERIES, "torque_enable") if (value := getattr(recording, key)) is not None
+        key: value[first:end]
+        for key in (*MEASURED_SERIES, "torque_enable")
+        if (value := getattr(recording, key)) is not None
     }
     own = slice(first, end)
     if recording.des_time is not None:

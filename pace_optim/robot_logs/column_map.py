@@ -123,9 +123,7 @@ def _source(path: Path, where: str, series: str, entry: Any) -> Source:
         raise ValueError(f"{path}: {where}.unit is {unit!r}; expected one of {listed(units)}. Correct it.")
     if unit in NEED_FACTOR and "factor" not in entry:
         what = "a current" if unit in CURRENTS else "part of a largest load"
-        raise ValueError(
-            f"{path}: {where} is {what}; expected factor = N m per {NEED_FACTOR[unit]} beside it. Add it."
-        )
+        raise ValueError(f"{path}: {where} is {what}; expected factor = N m per {NEED_FACTOR[unit]} beside it. Add it.")
     numbers = {key: entry[key] for key in ("sign", "offset", "gear_ratio", "factor") if key in entry}
     for key, value in numbers.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:

@@ -259,9 +259,7 @@ def _set_back(time: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[int]:
     return [k for k in set_back(time).tolist() if np.any(filled[:, :k].any(axis=1) & filled[:, k:].any(axis=1))]
 
 
-def _time(
-    path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None
-) -> tuple[str, np.ndarray, float, str]:
+def _time(path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> tuple[str, np.ndarray, float, str]:
     """The column of time, stamps [s], Unix time at zero, and a note on what they were taken for."""
     if chosen and chosen.time and chosen.time not in columns:
         raise ValueError(f"{path}: has no column '{chosen.time}' for the time. Columns: {listed(columns)}.")

@@ -19,6 +19,7 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
+from pace_optim.recording.notes import notes_by_kind
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.whole_delay import whole_delay
 
@@ -54,6 +55,8 @@ class FitResult(DriveResult):
     """Whether the fit ended so far above the noise that its error bars say nothing."""
     measured_drive: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What the torque in the recordings says of each drive, by joint and recording."""
+    contested: list[str] = field(default_factory=list)
+    """Facts that are stated and that the torque in a recording contradicts."""
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -206,10 +209,11 @@ def make_result(
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
         measured_drive=problem.measured.to_dict(),
+        contested=list(problem.measured.contested),
         notes=list(problem.env_cfg.sim2real.notes)
         + list(problem.measured.notes)
         + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
-        + [f"{recording.name}: {note}" for recording in data.recordings for note in recording.notes],
+        + notes_by_kind(data.recordings),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         **facts,
     )
