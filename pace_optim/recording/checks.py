@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from .data import Recording
-from .facts import as_array, drive_of, joint_names_of, load_of
+from .facts import as_array, check_one_line, drive_of, joint_names_of, load_of
 from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest, listed
-from .stamps import seconds_of
+from .stamps import seconds_of, set_back, unrounded
 
 _HUGE = 1e6
 """No joint turns so far or so fast [rad], [rad/s]."""
+_FASTEST = 2e-5
+"""Steps of the fastest current loops [s]."""
 MIN_SAMPLES = 20
 """Fewer samples than this are not a recording."""
 
@@ -31,6 +33,8 @@ def check_recording(
     """
     notes = _check_keys(fields, source, found or tuple(fields))
     time, origin, kind = _stamps("time", fields["time"], source)
+    time, rounded = unrounded(time)
+    notes += [rounded] if rounded else []
     notes += [f"time holds {kind}: counted from its first sample here."] if kind else []
     des_time = _command_time(fields.get("des_time"), time, origin, source)
     clocks = {} if des_time is None else dict.fromkeys(COMMAND_SERIES, ("des_time", des_time))
@@ -60,6 +64,7 @@ def check_recording(
     name = fields.get("name", default_name)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{source}: name is {name!r}; expected text. Correct it or leave it out.")
+    check_one_line("name", name, source)
     recording = Recording(
         name=name,
         joint_names=joint_names,
@@ -277,13 +282,21 @@ def _check_time(key: str, time: np.ndarray, source: str) -> None:
     step = np.diff(time)
     if np.any(step <= 0.0):
         first = int(np.argmax(step <= 0.0)) + 1
+        cure = "Sort the samples and drop repeated ones."
+        if len(back := set_back(time)):
+            first, cure = int(back[0]), "The clock was set back there: cut the file into two recordings."
         raise ValueError(
             f"{source}: {key} does not increase at sample {first} ({time[first - 1]:.9g} s, then "
-            f"{time[first]:.9g} s); expected strictly increasing time. Sort the samples and drop repeated ones."
+            f"{time[first]:.9g} s); expected strictly increasing time. {cure}"
         )
     if not len(step):
         return
     median = float(np.median(step))
+    if median < _FASTEST and key == "time":
+        raise ValueError(
+            f"{source}: time steps by {median:.3g} s, which is {1 / median:.3g} Hz; expected at least {_FASTEST:g} s: no "
+            "drive's loop is faster. Is time in another unit than seconds?"
+        )
     if 0.5 <= median < 1.5 and key == "time":
         raise ValueError(
             f"{source}: time steps by {median:g}: that is {1 / median:.3g} Hz in seconds, too slow for joints (20 Hz "

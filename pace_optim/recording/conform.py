@@ -69,6 +69,12 @@ def conform_recording(
     origin = recording.start_stamp
     # what a torque says of its drive is read from even samples
     base = fit_time_base(recording.time, control_dt, recording.label, may_place=recording.dof_effort is None)
+    if base.num_samples < MIN_SAMPLES or base.num_steps < MIN_SAMPLES:
+        raise ValueError(
+            f"{recording.label}: lasts {recording.duration:.3g} s, {base.num_steps} control steps of "
+            f"{1e3 * control_dt:.3g} ms; expected at least {MIN_SAMPLES}. Record for longer, or check that time is in "
+            "seconds."
+        )
     if base.sample_at is not None:
         on_grid = _placed(recording, base, control_dt)
     else:

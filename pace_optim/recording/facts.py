@@ -25,6 +25,18 @@ def as_array(value: Any) -> np.ndarray:
         return np.asarray(None)
 
 
+def check_one_line(label: str, text: str, source: str) -> None:
+    """Refuse a name that holds line breaks or what steers a terminal.
+
+    Raises:
+        ValueError: If it does.
+    """
+    if not text.isprintable():
+        raise ValueError(
+            f"{source}: {label} is {text!r}; expected one line of printable text. Correct it."
+        )
+
+
 def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     """Return the file's joint names as a tuple, () when it has none.
 
@@ -46,6 +58,8 @@ def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
             f"{source}: joint_names has {len(names)} names ({listed(names)}) but dof_pos has {num_joints} "
             "columns. Give one name per column."
         )
+    for name in names:
+        check_one_line("a joint's name", name, source)
     if repeated := sorted({n for n in names if names.count(n) > 1}):
         raise ValueError(f"{source}: joint_names repeats {listed(repeated)}. Give every joint its own name.")
     return tuple(names)
@@ -112,6 +126,8 @@ def _added_mass(value: Any, source: str) -> dict[str, float]:
             f"{source}: added_mass is {value!r}; expected {{body: kg}} (in an .npz as JSON text). "
             'Write it as {"body_name": 0.5}.'
         )
+    for body in value:
+        check_one_line("a body of added_mass", body, source)
     return {body: _number("added_mass", mass, source, f"added_mass of {body}") for body, mass in value.items()}
 
 

@@ -131,7 +131,11 @@ def _read_pt(path: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: holds a {type(content).__name__}; expected a dict with time, dof_pos and des_dof_pos. {cure}"
         )
-    return {str(key): _without_tensor(value) for key, value in content.items()}
+    try:
+        return {str(key): _without_tensor(value) for key, value in content.items()}
+    except (NotImplementedError, RuntimeError, TypeError) as error:  # meta, sparse, quantised tensors
+        text = " ".join(str(error).split())[:120]
+        raise ValueError(f"{path}: holds a tensor that has no plain numbers ({text}). {cure}") from error
 
 
 def _without_tensor(value: Any) -> Any:
