@@ -9,7 +9,7 @@ import numpy as np
 
 from .checks import MIN_SAMPLES
 from .data import Recording
-from .keys import COMMAND_SERIES, MEASURED_SERIES, listed
+from .keys import COMMAND_SERIES, SAMPLED_SERIES, listed
 
 _STEPS = 3.0
 """Steps of the usual length that a gap is longer than, and ..."""
@@ -114,7 +114,7 @@ def _part(recording: Recording, first: int, end: int, number: int, note: str, co
     begin, last = recording.time[first], recording.time[end - 1]
     rows: dict[str, Any] = {
         key: value[first:end]
-        for key in (*MEASURED_SERIES, "torque_enable")
+        for key in SAMPLED_SERIES
         if (value := getattr(recording, key)) is not None
     }
     own = slice(first, end)
