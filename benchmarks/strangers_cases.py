@@ -214,7 +214,12 @@ def table(folder: Path) -> str:
             continue
         content = json.loads(file.read_text())
         wrong = judged(row, content)
-        cells = (_said(row, content), _found(content["found"]), _right(row), f"wrong: {', '.join(wrong)}" if wrong else "right")
+        cells = (
+            _said(row, content),
+            _found(content["found"]),
+            _right(row),
+            f"wrong: {', '.join(wrong)}" if wrong else "right",
+        )
         lines.append(f"| {name} | {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(lines)
 

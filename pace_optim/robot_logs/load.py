@@ -96,7 +96,8 @@ def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> li
 def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Understood]:
     result = []
     for log in _logs(path, columns):
-        used, notes, facts_from = columns, list(log.notes), ()
+        used, notes = columns, list(log.notes)
+        facts_from: tuple[str, ...] = ()
         unit_stated = tuple(columns.joints) if columns is not None else ()
         beside = Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path
         if used is None or not used.joints:
