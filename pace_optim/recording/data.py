@@ -95,6 +95,8 @@ class Recording:
     """Commanded torques on the control grid [N m], zero for joints that have none; None where no joint has any."""
     command_torque_enable: np.ndarray | None = None
     """`torque_enable` on the control grid, or None."""
+    unit_stated: tuple[str, ...] = ()
+    """Joints whose positions' unit the log itself states: no advice doubts it."""
     notes: tuple[str, ...] = ()
     """What a user should know about this recording, in plain sentences."""
     source: str = ""

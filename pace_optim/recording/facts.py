@@ -32,9 +32,7 @@ def check_one_line(label: str, text: str, source: str) -> None:
         ValueError: If it does.
     """
     if not text.isprintable():
-        raise ValueError(
-            f"{source}: {label} is {text!r}; expected one line of printable text. Correct it."
-        )
+        raise ValueError(f"{source}: {label} is {text!r}; expected one line of printable text. Correct it.")
 
 
 def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from .checks import MIN_SAMPLES
 from .data import Recording
-from .keys import COMMAND_SERIES, MEASURED_SERIES, listed
+from .keys import COMMAND_SERIES, SAMPLED_SERIES, listed
 
 _STEPS = 3.0
 """Steps of the usual length that a gap is longer than, and ..."""
@@ -42,14 +43,14 @@ def split_at_gaps(recording: Recording) -> list[Recording]:
     time = recording.time
     step = np.diff(time)
     usual = float(np.median(step))
-    moving = [k for k in np.flatnonzero(step > max(_STEPS * usual, _SHORTEST)) if not _is_still(recording, int(k))]
+    moving = [int(k) for k in np.flatnonzero(step > max(_STEPS * usual, _SHORTEST)) if not _is_still(recording, int(k))]
     if not moving:
         return [recording]
     least, least_samples = 0.0, max(MIN_SAMPLES, round(_PART / usual))
     while True:
         cuts = [k for k in moving if step[k] > least]
-        edges = [0, *(k + 1 for k in cuts), len(time)]
-        parts = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= least_samples]
+        edges: list[int] = [0, *(k + 1 for k in cuts), len(time)]
+        parts = [(a, b) for a, b in itertools.pairwise(edges) if b - a >= least_samples]
         if least >= _LONGEST or sum(b - a for a, b in parts) >= _KEPT * len(time):
             break
         least = min(_LONGEST, max(2 * least, _SHORTEST))
@@ -61,8 +62,11 @@ def split_at_gaps(recording: Recording) -> list[Recording]:
             "Record again without losing samples, or check that time is in seconds."
         )
     jumped = [k for k in cuts if _clock_jumped(recording, int(k), usual)]
-    words = [f"{'the clock jumps ahead' if k in jumped else 'no samples'} by {step[k]:.3g} s at {time[k] - time[0]:.4g} s"
-             if k in jumped else f"no samples for {step[k]:.3g} s at {time[k] - time[0]:.4g} s" for k in cuts]  # fmt: skip
+    words = [
+        f"{'the clock jumps ahead by' if k in jumped else 'no samples for'} {step[k]:.3g} s "
+        f"at {time[k] - time[0]:.4g} s"
+        for k in cuts
+    ]
     left = len(time) - sum(b - a for a, b in parts)
     note = f"Split into {len(parts)} part{'s' * (len(parts) > 1)}: {listed(words, 4)}."
     note += f" {left} samples between them are left out." if left else ""
@@ -113,9 +117,7 @@ def _part(recording: Recording, first: int, end: int, number: int, note: str, co
     """Samples from first to end, with the commands in force while they were taken."""
     begin, last = recording.time[first], recording.time[end - 1]
     rows: dict[str, Any] = {
-        key: value[first:end]
-        for key in (*MEASURED_SERIES, "torque_enable")
-        if (value := getattr(recording, key)) is not None
+        key: value[first:end] for key in SAMPLED_SERIES if (value := getattr(recording, key)) is not None
     }
     own = slice(first, end)
     if recording.des_time is not None:

@@ -73,7 +73,8 @@ def check_motion(
     names = recording.joint_names
     position, commanded = recording.dof_pos, recording.has_position_command
     target = np.where(commanded, position[:1] if recording.des_dof_pos is None else recording.des_dof_pos, position[:1])
-    if turning := _those(names, turns & (np.abs(position).max(axis=0) > 8.0 * np.pi)):
+    doubted = np.array([name not in recording.unit_stated for name in names])
+    if turning := _those(names, turns & doubted & commanded & (np.abs(position).max(axis=0) > 8.0 * np.pi)):
         notes.append(f"{listed(turning)}: more than four turns from zero. {_DEGREES.replace('The values', 'If they')}")
     still = np.ptp(position, axis=0) < _STILL
     if any(still):
@@ -126,7 +127,8 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
             values = getattr(recording, key)[:, joint]
             unit = units_for("rad", [types[joint]])
             cure = "Check the column order, the signs and the zero, or the model's limits."
-            if types[joint] == "hinge" and np.abs(values).max() > 2.0 * np.pi:
+            stated = names[joint] in recording.unit_stated
+            if types[joint] == "hinge" and np.abs(values).max() > 2.0 * np.pi and not stated:
                 cure = _DEGREES
             raise ValueError(
                 f"{source}: {key} of {names[joint]} goes from {values.min():.3f} to {values.max():.3f} {unit}; "

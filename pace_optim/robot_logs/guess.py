@@ -67,6 +67,8 @@ class Guess:
     notes: tuple[str, ...]
     missing: tuple[str, ...]
     """All that a recording needs and that was not found."""
+    unit_stated: tuple[str, ...] = ()
+    """Joints whose positions' unit the log states."""
     facts_from: tuple[str, ...] = ()
     """Channels that facts were read from."""
 
@@ -125,6 +127,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
         columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable),
         notes=(*notes, *more),
         missing=tuple(_missing(sources, names, candidates)),
+        unit_stated=tuple(name for name, by in picked.items() if "dof_pos" in by and by["dof_pos"].unit),
         facts_from=tuple(facts_from),
     )
 

@@ -96,11 +96,13 @@ def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> li
 def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Understood]:
     result = []
     for log in _logs(path, columns):
-        used, notes, facts_from = columns, list(log.notes), ()
+        used, notes = columns, list(log.notes)
+        facts_from: tuple[str, ...] = ()
+        unit_stated = tuple(columns.joints) if columns is not None else ()
         beside = Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path
         if used is None or not used.joints:
             guess = guess_map(log, robot)
-            own, facts_from = guess.columns, guess.facts_from
+            own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
             used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable)
             notes += guess.notes
             if guess.missing:
@@ -119,7 +121,7 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
         lines = [printable(line) for line in (f"{path}: read as", *rates_of(log, used), *notes, *more)]
         result.append(
             Understood(
-                recording=replace(recording, notes=(*recording.notes, *notes, *more)),
+                recording=replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes, *more)),
                 columns=used,
                 lines=tuple(lines[:1] + [f"  {line}" for line in lines[1:]]),
             )
