@@ -9,10 +9,10 @@ Wild, SIAM J. Sci. Comput. 33, 2011, of order 2):
 Steps are taken along the principal directions d of H = JᵀJ, as it was known before, each of a length s at which the
 motion changes by ten times the noise, and at most by the error that is left:
 
-    s = min(10 η, √score) / √(dᵀ H d),   10⁻⁵ ≤ s ≤ ½
+    s = min(10 η, √score) / √(dᵀ H d),   10⁻⁵ ≤ s ≤ ½ min(1, 4 η / √score)
 
-A smooth simulation has no noise, and gets the narrow steps; where links rattle, what rattles is a small part of each
-change, also along a combination of parameters that hardly moves anything.
+A smooth simulation has no noise, and gets the narrow steps: over wide ones the motion bends. Where links rattle, what
+rattles is a small part of each change, also along a combination of parameters that hardly moves anything.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ from pace_optim.problem.parameter_space import ParameterSpace
 NARROW = 1e-5
 """Shortest normalised step, that of smooth simulations: as small as rounding allows."""
 _LONGEST = 0.5
-"""Longest normalised step."""
+"""Longest normalised step, where the noise is the error's ..."""
+_FULL_REACH = 4.0
+"""... fourth part or more; below, in proportion to its share."""
 TIMES_NOISE = 10.0
 """Times the noise that a step changes the motion by."""
 _AT_BOUND = 1e-3
@@ -134,7 +136,8 @@ def stencil(
     else:
         directions = _principal_directions(hessian, x, colouring)
         change = ((directions @ hessian) * directions).sum(dim=1).clamp(min=1e-300).sqrt()
-        reach = (min(TIMES_NOISE * noise, score**0.5) / change).clamp(NARROW, _LONGEST)
+        longest = _LONGEST * min(1.0, _FULL_REACH * noise / max(score**0.5, 1e-300))
+        reach = (min(TIMES_NOISE * noise, score**0.5) / change).clamp(NARROW, max(NARROW, longest))
     free = torch.tensor([bool(joints) for joints in colouring.joints])
     steps = _inside(x, directions * torch.where(free, reach, 0.0)[:, None])
     vectors = [x + steps[list(entries)].sum(dim=0) for entries in colouring.colours]
