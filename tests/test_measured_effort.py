@@ -23,8 +23,8 @@ def sines(time: np.ndarray, seed: int, size: float) -> np.ndarray:
 
 
 def recorded(
-    *, kp=40.0, kd=1.0, delay=3, lag=0, speed_lag=0, limit=np.inf, noise=0.0, offset=0.0, feed_forward=None, seconds=8.0,
-    measured_speed=True, stated=None, position=True,
+    *, kp=40.0, kd=1.0, delay=3, lag=0, speed_lag=0, limit=np.inf, noise=0.0, offset=0.0, feed_forward=None,
+    seconds=8.0, measured_speed=True, stated=None, position=True,
 ) -> Recording:  # fmt: skip
     """A motion and the torque that a drive asks for along it; commands and positions come so many steps late in it."""
     time = np.arange(round(seconds / DT)) * DT

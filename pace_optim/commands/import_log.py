@@ -60,16 +60,12 @@ def _robot(task: str | None) -> Robot:
     if task is None:
         return Robot()
     from pace_envs import ManagerBasedRLEnv, load_env_cfg
+    from pace_optim.problem.recordings import known_robot
 
     cfg = load_env_cfg(task)
     cfg.scene.num_envs = 1
     env = ManagerBasedRLEnv(cfg)  # type: ignore[arg-type]
-    robot = env.scene["robot"]
-    known = Robot(
-        joint_names=tuple(robot.joint_names),
-        limits=robot.data.joint_pos_limits.numpy().copy(),
-        joint_types=robot.joint_types,
-    )
+    known = known_robot(env)
     env.close()
     return known
 

@@ -7,6 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, paired_files, read_map, with_rate
@@ -68,19 +71,31 @@ def read_all(
     return result
 
 
+def known_robot(env: ManagerBasedEnv) -> Robot:
+    """What a log is read for: joints, their limits, and the gains and torque limits that are stated."""
+    robot = env.scene["robot"]
+    sim2real = getattr(env.cfg, "sim2real", None)
+    assumed = np.isin(robot.joint_names, list(getattr(sim2real, "assumed_gains", ())))
+    return Robot(
+        joint_names=tuple(robot.joint_names),
+        limits=robot.data.joint_pos_limits.numpy().copy(),
+        joint_types=robot.joint_types,
+        stiffness=np.where(assumed, np.nan, of_joints(env, "stiffness")),
+        effort_limit=of_joints(env, "effort_limit"),  # type: ignore[arg-type]
+    )
+
+
 def _conformed(
     name: str, env: ManagerBasedEnv, control_dt: float, columns: ColumnMap | None, tell: Callable[[str], None]
 ) -> list[Recording]:
-    robot = env.scene["robot"]
-    limits = robot.data.joint_pos_limits.numpy()
-    known = Robot(joint_names=tuple(robot.joint_names), limits=limits, joint_types=robot.joint_types)
+    robot, known = env.scene["robot"], known_robot(env)
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     return [
         conform_recording(
             recording,
             joint_order=known.joint_names,
             control_dt=control_dt,
-            joint_pos_limits=limits,
+            joint_pos_limits=known.limits,
             joint_types=robot.joint_types,
             load_bodies=robot.body_names,
             accepts_load=sim2real.apply_load is not None,

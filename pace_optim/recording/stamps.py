@@ -70,7 +70,7 @@ def unrounded(time: np.ndarray) -> tuple[np.ndarray, str]:
         return time, ""
     resolution = float(np.median(distinct))
     row = np.arange(len(time))
-    slope, start = np.polyfit(row, time - time[0], 1)
+    slope = float(np.polyfit(row, time - time[0], 1)[0])
     if slope <= 0 or np.ptp(time - time[0] - slope * row) > _ROUNDED * resolution:
         return time, ""
     note = (

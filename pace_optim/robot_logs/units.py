@@ -17,7 +17,7 @@ from .words import UNITS
 _BEYOND = 0.2
 """How far beyond a joint's limits positions may be [rad]."""
 _TURNS = 4.0 * np.pi
-"""Where no limits are known, positions that are commanded beyond this are degrees (up to 360), of a slide mm [rad, m]."""
+"""Where no limits are known, commanded positions beyond this are degrees (up to 360), of a slide mm [rad, m]."""
 _POSITIONS: dict[JointType, tuple[str, str]] = {"hinge": ("rad", "deg"), "slide": ("m", "mm")}
 """What positions are in, and what else they may be in."""
 _WORDS = {"deg": "degrees", "mm": "millimetres"}
@@ -202,7 +202,7 @@ def _of_commands(
 def _of_speeds(
     series: str, channels: Mapping[str, Channel], positions: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
-    """By how much speeds are more than the slopes of positions: each joint's that moves, the others' as all together."""
+    """By how much speeds are more than the slopes of positions: each joint's that moves, others' as all together."""
     sums: dict[str, np.ndarray] = {}
     for name, channel in channels.items():
         sums[name] = np.zeros(3)
@@ -258,8 +258,8 @@ def _of_efforts(
     if not registers:
         return units, []
     return units, [
-        f"{listed(registers)}: whole numbers, as of a register in permille, percent or mA, and no {whole}: left out. If "
-        "you know what one is, give unit and factor in a column map."
+        f"{listed(registers)}: whole numbers, as of a register in permille, percent or mA, and no {whole}: left out. "
+        "If you know what one is, give unit and factor in a column map."
     ]
 
 
