@@ -1,7 +1,5 @@
 """What of a result comes from the physics step: closed forms, and recordings of physics with the step and without."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,7 @@ from pace_envs import set_physics_dt
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.step_share import change_without_step, change_without_steps, step_share
+from pace_optim.uncertainty.step_share import change_without_step, step_share
 
 START = torch.zeros(2, dtype=torch.float64)
 
@@ -48,10 +46,9 @@ def test_a_recording_that_the_step_itself_made_has_no_share():
     assert shares(0.0).tolist() == [0.0, 0.0]
 
 
-def end_of(recorded, task="test", duration=2.0):
+def end_of(recorded, duration=2.0):
     """A fit at 2.5 ms to a recording of the bench: its problem, error, vector and what is known there."""
     problem = make_problem(record(chirp(duration), CALM, cfg=recorded, noise=1e-4))
-    problem = dataclasses.replace(problem, task=task)
     colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
     truth = problem.space.from_dict(CALM)
     start = problem.space.to_normalised(truth)
@@ -80,34 +77,3 @@ def test_error_bars_with_the_step_hold_the_truth_where_those_of_noise_do_not():
 def test_a_simulation_with_this_very_step_is_known_as_one():
     share, off, std = fitted(0.0025)
     assert not share.any() and (np.abs(off) < 4 * std).all()
-
-
-@pytest.mark.parametrize("step", [0.0025, 0.0003125])
-def test_a_loop_whose_rate_nobody_stated_is_in_the_error_bars(step):
-    """A model file's servo that runs faster than commands come: an armature was 87 % off, ± 5 %."""
-    recorded = env_cfg()
-    for drive in recorded.scene.robot.actuators.values():
-        drive.drive_dt = step
-    if step < 0.0025:
-        set_physics_dt(recorded, step, "drive_dt")
-    problem, off, x, known = end_of(recorded, "robot.xml", 1.0)
-    physical, there, std = problem.space.to_physical(x), known.jacobian.residuals, known.uncertainty.std
-    changes = [look(problem, physical, there) for look in (change_without_step, change_without_steps)]
-    shares = [step_share(known.jacobian, change, problem.space, x, ~np.isnan(std)) for change in changes]
-    if step == 0.0025:
-        assert not np.array(shares).any()
-        return
-    both = known.uncertainty.with_step(shares[0]).with_step(shares[1])
-    assert (np.abs(off) > 5 * std).any() and (np.abs(off) < 3 * both.std).all()
-    assert (np.abs(off - shares[1]) < 0.25 * np.abs(off) + 3 * std).all()
-    assert both.step == pytest.approx(np.hypot(*shares))
-    stated = problem.with_drive_dt(step)
-    assert stated.physics_dt == step and not stated.assumes_loop_rate
-    assert change_without_steps(stated, physical, there) is None
-
-
-def test_only_a_model_files_loop_is_assumed():
-    problem = make_problem()
-    assert not problem.assumes_loop_rate and dataclasses.replace(problem, task="robot.xml").assumes_loop_rate
-    stated = make_problem(record(drive={"stiffness": 40.0}))
-    assert not dataclasses.replace(stated, task="robot.xml").assumes_loop_rate

@@ -11,6 +11,8 @@ _LONGEST = 0.25
 """Time from the beginning in which a slope is sought [s]."""
 _DEGREES = (1, 2, 3)
 """Of the polynomials that the motion is taken for there."""
+_LENGTHS = 16
+"""Numbers of samples that are tried of each."""
 _FREEDOM = 2
 """Samples that a window has beyond a polynomial's coefficients, at least."""
 _FITS = 2.0
@@ -57,7 +59,10 @@ def _slope(time: np.ndarray, position: np.ndarray, noise: float) -> tuple[float,
     """The surest slope at the beginning and its standard deviation; ``None`` where no polynomial fits."""
     best: tuple[float, float, float] | None = None
     for degree in _DEGREES:
-        for count in range(degree + 2 + _FREEDOM, len(time) + 1):
+        least = degree + 2 + _FREEDOM
+        for count in np.unique(np.geomspace(least, max(least, len(time)), _LENGTHS).astype(int)).tolist():
+            if count > len(time):
+                continue
             scaled, moved = time[:count] / time[count - 1], position[:count] - position[0]
             powers = np.vander(scaled, degree + 2, increasing=True)
             fewer = powers[:, :-1]

@@ -133,7 +133,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         known: Which parameters have an error bar, (size,) bool; the others stay.
 
     Returns:
-        What was found; ``None`` where the rate is stated, or a candidate cannot be simulated.
+        What was found; ``None`` where the rate is stated, a candidate cannot be simulated, or none is better than the
+        fit at its own physics step: then a simulation with that step has made the recordings.
     """
     if not problem.assumes_loop_rate or not known.any():
         return None
@@ -146,6 +147,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     found = [_refitted(problem.with_loop(p, min(periods)), x, there, known) for p in [*periods, *slower]]
     known_of = [each for each in found if each is not None]
     if any(each is None for each in found[: len(periods)]):
+        return None
+    if float(there.residuals.score[0]) <= min(float(r.score[0]) for _, r in known_of):
         return None
     values, errors = np.stack([v for v, _ in known_of]), torch.stack([r.error[0] for _, r in known_of])
     rates = [1 / f for f in _RATES if 1 / f < (1 - 1e-6) * assumed]

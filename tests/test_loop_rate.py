@@ -1,0 +1,112 @@
+"""The rate of the drives' loops where nobody stated it: what recordings tell of it, and what the error bars hold."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from problems import CALM, chirp, env_cfg, make_problem, record
+
+from pace_optim.optimizers.derivatives import colour
+from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.problem.drive_steps import set_drive_rate
+from pace_optim.uncertainty.assessment import assess
+from pace_optim.uncertainty.loop_rate import LoopRates, _against, _lagrange, loop_rates
+
+GAINS = {"stiffness": 85.0, "damping": 0.6}
+
+
+def recorded_at(period, duration=2.0, noise=1e-4):
+    """A recording that states its gains, of a drive whose loop has a period [s]; a model file's problem."""
+    cfg = env_cfg()
+    for drive in cfg.scene.robot.actuators.values():
+        drive.drive_dt = period
+    set_drive_rate(cfg)
+    problem = make_problem(record(chirp(duration), CALM, cfg=cfg, drive=GAINS, noise=noise))
+    return dataclasses.replace(problem, task="robot.xml")
+
+
+def fitted(problem):
+    """Where a fit from the truth ends, and what is known there."""
+    colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
+    start = problem.space.to_normalised(problem.space.from_dict(CALM))
+    best = least_squares(evaluator, colouring, [start], LeastSquaresCfg(max_iteration=8))[0]
+    return best.x, assess(problem, evaluator, colouring, best.x)
+
+
+def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_says_nothing_of_others():
+    problem = recorded_at(0.0025)
+    x, known = fitted(problem)
+    assert loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std)) is None
+
+
+def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state():
+    """Viscous friction was 53 % high with an error bar of 0.5 %, as a log that states gains seemed to state all."""
+    problem = recorded_at(0.001)
+    assert problem.assumes_loop_rate
+    x, known = fitted(problem)
+    rates = loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std))
+    truth = problem.space.from_dict(CALM).numpy()
+    off = rates.value_at(rates.chosen) - truth
+    both = np.sqrt(known.uncertainty.std**2 + (rates.shares**2).sum(axis=0))
+    assert (np.abs(off) < 3 * both).all()
+    assert (np.abs(problem.space.to_physical(x).numpy() - truth) > 5 * known.uncertainty.std).any()
+    assert (np.abs(rates.value_at(0.001) - truth) < 4 * known.uncertainty.std).all()
+    assert 0.001 in rates.allowed
+
+
+def test_only_drive_dt_states_a_rate():
+    problem = make_problem(record(drive=GAINS))
+    assert not problem.assumes_loop_rate  # a configuration says how its drives run
+    of_file = dataclasses.replace(problem, task="robot.xml")
+    assert of_file.assumes_loop_rate
+    stated = of_file.with_drive_dt(0.001)
+    assert not stated.assumes_loop_rate and stated.loop_dt == 0.001 and stated.physics_dt == 0.0005
+
+
+def of(weights, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
+    weights = np.array(weights)
+    return LoopRates(
+        periods=(0.0025, 0.001, 0.0005), values=np.array(values), weights=weights / weights.sum(), assumed=0.0025
+    )
+
+
+def test_a_rate_that_the_recordings_refute_is_not_used_and_the_spread_of_the_others_is_an_error():
+    undecided, decided, assumed = of([1.0, 1.0, 1.0]), of([1e-4, 1.0, 1.0]), of([1.0, 1e-9, 1e-9])
+    assert (undecided.chosen, decided.chosen, assumed.chosen) == (0.0025, 0.001, 0.0025)
+    assert (decided.shares**2).sum(axis=0) == pytest.approx([0.5 * 0.1**2, 0.0], rel=1e-2)
+    assert (undecided.shares**2).sum(axis=0)[0] == pytest.approx((0.3**2 + 0.4**2) / 3)
+    assert (assumed.shares**2).sum() < 1e-9
+    assert assumed.allowed == (0.0025,)
+
+
+def test_both_values_of_what_depends_on_the_rate_are_told():
+    space = make_problem().space
+    values = np.tile(space.to_physical(space.start).numpy(), (3, 1))
+    values[:, 1] = [0.23, 0.15, 0.11]
+    known = np.ones(space.size, dtype=bool)
+    (told,) = of([1.0, 1.0, 1.0], values).sentences(space, known)
+    assert "viscous friction of servo is 0.23 at 0.4 kHz and 0.11 at 2 kHz" in told and "--drive_dt" in told
+    (told,) = of([1e-4, 1.0, 1.0], values).sentences(space, known)
+    assert "tell it from 0.4 kHz" in told and "1 kHz is used" in told
+    written = of([1e-4, 1.0, 1.0], values).to_dict(space)
+    assert (
+        written["used_s"] == 0.001
+        and written["assumed_s"] == 0.0025
+        and set(written["parameters"]) == {"0.001", "0.0005"}
+    )
+
+
+def test_periods_between_and_beyond_the_simulated_ones_follow_by_their_polynomial():
+    nodes = (2.5, 1.0, 0.5)
+    assert _lagrange(nodes, 1.0).tolist() == [0.0, 1.0, 0.0]
+    for at in (0.025, 0.1, 2.0):
+        assert _lagrange(nodes, at) @ (3.0 + 2.0 * np.array(nodes) ** 2) == pytest.approx(3.0 + 2.0 * at**2)
+
+
+def test_chi_squared_counts_in_the_noise_along_the_difference():
+    rng = np.random.default_rng(0)
+    noise, apart = 1e-3 * rng.standard_normal(5000), 2e-4 * rng.standard_normal(5000)
+    errors = torch.as_tensor(np.stack([noise, noise + apart]))[:, :, None, None]
+    found = _against(errors, np.eye(2), torch.ones(5000, 1, dtype=torch.bool))
+    assert found[0] == 0.0 and found[1] == pytest.approx(200.0, rel=0.3)
