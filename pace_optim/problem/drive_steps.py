@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from pace_envs import ManagerBasedRLEnv, set_physics_dt
+from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv, set_physics_dt
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.recording import Recording
 
@@ -160,7 +160,7 @@ def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
 
 
-def of_joints(env: ManagerBasedRLEnv, name: str, only_implicit: bool = False) -> np.ndarray:
+def of_joints(env: ManagerBasedEnv, name: str, only_implicit: bool = False) -> np.ndarray:
     """A drive's values per joint, (n,); ``_run_dt``: time between two runs of a loop that holds its torque [s]."""
     robot = env.scene["robot"]
     result = np.zeros(robot.num_joints)

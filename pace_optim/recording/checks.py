@@ -294,8 +294,8 @@ def _check_time(key: str, time: np.ndarray, source: str) -> None:
     median = float(np.median(step))
     if median < _FASTEST and key == "time":
         raise ValueError(
-            f"{source}: time steps by {median:.3g} s, which is {1 / median:.3g} Hz; expected at least {_FASTEST:g} s: no "
-            "drive's loop is faster. Is time in another unit than seconds?"
+            f"{source}: time steps by {median:.3g} s, which is {1 / median:.3g} Hz; expected at least {_FASTEST:g} s: "
+            "no drive's loop is faster. Is time in another unit than seconds?"
         )
     if 0.5 <= median < 1.5 and key == "time":
         raise ValueError(
