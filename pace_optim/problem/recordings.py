@@ -80,7 +80,7 @@ def known_robot(env: ManagerBasedEnv) -> Robot:
         joint_names=tuple(robot.joint_names),
         limits=robot.data.joint_pos_limits.numpy().copy(),
         joint_types=robot.joint_types,
-        stiffness=np.where(assumed, np.nan, of_joints(env, "stiffness")),
+        stiffness=np.where(assumed, np.nan, of_joints(env, "stiffness")),  # type: ignore[arg-type]
         effort_limit=of_joints(env, "effort_limit"),  # type: ignore[arg-type]
     )
 
