@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -14,6 +14,16 @@ _LARGE = 1e7
 """Samples from where on it is looked whether there is memory for them."""
 _LARGEST_LEAD = 0.5
 """Of a step: by so much at most a simulator lets a held signal act too early."""
+
+
+class Jump(NamedTuple):
+    """How a signal that is given as its mean changes within the time of the mean."""
+
+    rise: torch.Tensor
+    """Its value after the change less that before, (num_envs, num_joints)."""
+
+    share: torch.Tensor
+    """The part of the time that is before the change, (num_envs, 1 or num_joints)."""
 
 
 class DelayBuffer:
@@ -187,6 +197,19 @@ class DelayBuffer:
             return newer
         older = _look_up(self._storage, self._older[self._head])
         return newer.lerp_(older, self._fraction.to(newer.dtype))
+
+    def jump(self, part: int) -> Jump | None:
+        """By how much the signal rises within a part of the present step; ``None`` where it does not change there."""
+        if self.interpolation == "hold" or self._all_zero:
+            return None
+        if self.parts > 1:
+            newer, older, share = self._at[part]
+        else:
+            newer, older, share = self._newer, self._older, None if self._whole else self._fraction
+        if share is None:
+            return None
+        rise = _look_up(self._storage, newer[self._head]) - _look_up(self._storage, older[self._head])
+        return Jump(rise, share.to(rise.dtype))
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.drive_parameters import DriveParameters
 from pace_actuators.drive_rates import calls_per_run
@@ -115,12 +116,11 @@ class Drive:
         self.encoder_bias = parameters.read("encoder_bias", 0.0)
         self.torque_enable: torch.Tensor | None = None
         self.holds_line = False
-        self.centred = False
         self.is_trapezoidal = False
-        self._first_call = True
         self._speed_slope: torch.Tensor | None = None
         self._loop_slope: torch.Tensor | None = None
         self._run: ControllerRun | None = None
+        self._jump: Jump | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
         self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
@@ -144,7 +144,6 @@ class Drive:
             runs=cfg.control_decimation // calls,
             parts=calls,
         )
-        self._asked = self.computed_effort
         self._calls_until_control = 0
         self._renewed = torch.zeros(num_envs, 1, dtype=torch.bool, device=self._device)  # since the last call
         self._any_renewed = False
@@ -206,9 +205,8 @@ class Drive:
             self._since_run[slice(None) if env_ids is None else env_ids] = self._own_dt
         if env_ids is None:
             self._calls_until_control = 0
-            self._first_call = True
             self._any_renewed = False
-        elif self._calls_until_control or self.centred:
+        elif self._calls_until_control:
             if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
                 self._renewed |= env_ids[:, None]
             else:
@@ -249,7 +247,6 @@ class Drive:
     def take_over_simulator(self, *, is_trapezoidal: bool, holds_line: bool) -> None:
         """Say how the simulator moves positions, and what it holds between two calls: see the attributes."""
         self.holds_line, self.is_trapezoidal = holds_line, is_trapezoidal
-        self.centred = holds_line and not is_trapezoidal
         if self.effects is not None:
             self.effects.is_trapezoidal = is_trapezoidal
         self._delays.set_lead(self._lead)
@@ -257,8 +254,14 @@ class Drive:
     @property
     def _lead(self) -> float:
         """By how much the simulator lets a delayed command act too early, in runs of the controller."""
-        early = self.cfg.centred_commands and self.cfg.delay_mode == "command"
-        return 0.5 / self._calls_per_run if early and not (self.is_trapezoidal or self.centred) else 0.0
+        early = self.cfg.centred_commands and self.cfg.delay_mode == "command" and not self.is_trapezoidal
+        return 0.5 / self._calls_per_run if early else 0.0
+
+    @property
+    def _ahead(self) -> float:
+        """By how long the simulator shows positions too early [s]."""
+        early = self.cfg.second_order and not self.is_trapezoidal and not self.cfg.implicit
+        return 0.5 * self._physics_dt if early and self._physics_dt is not None else 0.0
 
     def set_torque_enable(self, enabled: torch.Tensor | None) -> None:
         """Say which environments' drives give torque: bool, shape (num_envs,); ``None`` for all.

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import torch
 
-from pace_actuators.delay_buffer import DelayBuffer, Interpolation
+from pace_actuators.delay_buffer import DelayBuffer, Interpolation, Jump
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
 _Signal = TypeVar("_Signal", torch.Tensor, torch.Tensor | None)
@@ -101,3 +101,8 @@ class DriveDelays:
         """The mean of what arrives of a signal until the next run; ``undelayed`` if it is not delayed."""
         buffer = self._buffers.get(name)
         return undelayed if buffer is None or name in self._silent else buffer.mean()
+
+    def jump(self, name: str, part: int) -> Jump | None:
+        """How a signal changes within a call; ``None`` if it does not, or is not delayed or not given."""
+        buffer = self._buffers.get(name)
+        return None if buffer is None or name in self._silent else buffer.jump(part)

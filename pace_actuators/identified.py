@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
 """Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
 
-RATE_FLAGS = ("implicit", "centred_commands")
+RATE_FLAGS = ("implicit", "centred_commands", "second_order")
 """How its controller ran, beside ``drive_dt``."""
 
 RIG_EFFECTS = ("mount_compliance",)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
 from pace_actuators.dc_motor import clip_effort, clip_to_line, pd_effort
+from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive import ControllerRun
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.drive_with_effects import DriveWithEffects
@@ -49,9 +51,6 @@ class PaceDCMotor(DriveWithEffects):
         holds_line: Whether, between two calls, the simulator holds a torque that runs along the torque-speed line
             (``held_effort`` with its slope in ``joint_viscous_friction``) rather than one number: more exact, for
             simulators that take both.
-        centred: Whether the first call of a control step gives the mean of the old and the new torque. Where a
-            simulator updates speeds before positions (semi-implicit Euler), a torque acts half a physics step early;
-            with this it does not.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
     """
 
@@ -78,37 +77,36 @@ class PaceDCMotor(DriveWithEffects):
             joint_velocities=control_action.joint_velocities,
             joint_efforts=control_action.joint_efforts,
         )
+        if ahead := self._ahead:
+            joint_pos = torch.add(joint_pos, joint_vel, alpha=-ahead)
         if self.effects is not None:
             self.effects.begin_step(joint_pos, joint_vel)
-        before, first = self._asked, self._first_call
         if self._calls_until_control == 0:
             self.computed_effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
             self._calls_until_control = self._calls_per_run
-            self._first_call, self._alone = False, None
+            self._alone = None
         else:
             if self._delays.changes(part := self._calls_per_run - self._calls_until_control):
                 self.computed_effort = self._effort_command_at(part)
             if self._any_renewed:
                 self._alone = self._run_alone(control_action, joint_pos, joint_vel)
+                self._renewed.zero_()
+                self._any_renewed = False
             if self._alone is not None:
-                self.computed_effort = torch.where(self._alone.isnan(), self.computed_effort, self._alone)
+                others = self._alone.isnan()
+                self.computed_effort = torch.where(others, self.computed_effort, self._alone)
+                if self._jump is not None:
+                    self._jump = self._jump._replace(rise=self._jump.rise * others)
         self._calls_until_control -= 1
         asked = self.computed_effort
         if self.effects is not None and self.effects.has("effort_command"):
             asked = self.effects.asked_of_drive(asked)
             if self._loop_slope is not None:
                 self._loop_slope = self._loop_slope * self.effects.state.speed_slope
-        self._asked = asked
-        if self.centred and not first and asked is not before:
-            if self._any_renewed:
-                before = torch.where(self._renewed, asked, before)
-            asked = 0.5 * (before + asked)
-        if self._any_renewed:
-            self._renewed.zero_()
-            self._any_renewed = False
         if self._feeds_back:
             asked, self._loop_slope = self.effects.fed_back(asked)  # type: ignore[union-attr]
         effort = self.drive_effort(asked, joint_pos, joint_vel)
+        self._jump = None
         if self.effects is not None:
             effort = self.transmitted_effort(effort)
             self.effects.end_step()
@@ -165,7 +163,10 @@ class PaceDCMotor(DriveWithEffects):
                 self._run.added = effort - plain
         if feed_forward is not None:
             effort += feed_forward
-        return self._delays.push("torque", effort) if self.cfg.delay_mode == "effort" else effort
+        if self.cfg.delay_mode == "effort":
+            effort = self._delays.push("torque", effort)
+        self._jump = self._jump_of_torque(0, stiffness, damping)
+        return effort
 
     def _run_alone(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
         """What the controllers of reset drives ask while the others hold [N m]; NaN for the others.
@@ -185,10 +186,11 @@ class PaceDCMotor(DriveWithEffects):
     def _effort_command_at(self, part: int) -> torch.Tensor:
         """The controller's torque [N m] at a call between two of its runs, when a command or a torque has arrived."""
         delays, run = self._delays, self._run
-        if self.cfg.delay_mode == "effort":
-            return delays.at("torque", part, self.computed_effort)
         if run is None:  # a subclass has a law of its own
             return self.computed_effort
+        self._jump = self._jump_of_torque(part, run.stiffness, run.damping)
+        if self.cfg.delay_mode == "effort":
+            return delays.at("torque", part, self.computed_effort)
         position = delays.at("positions", part, None)
         velocity = delays.at("velocities", part, run.velocity)
         feed_forward = delays.at("efforts", part, run.feed_forward)
@@ -199,6 +201,25 @@ class PaceDCMotor(DriveWithEffects):
             if more is not None:
                 effort += more
         return effort
+
+    def _jump_of_torque(self, part: int, stiffness: torch.Tensor, damping: torch.Tensor) -> Jump | None:
+        """How the torque that is asked changes within a call, as a command or a torque arrives [N m]."""
+        jumps = [(self._delays.jump("torque", part), None)]
+        if self.cfg.delay_mode == "command":
+            gains = {"positions": stiffness, "velocities": damping, "efforts": None}
+            jumps = [(self._delays.jump(name, part), gain) for name, gain in gains.items()]
+        found = [(jump, gain) for jump, gain in jumps if jump is not None]
+        if not found:
+            return None
+        rises = [jump.rise if gain is None else gain * jump.rise for jump, gain in found]
+        return Jump(sum(rises[1:], rises[0]), found[0][0].share)
+
+    def _in_parts(self, effort: torch.Tensor) -> list[tuple[torch.Tensor | float, torch.Tensor]]:
+        """The torques of which a mean torque is made in a call, and how much of the time each has."""
+        if self._jump is None:
+            return [(1.0, effort)]
+        rise, share = self._jump
+        return [(1 - share, effort + share * rise), (share, effort - (1 - share) * rise)]
 
     def _within_the_step(
         self, position: torch.Tensor, speed: torch.Tensor, stiffness: torch.Tensor, damping: torch.Tensor
@@ -228,23 +249,25 @@ class PaceDCMotor(DriveWithEffects):
         Returns:
             The motor's torque [N m], (num_envs, num_joints).
         """
-        asked, slope = effort_command, None
+        asked, slope, clip = effort_command, self._loop_slope, clip_effort
         speed = joint_vel if self.effects is None else self.effects.state.motor_vel
-        clip = clip_effort
+        parts = self._in_parts(asked)
         if self.effects is not None and self.effects.acts_in_drive:
-            asked = torch.clamp(asked, -self.effort_limit, self.effort_limit)
-            if (slope := self._loop_slope) is not None:
-                slope = slope * (asked == effort_command)
+            clamped = [(share, part, part.clamp(-self.effort_limit, self.effort_limit)) for share, part in parts]
+            asked = _mean(asked, clamped)
+            slope = None if slope is None else sum(share * (slope * (after == part)) for share, part, after in clamped)
             asked, slope = self.effects.given_by_drive(asked, slope)
-            clip = clip_to_line
-        effort = clip(asked, speed, self.saturation_effort, self.effort_limit, self.velocity_limit)
-        own = self._loop_slope if slope is None else slope
-        if self.holds_line:
-            line = self.saturation_effort / self.velocity_limit
-            free = effort.abs() != self.effort_limit
-            self._speed_slope = torch.where(effort == asked, 0.0 if own is None else own, line * free)
-        elif self._loop_slope is not None:
-            self._speed_slope = (self._loop_slope if own is None else own) * (effort == asked)
+            parts, clip = [(1.0, asked)], clip_to_line
+        limits = speed, self.saturation_effort, self.effort_limit, self.velocity_limit
+        clipped = [(share, part, clip(part, *limits)) for share, part in parts]
+        effort = _mean(asked, clipped)
+        if self.holds_line or self._loop_slope is not None:
+            own = 0.0 if slope is None else slope
+            line = self.saturation_effort / self.velocity_limit if self.holds_line else 0.0
+            self._speed_slope = sum(
+                share * torch.where(after == part, own, line * (after.abs() != self.effort_limit))
+                for share, part, after in clipped
+            )
         if self.torque_enable is not None:
             effort = effort * self.torque_enable
             if self._speed_slope is not None:
@@ -264,3 +287,15 @@ class PaceDCMotor(DriveWithEffects):
         if self.effects is None or not self.effects.changes_passive:
             return effort
         return self.effects.at_the_joint(effort, self.friction, self.viscous_friction, self._speed_slope)
+
+
+def _mean(asked: torch.Tensor, limited: Sequence[tuple[torch.Tensor | float, torch.Tensor, torch.Tensor]]) -> Any:
+    """What limits leave of a mean torque [N m]; exactly that torque where no part of it meets one.
+
+    Args:
+        asked: The mean torque [N m].
+        limited: Of each part its share of the time, its torque, and what limits leave of that.
+    """
+    if len(limited) == 1:
+        return limited[0][2]
+    return asked + sum(share * (after - part) for share, part, after in limited)

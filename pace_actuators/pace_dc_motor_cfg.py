@@ -113,6 +113,10 @@ class PaceDCMotorCfg(Config):
     it, and is longer than the drive's by half a physics step. ``True`` takes that half step out of the commands, so
     that it does not go into the delay; feedback stays as it is."""
 
+    second_order: bool = False
+    """Whether the values were identified with steps of second order, so that they hold no error of a step. Simulators
+    that update speeds before positions show positions half a physics step early; the drive then takes that back."""
+
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects beyond this base model, by name (``"stribeck_friction"``) or with their values."""
 

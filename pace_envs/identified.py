@@ -18,6 +18,7 @@ from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.managers import EventTermCfg
+from pace_envs.registration import set_physics_dt
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
 
@@ -37,11 +38,14 @@ def use_identified(
     randomize_std: float | None = None,
     gains: bool = False,
     on_the_rig: bool = False,
+    own_step: bool = False,
 ) -> list[str]:
     """Give the robot of an environment the drives that a fit identified.
 
     Armature, frictions, encoder bias, delay, delay mode and effects become the identified ones. Gains and limits stay
-    the environment's: they are the policy's controller.
+    the environment's: they are the policy's controller. Where the identification took steps of second order, so does
+    the environment on the processor, and at its control step as fine ones; on a GPU drives take half a step back
+    (``PaceDCMotorCfg.second_order``).
 
     Args:
         cfg: The environment; it is changed.
@@ -50,16 +54,24 @@ def use_identified(
             ``None`` does not.
         gains: Also take over the gains and limits of the recordings, as far as the result says them.
         on_the_rig: Whether the robot is held as in the recording: with the effects of what held it.
+        own_step: Keep the environment's physics step.
 
     Returns:
-        What the environment cannot represent, in words.
+        What was changed of the step, and what the environment cannot represent, in words.
 
     Raises:
         ValueError: If the result is unusable, or its joints are not the robot's.
     """
     drives = IdentifiedDrives.load(path)
     notes = check_representable(drives, HERE)
-    cfg.scene.robot.actuators = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
+    cfg.scene.robot.actuators = groups = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
+    if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
+        cfg.sim.integrator = "leapfrog"
+        at = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
+        if abs(cfg.sim.dt - at) < 1e-9 and drives.at.physics_dt < at * (1 - 1e-6) and not own_step:
+            set_physics_dt(cfg, drives.at.physics_dt)
+            step = f"physics steps of {1e3 * cfg.sim.dt:g} ms"
+            notes.append(f"{step}, as in the identification; the drives keep their {1e3 * at:g} ms.")
     if randomize_std is not None:
         cfg.events = {
             **cfg.events,

@@ -43,3 +43,9 @@ def from_euler(angles: torch.Tensor) -> torch.Tensor:
         ],
         dim=1,
     )
+
+
+def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
+    """Quaternion of a rotation about an axis by the vector's length [rad], (n, 3) to (n, 4)."""
+    angle = torch.linalg.vector_norm(vector, dim=1, keepdim=True)
+    return torch.cat([(0.5 * angle).cos(), 0.5 * torch.sinc(angle / (2 * torch.pi)) * vector], dim=1)

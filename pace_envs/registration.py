@@ -155,7 +155,7 @@ def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
 def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float, name: str = "physics_dt") -> None:
     """Make the physics step finer; the controllers, and the environment, keep their rates.
 
-    The finer steps are Runge-Kutta's.
+    The finer steps are of second order (``"leapfrog"``).
 
     Args:
         cfg: The environment; it is changed.
@@ -175,7 +175,7 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float, name: str = "phys
         return
     cfg.sim.dt /= ratio
     cfg.decimation *= ratio
-    cfg.sim.integrator = "rk4"
+    cfg.sim.integrator = "leapfrog"
     for drive in cfg.scene.robot.actuators.values():
         drive.control_decimation *= ratio
 

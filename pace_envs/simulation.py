@@ -17,6 +17,7 @@ from mujoco import batch
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
 from pace_envs.mujoco_warnings import keep_quiet
+from pace_envs.quaternions import from_rotation_vector, multiply
 
 EnvIds = Sequence[int] | torch.Tensor | np.ndarray | slice | None
 
@@ -24,16 +25,18 @@ _INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "leapfrog": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
 
 
 _STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
-_RK4_FRICTION = 0.8
-"""Time constant T of joint friction with RK4 [time steps]. A sticking joint's speed decays at the rate 2 / T; RK4 is
-stable where a step is shorter than 2.79 / rate, and 2 / 0.8 = 2.5."""
-_EXPLICIT = 0.5
-"""Part of its speed that a rotor may lose to viscous friction in a step of an explicit integrator."""
+_FRICTION_STEPS = {"leapfrog": 4 / 3}
+"""Time constant T of joint friction [time steps] by integrator; 2 with all others.
+
+A step makes v of a sticking joint's speed (1 - 2 / T) v: a constraint's force is constant over the step, and turns
+where the speed would pass this. With T = 2 friction turns half a step early in the mean, with T = 1 (the speed only
+changes its sign) in the middle.
+"""
 
 
 @dataclass(kw_only=True)
@@ -43,15 +46,22 @@ class SimulationCfg:
     dt: float = 0.0025
     """Physics time step [s]."""
 
-    integrator: Literal["implicitfast", "implicit", "euler", "rk4"] = "implicitfast"
-    """MuJoCo's integrator."""
+    integrator: Literal["implicitfast", "leapfrog", "implicit", "euler"] = "implicitfast"
+    """One of MuJoCo's, all of first order, or ``"leapfrog"``: of second order, at the cost of MuJoCo's implicitfast.
+
+    With x and v the state, M, D and f the inertia, the damping and all other forces:
+
+        x½ = x + h v / 2        M(x½) (v₊ - v) = h (f(x½, v) - D (v + v₊) / 2)        x₊ = x½ + h v₊ / 2
+
+    What is held over the step (a drive's torque) acts when it should. Of first order remain the forces that grow with
+    the square of the speed, and the instant within a step at which friction turns.
+    """
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """Gravity [m/s^2]."""
 
     friction_timeconst: float | None = None
-    """Time constant of the joints' Coulomb friction [s]; ``None``: the shortest that is stable, two time steps, or 0.8
-    with ``rk4``, whose stages bring a sticking joint to rest from any of them.
+    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps, with ``"leapfrog"`` 4 / 3.
 
     MuJoCo's default of 20 ms is soft: a stuck joint creeps.
     """
@@ -116,7 +126,7 @@ class Simulation:
     @property
     def is_trapezoidal(self) -> bool:
         """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
-        return self.cfg.integrator == "rk4"
+        return self.cfg.integrator == "leapfrog"
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
         """Compile the model and start the thread pool.
@@ -145,6 +155,7 @@ class Simulation:
         self.qfrc_applied = self.bind("qfrc_applied")
         self._constants_changed = False
         self._expanded: dict[str, torch.Tensor] = {}
+        self._drift = Drift(self.model, self.device) if self.is_trapezoidal else None
         self._link_fields: dict[str, torch.Tensor] = {}
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
 
@@ -188,17 +199,20 @@ class Simulation:
             viscous: Viscous friction [N m s/rad].
             implicit: Viscous friction that must act on the speed at the end of the step [N m s/rad].
         """
-        if not self.is_trapezoidal:
-            viscous = viscous if implicit is None else viscous + implicit
-        else:  # the integrator is explicit: - D v₊ = - D v - h D a is a torque and an inertia; so is too steep a line
-            h = self.cfg.dt
-            steep = (viscous - _EXPLICIT * armature / h).clamp(min=0.0)
-            drag, inertia = (steep, 0.5 * steep) if implicit is None else (steep + implicit, 0.5 * steep + implicit)
-            self.qfrc_applied[:, columns] -= drag * self.qvel[:, columns]
-            armature, viscous = armature + h * inertia, viscous - steep
+        if implicit is None:
+            damping = viscous
+        elif not self.is_trapezoidal:
+            damping = viscous + implicit
+        else:  # what _leap() makes act on the speed before the step is to be a part of viscous alone
+            most = armature / self.cfg.dt
+            early = torch.minimum(0.5 * viscous, most)
+            late = viscous + implicit - early
+            own = torch.minimum(late, most)
+            damping = late + own
+            self.qfrc_applied[:, columns] += (own - early) * self.qvel[:, columns]
         self.expand("dof_armature")[:, columns] = armature
         self.expand("dof_frictionloss")[:, columns] = friction
-        self.expand("dof_damping")[:, columns] = viscous
+        self.expand("dof_damping")[:, columns] = damping
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as it was computed last, (num_envs, len(columns)) each; gravity pulls no slide back.
@@ -248,7 +262,30 @@ class Simulation:
         """Advance every simulation by one physics step."""
         if self._constants_changed:
             self._update_constants()
+        if self._drift is None:
+            self._step()
+        else:
+            self._leap(self._drift)
+
+    def _step(self) -> None:
+        """MuJoCo's own step."""
         self.batch.step()
+
+    def _leap(self, drift: Drift) -> None:
+        """A step of second order around MuJoCo's, which moves the positions of its middle with the new speed.
+
+        Half of the damping acts on the speed before the step, as far as that cannot turn a rotor around.
+        """
+        h, damping = self.cfg.dt, self.expand("dof_damping")
+        whole, applied = damping.clone(), self.qfrc_applied.clone()
+        early = torch.minimum(0.5 * damping, self.expand("dof_armature") / h)
+        damping -= early
+        self.qfrc_applied.addcmul_(early, self.qvel, value=-1)
+        drift(self.qpos, self.qvel, 0.5 * h)
+        self._step()
+        drift(self.qpos, self.qvel, -0.5 * h)
+        damping.copy_(whole)
+        self.qfrc_applied.copy_(applied)
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
@@ -355,11 +392,50 @@ class Simulation:
         It is the time constant T; where that is below two steps, which MuJoCo would lengthen it to, it is the stiffness
         and damping that T stands for, -(1 / T², 2 / T).
         """
-        timeconst, dt = self.cfg.friction_timeconst, self.cfg.dt
-        if timeconst is None and self.is_trapezoidal:
-            shortest = _RK4_FRICTION * dt
-            return [-1.0 / shortest**2, -2.0 / shortest]
-        return [2 * dt if timeconst is None else timeconst, 1.0]
+        own, steps = self.cfg.friction_timeconst, _FRICTION_STEPS.get(self.cfg.integrator, 2)
+        timeconst = steps * self.cfg.dt
+        if own is None and steps < 2:
+            return [-1.0 / timeconst**2, -2.0 / timeconst]
+        return [timeconst if own is None else own, 1.0]
+
+
+class Drift:
+    """Moves positions with the speeds alone, as MuJoCo's ``mj_integratePos``."""
+
+    def __init__(self, model: mujoco.MjModel, device: torch.device):
+        """Look up where positions and speeds are.
+
+        Args:
+            model: The model.
+            device: Of the state.
+        """
+        kinds = {name: model.jnt_type == getattr(mujoco.mjtJoint, f"mjJNT_{name}") for name in ("FREE", "BALL")}
+        single = ~(kinds["FREE"] | kinds["BALL"])
+        positions, speeds = model.jnt_qposadr, model.jnt_dofadr
+        lines = [(positions[single], speeds[single])]
+        lines += [(positions[kinds["FREE"]] + i, speeds[kinds["FREE"]] + i) for i in range(3)]
+        turns = [(positions[kinds["FREE"]] + 3, speeds[kinds["FREE"]] + 3)]
+        turns += [(positions[kinds["BALL"]], speeds[kinds["BALL"]])]
+        self._all = model.nq == model.nv
+        self._lines = [torch.as_tensor(np.concatenate(each), device=device).long() for each in zip(*lines, strict=True)]
+        starts = zip(*(np.concatenate(each).tolist() for each in zip(*turns, strict=True)), strict=True)
+        self._turns = [(slice(q, q + 4), slice(v, v + 3)) for q, v in starts]
+
+    def __call__(self, qpos: torch.Tensor, qvel: torch.Tensor, time: float) -> None:
+        """Move.
+
+        Args:
+            qpos: (num_envs, nq); it is changed.
+            qvel: (num_envs, nv).
+            time: For how long [s].
+        """
+        if self._all:
+            qpos.add_(qvel, alpha=time)
+            return
+        q, v = self._lines
+        qpos[:, q] += time * qvel[:, v]
+        for place, speed in self._turns:
+            qpos[:, place] = multiply(qpos[:, place], from_rotation_vector(time * qvel[:, speed]))
 
 
 def bytes_per_env(model: mujoco.MjModel) -> int:

@@ -58,10 +58,7 @@ class WarpSimulation(Simulation):
             self._forget_graphs()
         return self._expanded[field]
 
-    def step(self) -> None:
-        """Advance every simulation by one physics step."""
-        if self._constants_changed:
-            self._update_constants()
+    def _step(self) -> None:
         self._run("step")
 
     def forward(self, env_ids: EnvIds = None) -> None:

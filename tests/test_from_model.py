@@ -287,7 +287,7 @@ def test_the_gains_around_motors_are_somebody_elses(tmp_path):
     assert cfg.sim2real.assumed_gains == cfg.sim2real.joint_order
     assert min(drive_of(cfg).stiffness) > 0.0 and min(drive_of(cfg).damping) > 0.0
     assert any("none: kp = effort limit" in note for note in cfg.sim2real.notes)
-    assert not drive_of(cfg).implicit and cfg.sim.integrator == "rk4"
+    assert not drive_of(cfg).implicit and cfg.sim.integrator == "leapfrog"
 
 
 def test_ranges_that_seem_to_be_radians_read_as_degrees_are_noted(tmp_path):

@@ -105,7 +105,6 @@ def test_a_lead_is_added_to_every_lag():
     [
         ({}, False, False, True),
         ({}, True, True, False),  # a simulator in which a held torque acts when it should
-        ({"control_decimation": 2}, False, True, False),  # there the torque is centred
         ({"delay_mode": "effort"}, False, False, False),
     ],
 )
@@ -124,10 +123,51 @@ def test_the_half_step_is_taken_out_where_a_simulator_makes_it(cfg, is_trapezoid
     assert (torques == [0.0, 0.0, 0.5, 1.0]) == early
 
 
+@pytest.mark.parametrize(
+    ("is_trapezoidal", "changes", "shown"),
+    [(False, {}, 0.1 - 0.5 * CONTROL_DT * 4.0), (True, {}, 0.1), (False, {"implicit": True}, 0.1)],
+)
+def test_positions_that_a_simulator_shows_early_are_taken_back_where_a_simulator_makes_it(
+    is_trapezoidal, changes, shown
+):
+    cfg = PaceDCMotorCfg(
+        joint_names_expr="a", stiffness=1.0, damping=0.0, effort_limit=100.0, second_order=True, **changes
+    )
+    motor = PaceDCMotor(cfg, ["a"], slice(None), 1, physics_dt=CONTROL_DT, dtype=torch.float64)
+    motor.take_over_simulator(is_trapezoidal=is_trapezoidal, holds_line=False)
+    position, velocity = (torch.full((1, 1), value, dtype=torch.float64) for value in (0.1, 4.0))
+    torque = motor.compute(ActuatorActions(joint_positions=torch.zeros_like(position)), position, velocity)
+    assert float(torque.joint_efforts) == pytest.approx(-shown)
+
+
+@pytest.mark.parametrize("decimation", [1, 5])
+@pytest.mark.parametrize("mode", ["command", "effort"])
+def test_limits_act_on_the_torque_before_and_after_a_command_that_arrives_within_a_step(decimation, mode):
+    """A delay of 1.3 control steps; targets 0, then 3 rad at a limit of 1 N m: 0.3 of a step at 0, 0.7 at the limit."""
+    cfg = PaceDCMotorCfg(
+        joint_names_expr="a",
+        stiffness=1.0,
+        damping=0.0,
+        effort_limit=1.0,
+        delay=1.3,
+        delay_mode=mode,
+        control_decimation=decimation,
+    )
+    motor = PaceDCMotor(cfg, ["a"], slice(None), 1, physics_dt=CONTROL_DT / decimation, dtype=torch.float64)
+    still, means = torch.zeros(1, 1, dtype=torch.float64), []
+    for target in (0.0, 3.0, 3.0, 3.0):
+        action = ActuatorActions(joint_positions=torch.full_like(still, target))
+        torques = [float(motor.compute(action, still, still).joint_efforts) for _ in range(decimation)]
+        means.append(sum(torques) / decimation)
+    assert means == pytest.approx([0.0, 0.0, 0.7, 1.0])
+
+
 def test_what_a_fit_found_keeps_how_commands_act_in_training_and_exports(tmp_path):
     problem = load_problem(BENCH, env_cfg=env_cfg())
     assert drive_in_force(problem)["centred_commands"] == {"servo": 1.0}
     assert not load_env_cfg("Pace-AnymalD-v0").scene.robot.actuators["legs"].centred_commands  # PACE's own
+    assert "second_order" not in drive_in_force(problem)
+    assert drive_in_force(problem.with_physics_dt(CONTROL_DT / 2))["second_order"] == {"servo": 1.0}
 
 
 def test_a_delay_of_whole_steps_of_a_held_loop_is_said_to_be_one_of_many(tmp_path):

@@ -335,12 +335,12 @@ def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
     fine = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.0005))
     drive = fine.scene.robot.actuators["legs"]
     assert (fine.sim.dt, fine.decimation, drive.control_decimation) == (pytest.approx(0.0005), 40, 5)
-    assert fine.sim.integrator == "rk4"
+    assert fine.sim.integrator == "leapfrog"
     values = {"stiffness": 800.0, "damping": 0.5, "encoder_side": 0.0}
     parameters = {f"joint_elasticity.{name}": dict.fromkeys(JOINTS, value) for name, value in values.items()}
     changed(result, effects=["joint_elasticity"], parameters=parameters)
     stiff = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.0005))
-    assert (stiff.sim.integrator, stiff.scene.robot.actuators["legs"].control_decimation) == ("rk4", 5)
+    assert (stiff.sim.integrator, stiff.scene.robot.actuators["legs"].control_decimation) == ("leapfrog", 5)
     coarse = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.005))
     assert (coarse.sim.dt, coarse.decimation) == (0.005, 4)
 

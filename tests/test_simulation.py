@@ -146,18 +146,19 @@ def test_a_finer_physics_step_keeps_the_control_rate():
     assert 1e-7 < (a - b).abs().max() < 5e-3
 
 
-def test_finer_steps_are_runge_kutta_with_fast_dynamics_of_a_drive_too():
+def test_finer_steps_are_of_second_order_with_fast_dynamics_of_a_drive_too():
     cfg = load_env_cfg("Pace-TestBench-v0")
     cfg.set_effects(["joint_elasticity"])
     set_physics_dt(cfg, 0.0005)
-    assert cfg.sim.integrator == "rk4" and cfg.decimation == 5
+    assert cfg.sim.integrator == "leapfrog" and cfg.decimation == 5
     assert cfg.scene.robot.actuators["servo"].control_decimation == 5
 
 
 def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
-    """Positions every 10 ms of a joint that a slow torque swings against friction, by Runge-Kutta."""
+    """Positions every 10 ms of a joint that a slow torque swings against friction, by steps of second order."""
     cfg = load_env_cfg("Pace-TestBench-v0")
-    cfg.sim.dt, cfg.sim.integrator, cfg.sim.gravity, cfg.sim.friction_timeconst = dt, "rk4", (0.0, 0.0, 0.0), timeconst
+    cfg.sim.dt, cfg.sim.integrator, cfg.sim.gravity = dt, "leapfrog", (0.0, 0.0, 0.0)
+    cfg.sim.friction_timeconst = timeconst
     env = ManagerBasedRLEnv(cfg)
     start(env)
     every, seen = round(0.01 / dt), []
@@ -171,17 +172,17 @@ def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
     return np.array(seen)
 
 
-def test_friction_of_runge_kutta_gives_way_at_once():
-    """What two time steps smooth where the joint turns is worth a finer step."""
+def test_friction_of_second_order_steps_gives_way_in_the_middle_of_a_step():
+    """With two time steps it turns half a step early in the mean."""
     exact, own, two_steps = swung(0.0001), swung(0.0025), swung(0.0025, timeconst=0.005)
-    assert np.abs(own - exact).max() < 0.3 * np.abs(two_steps - exact).max()
+    assert np.abs(own - exact).max() < 0.7 * np.abs(two_steps - exact).max()
 
 
-def test_friction_of_runge_kutta_holds():
+def test_friction_of_second_order_steps_holds():
     assert np.abs(swung(0.0025, amplitude=0.19)).max() < 1e-4
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
+@pytest.mark.parametrize("integrator", ["implicitfast", "leapfrog"])
 def test_implicit_damping_acts_on_the_speed_after_the_step(integrator):
     """(M + J) (v₊ - v) = h (τ - D v₊), whatever D is."""
     cfg = load_env_cfg("Pace-TestBench-v0")
@@ -202,14 +203,14 @@ def test_implicit_damping_acts_on_the_speed_after_the_step(integrator):
 
 
 def test_finer_steps_bear_any_torque_speed_line():
-    """Runge-Kutta's own damping would diverge beyond 2.8 M / h."""
+    """An explicit damping would diverge beyond 2 M / h."""
     env = bench(gravity=False, physics_dt=0.00125, damping=0.0, armature=0.01, viscous_friction=2000.0)
     start(env, velocity=2.0)
     q = roll(env, 0.2)[:, 0]
     assert float(q.max()) < 2 * (INERTIA + 0.01) * 2.0 / 2000.0 and float(q.min()) >= -1e-9
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "rk4"])
+@pytest.mark.parametrize("integrator", ["implicitfast", "leapfrog"])
 def test_between_control_steps_the_torque_is_held(integrator):
     cfg = load_env_cfg("Pace-TestBench-v0")
     cfg.set_effects(["backlash"])
@@ -226,9 +227,7 @@ def test_between_control_steps_the_torque_is_held(integrator):
         env.scene.update()
         seen.append(robot.data.applied_torque.item())
     assert len(set(seen[:5])) == 1 and len(set(seen[6:])) == 1 and seen[0] != seen[6]
-    # where positions move with the new speed, a torque acts half a physics step early, else
-    expected = seen[6] if integrator == "rk4" else 0.5 * (seen[0] + seen[6])
-    assert seen[5] == pytest.approx(expected)
+    assert seen[5] == pytest.approx(seen[6])
 
 
 @pytest.mark.parametrize("physics_dt", [0.001, 0.005, 0.0, -0.0025, math.nan, math.inf])

@@ -131,7 +131,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
         scene=PaceSim2realSceneCfg(robot=articulation),
         sim=SimulationCfg(
             dt=control_dt,
-            integrator="implicitfast" if continuous else "rk4",  # where all damping is stable, or torques are held
+            integrator="leapfrog",
             gravity=_gravity(robot.model),
         ),
         sim2real=PaceCfg(
@@ -151,6 +151,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             },
             slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
             assumed_gains=tuple(joint.name for joint in joints if not has_gains(joint)),
+            physics_steps=max(1, min(defaults.PHYSICS_STEPS, round(control_dt / defaults.FINEST_STEP))),
             notes=robot.notes,
         ),
     )

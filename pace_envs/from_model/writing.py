@@ -88,6 +88,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
                     for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
                 },
             },
+            physics_steps=_STEPS_,  # in a control step of a fit
             assumed_gains=_ASSUMED_,  # without those whose gains you state above
         ),
     )
@@ -147,6 +148,7 @@ def configuration_text(
             "_ROTATION_": tuple(robot.init_state.rot),
             "_STEP_": _number(cfg.sim.dt),
             "_INTEGRATOR_": cfg.sim.integrator,
+            "_STEPS_": sim2real.physics_steps,
             "_GRAVITY_": tuple(cfg.sim.gravity),
             "_ROBOT_": sim2real.robot_name,
             "_DATA_": f"data/{sim2real.robot_name}/chirp.npz",

@@ -67,11 +67,11 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvC
         if not isinstance(cfg, VelocityEnvCfg):
             raise ValueError(f"--randomize is for walking robots, and {settings.task} is no velocity task.")
         add_randomization(cfg)
+    cfg.sim.device = settings.device
     _use_drives(cfg, settings)
     if settings.num_envs is not None:
         cfg.scene.num_envs = settings.num_envs
     cfg.seed = cfg.runner.seed = settings.seed + process_number()  # each process has environments of its own
-    cfg.sim.device = settings.device
     if settings.max_iterations is not None:
         if settings.max_iterations < 1:
             raise ValueError(f"max_iterations is {settings.max_iterations}, expected at least 1.")
@@ -95,7 +95,12 @@ def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
     for doubt in doubts(cfg, settings.identified):
         print(f"warning: identified drives: {doubt}", file=sys.stderr)
     notes = [set_identified_step(cfg, settings.identified)]
-    more = use_identified(cfg, settings.identified, randomize_std=settings.randomize_identified)
+    more = use_identified(
+        cfg,
+        settings.identified,
+        randomize_std=settings.randomize_identified,
+        own_step=settings.physics_dt is not None,
+    )
     if settings.physics_dt is not None:
         notes = []
         # a finer step leaves the drives' controllers at their rate; how it is taken depends on their effects

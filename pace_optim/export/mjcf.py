@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -17,7 +17,7 @@ from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.model_file import missing_files, read_model_file
 from pace_optim.export.mjcf_drives import write_drives
-from pace_optim.export.plain_drive import GAIN_EFFECTS, effect_notes, is_undetermined, plain_drives
+from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
 
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
 
@@ -47,8 +47,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         for parameter, attribute in fields.items():
             if not is_undetermined(drives, parameter, name):
                 _set(joint, attribute, drives.values(parameter, [name])[name])
-        solref = model.dof_solref[column]  # that of RK4 would not be stable with another integrator
-        joint.solref_friction = solref if solref[0] > 0 else [2 * drives.at.physics_dt, 1.0]
+        joint.solref_friction = model.dof_solref[column]
         joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
         joint = spec.joint(name)
@@ -64,12 +63,38 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         notes = _notes_of_joints(drives)
     else:
         actuators, notes = plain_drives(drives)
+        actuators, more = _in_plain_steps(spec, actuators, drives.at.physics_dt)
+        notes += more
         notes += write_drives(spec, actuators, drives.at.physics_dt)
         held += GAIN_EFFECTS
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def _in_plain_steps(
+    spec: mujoco.MjSpec, actuators: Mapping[str, PlainDrive], dt: float
+) -> tuple[dict[str, PlainDrive], list[str]]:
+    """Drives, and armatures in the model, that move in MuJoCo's own steps as they did in steps of second order."""
+    result, least = dict(actuators), []
+    for name, drive in actuators.items():
+        if not drive.second_order:
+            continue
+        joint = spec.joint(name)
+        result[name], more = drive.for_steps_of(dt, float(np.ravel(joint.damping)[0]))
+        if joint.armature + more < 0:
+            least.append(name)
+        joint.armature = max(0.0, joint.armature + more)
+    notes = []
+    if any(drive.second_order for drive in actuators.values()):
+        notes.append(
+            "kd, delay and armature are not the identified ones: they make up for MuJoCo's steps of first order, in "
+            "which a speed is half a step older than its position, and for torques that the drive holds."
+        )
+    if least:
+        notes.append(f"the armature of {', '.join(least)} cannot make up for all of it: it is 0.")
+    return result, notes
 
 
 def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:

@@ -124,11 +124,13 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
 
 def _integrator(drives: Mapping[str, PlainDrive]) -> mujoco.mjtIntegrator:
     """The one with which the actuators' damping acts as it did: within the step, or as a torque held over it."""
-    continuous = any(drive.run_dt == 0 for drive in drives.values())
+    continuous = any(drive.run_dt == 0 and not drive.second_order for drive in drives.values())
     return mujoco.mjtIntegrator.mjINT_IMPLICITFAST if continuous else mujoco.mjtIntegrator.mjINT_EULER
 
 
 def _rate_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
+    if any(drive.second_order for drive in drives.values()):
+        return ["the integrator is Euler; the identification's steps were of second order."]
     rates = sorted({drive.run_dt for drive in drives.values()})
     how = "implicitfast: kd acts within the step" if rates[0] == 0 else "Euler: a drive's torque is held over the step"
     notes = [f"the integrator is {how}, as in the identification."]

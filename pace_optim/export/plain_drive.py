@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
@@ -43,6 +43,29 @@ class PlainDrive:
 
     run_dt: float = 0.0
     """Time over which the drive's controller holds its torque [s]; 0 for one that runs continuously."""
+
+    second_order: bool = False
+    """Whether it was identified with steps of second order."""
+
+    def for_steps_of(self, dt: float, viscous: float) -> tuple[PlainDrive, float]:
+        """The same in a simulator that evaluates it at every step and updates speeds before positions.
+
+        There a speed is half a step old when a position is new. A torque that is held for T is T / 2 old in the mean,
+        so that kp acts on q - v T / 2 and kd on v - a T / 2: with a step h, kd - kp T / 2 takes the place of kd, and
+        the armature is less by kd (T - h) / 2, and by d h / 2 where viscous friction d acts on the speed after the
+        step. Commands are late by h / 2. All this is of second order, but where a limit meets it.
+
+        Args:
+            dt: h [s].
+            viscous: d [N m s/rad].
+
+        Returns:
+            The drive, and what is to be added to the armature [kg m²].
+        """
+        drive = replace(
+            self, damping=self.damping - 0.5 * self.stiffness * self.run_dt, delay_s=self.delay_s + 0.5 * dt
+        )
+        return drive, -0.5 * (self.damping * (self.run_dt - dt) + viscous * dt)
 
     @property
     def has_line(self) -> bool:
@@ -90,6 +113,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
                 delay_s=drives.delay_s + early if commands else 0.0,
                 run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
+                second_order=bool(drives.drive.get("second_order", {}).get(joint)),
             )
     notes = []
     if not commands and drives.delay_s > 0:

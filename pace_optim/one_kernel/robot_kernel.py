@@ -137,11 +137,13 @@ class RobotKernel:
             "series": self._series,
             "memory": torch.empty(env.num_envs, max(1, source.memory), dtype=torch.float64),
             "bias": env.sim.qfrc_bias.clone() if reads_load else torch.zeros_like(env.sim.qvel),
+            "before": torch.empty(env.num_envs, 2, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
-            "step": self._batch.step,
+            "step": self._batch.address_of("mj_step"),
+            "drift": self._batch.address_of("mj_integratePos") if env.sim.is_trapezoidal else 0,
             "robots": env.num_envs,
             "recordings": self._dataset.num_recordings,
             "end": end,
@@ -185,7 +187,10 @@ class _Batch:
         size = self._library.mjb_nstate(self._batch)
         address = self._library.mjb_state(self._batch)
         self._state = np.ctypeslib.as_array(ctypes.cast(address, ctypes.POINTER(ctypes.c_double)), (sim.num_envs, size))
-        self.step = ctypes.cast(self._library.mj_step, ctypes.c_void_p).value or 0
+
+    def address_of(self, function: str) -> int:
+        """Where a function of MuJoCo is."""
+        return ctypes.cast(getattr(self._library, function), ctypes.c_void_p).value or 0
 
     def begin(self, sim: Simulation) -> None:
         """Take over models and states."""

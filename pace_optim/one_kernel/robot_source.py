@@ -14,6 +14,7 @@ from pace_optim.one_kernel.tape import Node, NotTraceableError
 
 ARGUMENTS = {
     "step": "void (*step)(const mjModel*, mjData*)",
+    "drift": "void (*drift)(const mjModel*, mjtNum*, const mjtNum*, mjtNum)",
     "robots": "long long robots",
     "recordings": "long long recordings",
     "first": "long long first",
@@ -24,15 +25,17 @@ ARGUMENTS = {
     "series": "const double* series",
     "memory": "double* memory",
     "bias": "double* bias",
+    "before": "double* before",
     "out": "double* out",
     "state": "double* state",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step; environments and recordings; the control steps from
-``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to
-which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and
-the forces of gravity and motion of each environment; what is shown (rows, environments, joints), and unless it is 0
-MuJoCo's positions and speeds there (rows, environments, nq + nv). Then the leaves of each drive, each with the memory
-of its delays behind it."""
+"""What ``simulate`` is told, eight bytes each: MuJoCo's step, and its ``mj_integratePos`` where steps are those of
+``Simulation._leap``, else 0; environments and recordings; the control steps from ``first`` to before ``last`` that it
+takes, and the one at which joints are only shown; how many steps commands last; to which row of ``out`` each step is
+shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of gravity and motion of
+each environment; room for the forces applied and the damping before a step (environments, 2, nv); what is shown (rows,
+environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Then the
+leaves of each drive, each with the memory of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + BEGIN
@@ -75,7 +78,7 @@ def robot_source(
         loop += ["keep(m, d, robot, k, a);"] if part == 0 else []
         loop += [f"{name}_{part}(x, robot, m, d, k, a);" for name in names]
         loop += ["if (k == a->end) break;"] if part == 0 else []
-        loop += ["a->step(m, d);"] if part + 1 < parts else []
+        loop += ["advance(m, d, robot, a);"] if part + 1 < parts else []
     functions = "\n".join(drive.functions(parts) for drive in drives)
     begin = "\n    ".join(f"{name}_begin(x, robot, a, a->leaves[{i}]);" for i, name in enumerate(names))
     steps = "\n    ".join(loop)
@@ -91,6 +94,27 @@ static void keep(const mjModel* m, const mjData* d, long long robot, long long k
   double* kept = a->state + (a->slot[k] * a->robots + robot) * (m->nq + m->nv);
   memcpy(kept, d->qpos, m->nq * sizeof(double));
   memcpy(kept + m->nq, d->qvel, m->nv * sizeof(double));
+}}
+static void advance(mjModel* m, mjData* d, long long robot, const Arguments* a) {{
+  if (!a->drift) {{
+    a->step(m, d);
+    return;
+  }}
+  const int n = m->nv;
+  const double h = m->opt.timestep;
+  double *applied = a->before + 2 * robot * n, *damping = applied + n;
+  memcpy(applied, d->qfrc_applied, n * sizeof(double));
+  memcpy(damping, m->dof_damping, n * sizeof(double));
+  for (int i = 0; i < n; ++i) {{
+    const double half = 0.5 * damping[i], most = m->dof_armature[i] / h, early = half < most ? half : most;
+    m->dof_damping[i] -= early;
+    d->qfrc_applied[i] -= early * d->qvel[i];
+  }}
+  a->drift(m, d->qpos, d->qvel, 0.5 * h);
+  a->step(m, d);
+  a->drift(m, d->qpos, d->qvel, -0.5 * h);
+  memcpy(m->dof_damping, damping, n * sizeof(double));
+  memcpy(d->qfrc_applied, applied, n * sizeof(double));
 }}
 {functions}
 extern "C" void simulate(const mjModel* model, mjData* d, int robot, void* arguments) {{

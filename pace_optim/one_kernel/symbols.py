@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 
-from pace_actuators.delay_buffer import DelayBuffer
+from pace_actuators.delay_buffer import DelayBuffer, Jump
 from pace_optim.one_kernel.operations import Operations
 from pace_optim.one_kernel.tape import Node, NotTraceableError, Ring, Tape
 
@@ -241,6 +241,16 @@ class SymbolicDelay:
     def part(self, part: int) -> Symbol:
         """As the buffer's."""
         return self._between(*self._parts[part]) if self._parts else self.mean()
+
+    def jump(self, part: int) -> Jump | None:
+        """As the buffer's."""
+        newer, older, share = self._parts[part] if self._parts else self._mean
+        if share is None:
+            return None
+        if self.ring is None:
+            raise NotTraceableError("a delay that is read before it has a sample")
+        rise = self._operations.of("sub", self._tape.seen(self.ring, newer), self._tape.seen(self.ring, older))
+        return Jump(*(cast(torch.Tensor, Symbol(self._operations, Cell(node), ())) for node in (rise, share)))
 
     def mean(self) -> Symbol:
         """As the buffer's."""

@@ -67,26 +67,24 @@ def set_drive_rate(cfg: PaceSim2realEnvCfg, physics_dt: float | None = None) -> 
 
 
 def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
-    """Make the physics step as fine as drives that run continuously ask for.
+    """The physics step that a task asks for, made finer where drives that run continuously need it.
 
     Args:
         cfg: The environment; it is changed.
 
     Returns:
-        The physics step at which drives that run continuously are simulated well [s]; ``None`` if the present one is
-        fine enough, with Runge-Kutta's steps. A search may take the present one: it is stable.
+        The step [s]; ``None`` if the present one is fine enough. A search may take the present one: it is stable.
     """
+    steps = cfg.sim2real.physics_steps
     if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
-        cfg.scene.num_envs = 1
+        cfg.sim.integrator, cfg.scene.num_envs = "leapfrog", 1
         env = ManagerBasedRLEnv(cfg)
         inverse = _inverse_inertia(env, upper=False)
         damping = of_joints(env, "damping", only_implicit=True)
         env.close()
         steep = float((damping * cfg.sim.dt * inverse.diagonal()).max())
-        if steep > _FINE:
-            return cfg.sim.dt / min(_FINEST, math.ceil(steep / _FINE))
-        cfg.sim.integrator = "rk4"  # of second order, and stable there
-    return None
+        steps = max(steps, min(_FINEST, math.ceil(steep / _FINE)))
+    return cfg.sim.dt / steps if steps > 1 else None
 
 
 def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[str]:

@@ -91,9 +91,9 @@ class Problem:
         return self.plain_cfg.sim.dt
 
     def for_search(self, device: str = "cpu") -> Problem:
-        """The same on a device, and at a longer physics step where drives run continuously: there all are stable."""
-        implicit = any(drive.implicit for drive in self.plain_cfg.scene.robot.actuators.values())
-        problem = self.with_physics_dt(self.coarsest_dt) if implicit else self
+        """The same on a device, and at a longer physics step where steps of second order are stable there."""
+        second_order = self.plain_cfg.sim.integrator == "leapfrog"
+        problem = self.with_physics_dt(self.coarsest_dt) if second_order else self
         return problem if device == problem.device else replace(problem, device=device)
 
     @property
@@ -272,7 +272,7 @@ def load_problem(
             each.sim2real.start_params = {**each.sim2real.start_params, **start}
     space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
     recordings, held_out = affordable(
-        [recordings, held_out], control_dt, _columns(space, trees), _evaluations(cfg), max_duration, tell
+        [recordings, held_out], control_dt, _columns(space, trees), cfg.decimation, max_duration, tell
     )
     refuse_open_loops(env, [*recordings, *held_out])
     problem = Problem(
@@ -342,11 +342,6 @@ def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:
     """Parameters whose derivatives take a simulation each: those of one tree are perturbed beside those of others."""
     owners = space.owners(trees)
     return max((owners.count(i) for i in range(len(trees))), default=0) + owners.count(None)
-
-
-def _evaluations(cfg: PaceSim2realEnvCfg) -> int:
-    """Times that accelerations are computed in a control step: a Runge-Kutta step does so four times."""
-    return cfg.decimation * (4 if cfg.sim.integrator == "rk4" else 1)
 
 
 def _configured(

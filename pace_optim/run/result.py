@@ -163,8 +163,10 @@ def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
         own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
         if cfg.drive_dt is not None:
             found.setdefault("drive_dt", {}).update(dict.fromkeys(own, cfg.drive_dt))
+        flags = {name: getattr(cfg, name) for name in RATE_FLAGS}
+        flags["second_order"] |= problem.env_cfg.sim.integrator == "leapfrog"
         for name in RATE_FLAGS:
-            if getattr(cfg, name):
+            if flags[name]:
                 found.setdefault(name, {}).update(dict.fromkeys(own, 1.0))
     return {name: values for name, values in found.items() if values}
 

@@ -119,6 +119,9 @@ class PaceCfg(Config):
     assumed_gains: tuple[str, ...] = ()
     """Joints whose gains nobody has stated: those of their drives are assumed."""
 
+    physics_steps: int = 1
+    """Physics steps in a control step that a fit takes unless it is told a ``physics_dt``; a search takes one."""
+
     notes: tuple[str, ...] = ()
     """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
 
