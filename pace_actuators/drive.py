@@ -254,8 +254,8 @@ class Drive:
     @property
     def _lead(self) -> float:
         """By how much the simulator lets a delayed command act too early, in runs of the controller."""
-        early = self.cfg.centred_commands and self.cfg.delay_mode == "command" and not self.is_trapezoidal
-        return 0.5 / self._calls_per_run if early else 0.0
+        held = (self.cfg.centred_commands or self.cfg.second_order) and self.cfg.delay_mode == "command"
+        return 0.5 / self._calls_per_run if held and not self.is_trapezoidal else 0.0
 
     @property
     def _ahead(self) -> float:
@@ -269,7 +269,7 @@ class Drive:
         Raises:
             ValueError: If it has another shape.
         """
-        if enabled is not None and enabled.numel() != self._num_envs:
+        if enabled is not None and enabled.shape.numel() != self._num_envs:
             raise ValueError(f"torque_enable has shape {tuple(enabled.shape)}, expected ({self._num_envs},).")
         self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
         if self.effects is not None:
@@ -293,10 +293,9 @@ class Drive:
         """Refuse what has not a row per environment and a column per joint: torch would spread it without a word."""
         expected = (self._num_envs, len(self._joint_names))
         for name, value in given.items():
-            if value is not None and (not isinstance(value, torch.Tensor) or value.shape != expected):
-                found = (
-                    f"shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else f"type {type(value).__name__}"
-                )
+            is_tensor = torch.overrides.is_tensor_like(value)  # one that is traced too
+            if value is not None and (not is_tensor or value.shape != expected):
+                found = f"shape {tuple(value.shape)}" if is_tensor else f"type {type(value).__name__}"
                 raise ValueError(
                     f"{name} has {found}, expected a tensor of shape {expected}: a row per environment, a column for "
                     f"each of the joints {', '.join(self._joint_names)}."

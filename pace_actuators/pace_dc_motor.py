@@ -204,15 +204,14 @@ class PaceDCMotor(DriveWithEffects):
 
     def _jump_of_torque(self, part: int, stiffness: torch.Tensor, damping: torch.Tensor) -> Jump | None:
         """How the torque that is asked changes within a call, as a command or a torque arrives [N m]."""
-        jumps = [(self._delays.jump("torque", part), None)]
-        if self.cfg.delay_mode == "command":
-            gains = {"positions": stiffness, "velocities": damping, "efforts": None}
-            jumps = [(self._delays.jump(name, part), gain) for name, gain in gains.items()]
+        gains = {"positions": stiffness, "velocities": damping, "efforts": None}
+        delayed = gains if self.cfg.delay_mode == "command" else {"torque": None}
+        jumps = [(self._delays.jump(name, part), gain) for name, gain in delayed.items()]
         found = [(jump, gain) for jump, gain in jumps if jump is not None]
         if not found:
             return None
         rises = [jump.rise if gain is None else gain * jump.rise for jump, gain in found]
-        return Jump(sum(rises[1:], rises[0]), found[0][0].share)
+        return Jump(_sum(rises), found[0][0].share)
 
     def _in_parts(self, effort: torch.Tensor) -> list[tuple[torch.Tensor | float, torch.Tensor]]:
         """The torques of which a mean torque is made in a call, and how much of the time each has."""
@@ -255,7 +254,8 @@ class PaceDCMotor(DriveWithEffects):
         if self.effects is not None and self.effects.acts_in_drive:
             clamped = [(share, part, part.clamp(-self.effort_limit, self.effort_limit)) for share, part in parts]
             asked = _mean(asked, clamped)
-            slope = None if slope is None else sum(share * (slope * (after == part)) for share, part, after in clamped)
+            if slope is not None:
+                slope = _sum([share * (slope * (after == part)) for share, part, after in clamped])
             asked, slope = self.effects.given_by_drive(asked, slope)
             parts, clip = [(1.0, asked)], clip_to_line
         limits = speed, self.saturation_effort, self.effort_limit, self.velocity_limit
@@ -264,10 +264,10 @@ class PaceDCMotor(DriveWithEffects):
         if self.holds_line or self._loop_slope is not None:
             own = 0.0 if slope is None else slope
             line = self.saturation_effort / self.velocity_limit if self.holds_line else 0.0
-            self._speed_slope = sum(
-                share * torch.where(after == part, own, line * (after.abs() != self.effort_limit))
-                for share, part, after in clipped
-            )
+            slopes = [
+                torch.where(after == part, own, line * (after.abs() != self.effort_limit)) for _, part, after in clipped
+            ]
+            self._speed_slope = _sum([share * each for (share, *_), each in zip(clipped, slopes, strict=True)])
         if self.torque_enable is not None:
             effort = effort * self.torque_enable
             if self._speed_slope is not None:
@@ -298,4 +298,8 @@ def _mean(asked: torch.Tensor, limited: Sequence[tuple[torch.Tensor | float, tor
     """
     if len(limited) == 1:
         return limited[0][2]
-    return asked + sum(share * (after - part) for share, part, after in limited)
+    return asked + _sum([share * (after - part) for share, part, after in limited])
+
+
+def _sum(terms: Sequence[torch.Tensor]) -> torch.Tensor:
+    return sum(terms[1:], terms[0])

@@ -115,7 +115,8 @@ class PaceDCMotorCfg(Config):
 
     second_order: bool = False
     """Whether the values were identified with steps of second order, so that they hold no error of a step. Simulators
-    that update speeds before positions show positions half a physics step early; the drive then takes that back."""
+    that update speeds before positions show positions half a physics step early; the drive then takes that back, and
+    lets commands act half a step later."""
 
     effects: Sequence[EffectCfg | str] = ()
     """Physical effects beyond this base model, by name (``"stribeck_friction"``) or with their values."""

@@ -30,13 +30,6 @@ _INTEGRATORS = {
 
 
 _STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
-_FRICTION_STEPS = {"leapfrog": 4 / 3}
-"""Time constant T of joint friction [time steps] by integrator; 2 with all others.
-
-A step makes v of a sticking joint's speed (1 - 2 / T) v: a constraint's force is constant over the step, and turns
-where the speed would pass this. With T = 2 friction turns half a step early in the mean, with T = 1 (the speed only
-changes its sign) in the middle.
-"""
 
 
 @dataclass(kw_only=True)
@@ -61,7 +54,7 @@ class SimulationCfg:
     """Gravity [m/s^2]."""
 
     friction_timeconst: float | None = None
-    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps, with ``"leapfrog"`` 4 / 3.
+    """Time constant of the joints' Coulomb friction [s]; ``None``: two time steps.
 
     MuJoCo's default of 20 ms is soft: a stuck joint creeps.
     """
@@ -144,7 +137,8 @@ class Simulation:
         if not (np.isfinite(cfg.dt) and 0 < cfg.dt <= 0.1):
             raise ValueError(f"sim.dt is {cfg.dt} s, expected a time step in (0, 0.1] s.")
         if cfg.integrator not in _INTEGRATORS:
-            raise ValueError(f"Unknown integrator {cfg.integrator!r}. Available: {', '.join(_INTEGRATORS)}.")
+            cure = ' Write "leapfrog", which takes the place of "rk4".' if cfg.integrator == "rk4" else ""
+            raise ValueError(f"Unknown integrator {cfg.integrator!r}. Available: {', '.join(_INTEGRATORS)}.{cure}")
         self.cfg = cfg
         self.num_envs = num_envs
         self.device = self._find_device()
@@ -377,26 +371,14 @@ class Simulation:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         for body in spec.bodies[1:]:
             body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
-        impedance = self.cfg.friction_impedance
+        timeconst, impedance = self.cfg.friction_timeconst, self.cfg.friction_impedance
         for joint in spec.joints:
-            joint.solref_friction = self._friction_solref()
+            joint.solref_friction = [2 * self.cfg.dt if timeconst is None else timeconst, 1.0]
             joint.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
         try:
             return spec.compile()
         except ValueError as error:
             raise ValueError(f"MuJoCo cannot compile the model: {error}") from None
-
-    def _friction_solref(self) -> list[float]:
-        """MuJoCo's solref of joint friction.
-
-        It is the time constant T; where that is below two steps, which MuJoCo would lengthen it to, it is the stiffness
-        and damping that T stands for, -(1 / T², 2 / T).
-        """
-        own, steps = self.cfg.friction_timeconst, _FRICTION_STEPS.get(self.cfg.integrator, 2)
-        timeconst = steps * self.cfg.dt
-        if own is None and steps < 2:
-            return [-1.0 / timeconst**2, -2.0 / timeconst]
-        return [timeconst if own is None else own, 1.0]
 
 
 class Drift:

@@ -33,6 +33,7 @@ class Drive:
             "armature": 0.1,
             "friction": 0.5,
             "viscous_friction": 2.0,
+            "delay": 0.0,
             "max_delay": 8.0,
             "effects": effects,
             "physics_dt": DT,

@@ -493,14 +493,15 @@ def test_a_drive_that_is_reset_while_the_others_hold_begins_as_a_new_one(fields,
         assert torch.equal(held[[0, 2]], kept[[0, 2]])
 
 
-def test_a_drive_that_is_reset_gives_nothing_of_its_old_torque_where_torques_are_centred():
-    motor = drive(2, physics_dt=0.001, control_decimation=2)
-    motor.take_over_simulator(is_trapezoidal=False, holds_line=True)
-    for _ in range(2):
-        torque(motor, 5.0)
+@pytest.mark.parametrize("mode", ["command", "effort"])
+def test_a_drive_that_is_reset_gives_nothing_of_its_old_torque_where_a_command_arrives_within_a_step(mode):
+    """A delay of 1.75 control steps: at the second call of a step, half of it is the old torque, half the limit's."""
+    motor = drive(2, physics_dt=0.001, control_decimation=2, effort_limit=60.0, delay=1.75, delay_mode=mode)
+    for target in (5.0, 5.0, 10.0, 10.0, 10.0):
+        torque(motor, target)
     motor.reset(torch.tensor([False, True]))
-    assert torque(motor, 1.0)[:, 0].tolist() == [30.0, 10.0]  # 0.5 (50 + 10), and 10 alone
-    assert torque(motor, 1.0)[:, 0].tolist() == [10.0, 10.0]
+    assert torque(motor, 2.0)[:, 0].tolist() == [55.0, 20.0]  # 0.5 (50 + 60), not 60, the limit of their mean
+    assert torque(motor, 2.0)[:, 0].tolist() == [60.0, 20.0]
 
 
 # ---- gradients and shapes

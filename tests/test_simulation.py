@@ -172,10 +172,10 @@ def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
     return np.array(seen)
 
 
-def test_friction_of_second_order_steps_gives_way_in_the_middle_of_a_step():
-    """With two time steps it turns half a step early in the mean."""
-    exact, own, two_steps = swung(0.0001), swung(0.0025), swung(0.0025, timeconst=0.005)
-    assert np.abs(own - exact).max() < 0.7 * np.abs(two_steps - exact).max()
+def test_friction_of_second_order_steps_gives_way_at_once():
+    """What MuJoCo's default of 20 ms smooths where the joint turns is twenty times that of two steps."""
+    exact, own, default = swung(0.0001), swung(0.0025), swung(0.0025, timeconst=0.02)
+    assert np.abs(own - exact).max() < 0.05 * np.abs(default - exact).max()
 
 
 def test_friction_of_second_order_steps_holds():
@@ -203,11 +203,12 @@ def test_implicit_damping_acts_on_the_speed_after_the_step(integrator):
 
 
 def test_finer_steps_bear_any_torque_speed_line():
-    """An explicit damping would diverge beyond 2 M / h."""
-    env = bench(gravity=False, physics_dt=0.00125, damping=0.0, armature=0.01, viscous_friction=2000.0)
-    start(env, velocity=2.0)
+    """An explicit damping would diverge beyond 2 M / h. The first step moves with the mean of its speeds."""
+    speed, step, damping = 2.0, 0.00125, 2000.0
+    env = bench(gravity=False, physics_dt=step, damping=0.0, armature=0.01, viscous_friction=damping)
+    start(env, velocity=speed)
     q = roll(env, 0.2)[:, 0]
-    assert float(q.max()) < 2 * (INERTIA + 0.01) * 2.0 / 2000.0 and float(q.min()) >= -1e-9
+    assert float(q.max()) < speed * (0.5 * step + 2 * (INERTIA + 0.01) / damping) and float(q.min()) >= -1e-9
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "leapfrog"])
@@ -336,6 +337,7 @@ def test_environments_that_do_not_exist_are_refused(env_ids, message):
         ({"dt": 0.0}, "sim.dt is 0.0 s"),
         ({"dt": 1.0}, "sim.dt is 1.0 s"),
         ({"integrator": "rk45"}, "Unknown integrator 'rk45'. Available: implicitfast"),
+        ({"integrator": "rk4"}, 'Write "leapfrog"'),
     ],
 )
 def test_an_impossible_simulation_is_refused(change, message):

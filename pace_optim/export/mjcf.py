@@ -83,7 +83,7 @@ def _in_plain_steps(
             continue
         joint = spec.joint(name)
         result[name], more = drive.for_steps_of(dt, float(np.ravel(joint.damping)[0]))
-        if joint.armature + more < 0:
+        if joint.armature + more < 0 or drive.damping > 0 == result[name].damping:
             least.append(name)
         joint.armature = max(0.0, joint.armature + more)
     notes = []
@@ -93,7 +93,7 @@ def _in_plain_steps(
             "which a speed is half a step older than its position, and for torques that the drive holds."
         )
     if least:
-        notes.append(f"the armature of {', '.join(least)} cannot make up for all of it: it is 0.")
+        notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
     return result, notes
 
 

@@ -158,7 +158,13 @@ def _delay_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
         return [
             f"delay of {1e3 * delay:.3g} ms: MuJoCo's shortest is one step, so it is {1e3 * near:.3g} ms in the model."
         ]
-    return [
+    notes = [
         f"delay of {1e3 * delay:.3g} ms of the targets: it is in the actuators. After a reset MuJoCo's history holds "
         "zeros: call mj_initCtrlHistory with the first targets."
     ]
+    if abs(delay / dt - round(delay / dt)) > 1e-6 and any(math.isfinite(d.effort_limit) for d in drives.values()):
+        notes.append(
+            "where a command arrives within a step, a limit acts on the torque before and after it in the "
+            "identification; MuJoCo limits the mean of both."
+        )
+    return notes

@@ -50,10 +50,12 @@ class PlainDrive:
     def for_steps_of(self, dt: float, viscous: float) -> tuple[PlainDrive, float]:
         """The same in a simulator that evaluates it at every step and updates speeds before positions.
 
-        There a speed is half a step old when a position is new. A torque that is held for T is T / 2 old in the mean,
-        so that kp acts on q - v T / 2 and kd on v - a T / 2: with a step h, kd - kp T / 2 takes the place of kd, and
-        the armature is less by kd (T - h) / 2, and by d h / 2 where viscous friction d acts on the speed after the
-        step. Commands are late by h / 2. All this is of second order, but where a limit meets it.
+        There a speed is half a step h old when a position is new, and viscous friction d acts on a speed of h / 2
+        later. A torque that is held for T is in the mean that of q - v T / 2 + a T² / 6 and v - a T / 2. So
+
+            kd' = kd - kp T / 2        armature' = armature + kp T² / 6 - kd T / 2 + (kd' - d) h / 2
+
+        but where a limit meets it. What would be below 0 is 0.
 
         Args:
             dt: h [s].
@@ -62,10 +64,9 @@ class PlainDrive:
         Returns:
             The drive, and what is to be added to the armature [kg m²].
         """
-        drive = replace(
-            self, damping=self.damping - 0.5 * self.stiffness * self.run_dt, delay_s=self.delay_s + 0.5 * dt
-        )
-        return drive, -0.5 * (self.damping * (self.run_dt - dt) + viscous * dt)
+        damping = max(0.0, self.damping - 0.5 * self.stiffness * self.run_dt)
+        held = self.stiffness * self.run_dt**2 / 6 - 0.5 * self.damping * self.run_dt
+        return replace(self, damping=damping), held + 0.5 * (damping - viscous) * dt
 
     @property
     def has_line(self) -> bool:
@@ -100,7 +101,8 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 ("encoder_bias", 0.0),
             )
         }
-        early = 0.5 * drives.at.physics_dt if cfg.centred_commands else 0.0  # the other simulator's step does it too
+        exact = cfg.centred_commands or cfg.second_order  # the other simulator's commands act half a step early
+        early = 0.5 * drives.at.physics_dt if exact else 0.0
         for i, joint in enumerate(joints):
             gain = own["torque_gain"].get(joint, 1.0)
             line = math.isfinite(found["saturation_effort"][i]) and math.isfinite(found["velocity_limit"][i])
@@ -113,7 +115,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
                 delay_s=drives.delay_s + early if commands else 0.0,
                 run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
-                second_order=bool(drives.drive.get("second_order", {}).get(joint)),
+                second_order=cfg.second_order,
             )
     notes = []
     if not commands and drives.delay_s > 0:
