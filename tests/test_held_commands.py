@@ -106,12 +106,12 @@ def test_a_lead_is_added_to_every_lag():
         ({}, False, False, True),
         ({}, True, True, False),  # a simulator in which a held torque acts when it should
         ({"delay_mode": "effort"}, False, False, False),
+        ({"centred_commands": False, "second_order": True}, False, False, True),
     ],
 )
 def test_the_half_step_is_taken_out_where_a_simulator_makes_it(cfg, is_trapezoidal, holds_line, early):
-    cfg = PaceDCMotorCfg(
-        joint_names_expr="a", stiffness=1.0, damping=0.0, effort_limit=100.0, centred_commands=True, **cfg
-    )
+    cfg = {"centred_commands": True} | cfg
+    cfg = PaceDCMotorCfg(joint_names_expr="a", stiffness=1.0, damping=0.0, effort_limit=100.0, **cfg)
     motor = PaceDCMotor(cfg, ["a"], slice(None), 1, physics_dt=CONTROL_DT, dtype=torch.float64)
     motor.take_over_simulator(is_trapezoidal=is_trapezoidal, holds_line=holds_line)
     still, torques = torch.zeros(1, 1, dtype=torch.float64), []
