@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from pace_actuators.dc_motor import clip_effort, clip_to_line, pd_effort
+from pace_actuators.dc_motor import clip_to_line, pd_effort
 from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive import ControllerRun
 from pace_actuators.drive_delays import DriveDelays
@@ -248,18 +248,20 @@ class PaceDCMotor(DriveWithEffects):
         Returns:
             The motor's torque [N m], (num_envs, num_joints).
         """
-        asked, slope, clip = effort_command, self._loop_slope, clip_effort
+        asked, slope = effort_command, self._loop_slope
         speed = joint_vel if self.effects is None else self.effects.state.motor_vel
         parts = self._in_parts(asked)
+        clamped = [(share, part, part.clamp(-self.effort_limit, self.effort_limit)) for share, part in parts]
+        asked = _mean(asked, clamped)
+        if slope is not None:
+            slope = _sum([share * (slope * (after == part)) for share, part, after in clamped])
+        parts = [(share, after) for share, _, after in clamped]
         if self.effects is not None and self.effects.acts_in_drive:
-            clamped = [(share, part, part.clamp(-self.effort_limit, self.effort_limit)) for share, part in parts]
-            asked = _mean(asked, clamped)
-            if slope is not None:
-                slope = _sum([share * (slope * (after == part)) for share, part, after in clamped])
-            asked, slope = self.effects.given_by_drive(asked, slope)
-            parts, clip = [(1.0, asked)], clip_to_line
+            given, slope = self.effects.given_by_drive(asked, slope)
+            parts = [(1.0, given)] if len(parts) == 1 else [(share, part + (given - asked)) for share, part in parts]
+            asked = given
         limits = speed, self.saturation_effort, self.effort_limit, self.velocity_limit
-        clipped = [(share, part, clip(part, *limits)) for share, part in parts]
+        clipped = [(share, part, clip_to_line(part, *limits)) for share, part in parts]
         effort = _mean(asked, clipped)
         if self.holds_line or self._loop_slope is not None:
             own = 0.0 if slope is None else slope
