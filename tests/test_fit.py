@@ -14,6 +14,7 @@ from problems import BENCH, TRUTH, chirp, record
 import pace_optim.fit as fit_module
 from pace_envs import load_env_cfg
 from pace_optim.fit import fit, resume
+from pace_optim.identification import conclusion
 from pace_optim.identification.beginning import load_for_fit
 from pace_optim.identification.optimization import Optimization
 from pace_optim.optimizers.way_down import WayDown
@@ -326,6 +327,27 @@ def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp
     monkeypatch.setattr(WayDown, "run", at_once)
     result, folder = run(tmp_path, recordings["clean"])
     assert result.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
+
+
+def test_a_result_is_written_before_it_is_checked_and_an_interrupted_check_leaves_it(
+    recordings, tmp_path, no_report, monkeypatch
+):
+    """Ctrl-C during the checks left no result.json, although the result was printed."""
+
+    def interrupted(*args):
+        (folder,) = tmp_path.glob("*/*")
+        written.append(FitResult.load(folder))
+        raise KeyboardInterrupt
+
+    written = []
+    monkeypatch.setattr(conclusion, "change_without_step", interrupted)
+    result, folder = run(tmp_path, recordings["noisy"], optimizer="least_squares")
+    assert result.stop_reasons[-1] == conclusion.CHECKS_INTERRUPTED
+    assert written[0].parameters == FitResult.load(folder).parameters == result.parameters
+    assert (folder / "best_trajectory.pt").is_file()
+    with pytest.raises(KeyboardInterrupt):
+        fit(settings(tmp_path / "passed_on", recordings["noisy"], optimizer="least_squares"), Silent(),
+            assess_interrupted=False)  # fmt: skip
 
 
 def test_a_finished_run_resumes_to_itself(recordings, tmp_path, no_report):

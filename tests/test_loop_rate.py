@@ -16,7 +16,7 @@ from pace_optim.uncertainty.loop_rate import LoopRates, _against, _lagrange, loo
 GAINS = {"stiffness": 85.0, "damping": 0.6}
 
 
-def recorded_at(period, duration=2.0, noise=1e-4):
+def recorded_at(period, duration=1.0, noise=1e-4):
     """A recording that states its gains, of a drive whose loop has a period [s]; a model file's problem."""
     cfg = env_cfg()
     for drive in cfg.scene.robot.actuators.values():
