@@ -23,7 +23,7 @@ def separated(task: str, **bounds) -> PaceSim2realEnvCfg:
     cfg.sim2real.separate_dynamic_friction = True
     for name, value in bounds.items():
         setattr(cfg.sim2real, name, value)
-    cfg.__post_init__()
+    cfg.prepare()
     return cfg
 
 
@@ -45,7 +45,7 @@ def test_without_the_flag_nothing_changes():
 
 def test_bounds_of_the_ratio_are_checked():
     with pytest.raises(ValueError, match="friction_ratio_bounds"):
-        separated("Pace-AnymalD-v0", friction_ratio_bounds=(0.5, 1.2)).sim2real.__post_init__()
+        separated("Pace-AnymalD-v0", friction_ratio_bounds=(0.5, 1.2)).sim2real.prepare()
 
 
 def test_friction_is_that_of_rest_at_rest_and_its_share_while_sliding():

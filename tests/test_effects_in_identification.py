@@ -200,7 +200,8 @@ def test_a_fit_recovers_an_effect_and_writes_it(optimizer, recorded, tmp_path, m
     assert content["parameters"]["stribeck_friction.effort"]["servo"] == pytest.approx(1.2, abs=0.02)
     assert content["parameters"]["stribeck_friction.velocity"]["servo"] == pytest.approx(0.3, abs=0.01)
     assert content["parameters"]["friction"]["servo"] == pytest.approx(CALM["friction"], abs=0.02)
-    assert 0 <= content["std"]["stribeck_friction.effort"]["servo"] < 0.1
+    std = content["std"]["stribeck_friction.effort"]["servo"]
+    assert std is None or 0 <= std < 0.1  # none where the noise-free recording is missed by more than its noise
     assert content["units"]["stribeck_friction.velocity"] == "rad/s"
     assert result.score < 1e-9
     events = EventAccumulator(str(folder)).Reload()

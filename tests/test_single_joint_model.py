@@ -59,7 +59,7 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     sought = whole.space.from_dict(truth)
     path = reference_path(whole.with_physics_dt(0.00025), sought, ["payload"])
     twins = twin_problem(whole, path).with_physics_dt(0.00125)
-    assert float((moved_by(twins, sought)[:, 0] - torch.as_tensor(recording.dof_pos)).abs().max()) < 3e-4
+    assert float((moved_by(twins, sought)[:, 0] - torch.as_tensor(recording.dof_pos)).abs().max()) < 4e-4
 
 
 def test_a_joint_s_own_payload_is_that_of_its_link_alone():

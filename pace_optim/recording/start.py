@@ -19,6 +19,8 @@ _FITS = 2.0
 """Standard deviations of χ² by which a polynomial may miss the samples."""
 _STANDS_OUT = 4.0
 """Standard deviations at which a speed is one."""
+_FROM_THE_START = 0.5
+"""Part of the slope with which the first samples move."""
 _LEAST_NOISE = 5e-6
 """Of any encoder: a clean simulation has none, and no polynomial fits it [rad]."""
 
@@ -51,8 +53,16 @@ def start_speed(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         found = _slope(time[:count], position[:count], noise)
         if found is not None:
             slope, std = found
-            speed[joint], known[joint] = slope if abs(slope) > _STANDS_OUT * std else 0.0, True
+            moves = abs(slope) > _STANDS_OUT * std and _at_once(time, position, slope, noise)
+            speed[joint], known[joint] = slope if moves else 0.0, True
     return speed, known
+
+
+def _at_once(time: np.ndarray, position: np.ndarray, slope: float, noise: float) -> bool:
+    """Whether the first samples move with the slope: of a motion that sets in, they do not yet."""
+    clear = np.searchsorted(time, _STANDS_OUT * noise / abs(slope))
+    first = min(len(time) - 1, max(1, int(clear)))
+    return float(position[first] - position[0]) / (slope * float(time[first])) > _FROM_THE_START
 
 
 def _slope(time: np.ndarray, position: np.ndarray, noise: float) -> tuple[float, float] | None:

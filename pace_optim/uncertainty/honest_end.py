@@ -27,10 +27,11 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
 
 
 def noise_score(problem: Problem) -> float:
-    """The score that the recordings' noise alone leaves, Σ_joints of its mean variance [rad²]."""
+    """The score that the noise of what is trained on leaves, Σ_joints of its mean variance [rad²]."""
+    trained = [problem.dataset.recordings[r] for r in problem.dataset.trained()]
     squares = [
         noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
-        for recording in problem.dataset.recordings
+        for recording in trained
         for j in range(recording.dof_pos.shape[1])
     ]
     return float(np.mean(squares)) * len(problem.joint_names)
