@@ -11,7 +11,7 @@ from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.notes import notes_by_kind
 from pace_optim.recording.stamps import set_back, unrounded
-from pace_optim.recording.start_speed import start_speed
+from pace_optim.recording.start import start_speed
 from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, read_map, understood, with_rate
 
 TIME = np.arange(800) / 200
@@ -250,7 +250,7 @@ def test_a_gap_in_which_nothing_happens_or_that_cubics_bridge_does_not_split():
 def test_a_recording_in_motion_begins_with_the_slope_of_its_positions(noise):
     fine = np.arange(1600) / 400
     q = np.sin(4 * fine) + noise * np.random.default_rng(0).normal(size=len(fine))
-    assert start_speed(recording(fine, q, q))[0] == pytest.approx(4.0, rel=0.03)
+    assert start_speed(recording(fine, q, q))[0][0] == pytest.approx(4.0, rel=0.03)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -259,7 +259,7 @@ def test_a_recording_that_begins_at_rest_has_no_speed(seed):
     sets_in = np.where(fine > 0.007, 5 * (fine - 0.007) ** 2, 0.0)
     for motion in (sets_in, 0.5 * (1 - np.cos(6 * fine)), 0 * fine):
         q = motion + 1e-4 * np.random.default_rng(seed).normal(size=len(fine))
-        assert start_speed(recording(fine, q, q))[0] == 0.0
+        assert start_speed(recording(fine, q, q))[0][0] == 0.0
 
 
 def test_notes_come_once_for_each_kind():
