@@ -30,7 +30,9 @@ ARM = {
 PENDULUM = {"armature": (0.00448,), "viscous_friction": (0.02,), "friction": (0.06,), "delay": 2.0}
 SERVO = {"armature": (0.0284,), "viscous_friction": (0.0591,), "friction": (0.0524,)}
 WHEEL = {"viscous_friction": (0.05,), "friction": (0.12,), "delay": 2.0}
-ANKLE = {"armature": (0.01,), "viscous_friction": (0.05,), "friction": (0.08,), "delay": 4.0}
+ANKLE = {"armature": (0.01,), "friction": (0.08,)}
+"""Every other target is missing in the log, which looks like a shorter delay."""
+SHOULDER = {"viscous_friction": (0.2, None), "friction": (0.05, None)}
 _RELATIVE, _BIAS, _DELAY = 0.05, 3e-3, 0.4
 _LONGEST = 600
 
@@ -45,8 +47,8 @@ class Row:
     command: str = "fit"
     """``fit`` or ``import_log``."""
     options: tuple[str, ...] = ()
-    right: Mapping[str, tuple[float, ...] | float] = field(default_factory=dict)
-    """True values, by joint; the delay in ms."""
+    right: Mapping[str, tuple[float | None, ...] | float] = field(default_factory=dict)
+    """True values, by joint, ``None`` where any is right; the delay in ms."""
     says: str = ""
     """What must be said (a regular expression)."""
     never: str = r"^(warning: all is well|run: /tmp/other)"
@@ -110,7 +112,7 @@ ROWS = {
     "lerobot_nested_names two": Row(
         command="import_log", task=f"{LEROBOT}/arm.xml", data=(f"{LEROBOT}/dataset_two",), says=LEROBOT_SAYS
     ),
-    "long_table": Row(task="long_table/ankle.xml", data=("long_table/long.csv",), right=ANKLE, says="3000 values"),
+    "long_table": Row(task="long_table/ankle.xml", data=("long_table/long.csv",), right=ANKLE, says="1500 values"),
     "wheel_rad_read_as_deg": Row(
         task="wheel_rad_read_as_deg/wheel.xml", data=("wheel_rad_read_as_deg/speeds.csv",), right=WHEEL
     ),
@@ -121,7 +123,10 @@ ROWS = {
         may_refuse=True,
     ),
     "idle_joint_torque_log": Row(
-        task="idle_joint_torque_log/arm.urdf", data=("idle_joint_torque_log/torques.csv",), says="elbow.*moves less"
+        task="idle_joint_torque_log/arm.urdf",
+        data=("idle_joint_torque_log/torques.csv",),
+        says="elbow.*moves less",
+        right=SHOULDER,
     ),
     "time_only_map": Row(
         command="import_log",
@@ -200,6 +205,8 @@ def judged(row: Row, content: dict) -> list[str]:
             continue
         values = found["parameters"][group].values()
         for joint, value, right in zip(found["parameters"][group], values, true, strict=True):  # type: ignore[arg-type]
+            if right is None:
+                continue
             room = _BIAS if group == "encoder_bias" else _RELATIVE * abs(right)
             wrong += [] if abs(value - right) < room else [f"{group}/{joint}"]
     return wrong
@@ -242,7 +249,10 @@ def _found(found: dict) -> str:
 
 
 def _right(row: Row) -> str:
-    values = [f"{v:g} ms" if isinstance(v, float) else ", ".join(f"{x:g}" for x in v) for v in row.right.values()]
+    values = [
+        f"{v:g} ms" if isinstance(v, float) else ", ".join("any" if x is None else f"{x:g}" for x in v)
+        for v in row.right.values()
+    ]
     told = f"says {row.says}" if row.says else ""
     return "; ".join(part for part in ("refused" if row.refused else "", " · ".join(values), told) if part) or "works"
 

@@ -19,8 +19,10 @@ _FITS = 2.0
 """Standard deviations of χ² by which a polynomial may miss the samples."""
 _STANDS_OUT = 4.0
 """Standard deviations at which a speed is one."""
-_FROM_THE_START = 0.5
-"""Part of the slope with which the first samples move."""
+_CLEAR = 5.0
+"""Times the noise that a joint has moved where its motion shows."""
+_AT_ONCE = 0.8
+"""Part of the speed with which it must have done so: a motion that sets in has less."""
 _LEAST_NOISE = 5e-6
 """Of any encoder: a clean simulation has none, and no polynomial fits it [rad]."""
 
@@ -59,10 +61,10 @@ def start_speed(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _at_once(time: np.ndarray, position: np.ndarray, slope: float, noise: float) -> bool:
-    """Whether the first samples move with the slope: of a motion that sets in, they do not yet."""
-    clear = np.searchsorted(time, _STANDS_OUT * noise / abs(slope))
-    first = min(len(time) - 1, max(1, int(clear)))
-    return float(position[first] - position[0]) / (slope * float(time[first])) > _FROM_THE_START
+    """Whether the first samples that could stand out of the noise move with a speed: at rest, they have not yet."""
+    first = min(int(np.searchsorted(time, _CLEAR * noise / abs(slope))), len(time) - 1)
+    first = max(first, 1)
+    return float(position[first] - position[0]) / float(time[first]) / slope > _AT_ONCE
 
 
 def _slope(time: np.ndarray, position: np.ndarray, noise: float) -> tuple[float, float] | None:
