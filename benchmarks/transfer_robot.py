@@ -59,17 +59,23 @@ class RealDrive(PaceDCMotor):
             self._calls_until_control = self.cfg.control_decimation
             self._control(control_action.joint_positions.numpy(), joint_pos.numpy(), speed)
         part = self.cfg.control_decimation - self._calls_until_control
-        self._asked = self._gains[0] * self._arrived(part) + self._feedback
+        older, newer, weight = self._arrived(part)
+        before, after = (self._gains[0] * target + self._feedback for target in (older, newer))
+        self._asked = weight * before + (1 - weight) * after
         self._calls_until_control -= 1
-        stall, no_load, largest = self._limits
-        torque = np.clip(self._asked, -largest, largest)
-        for effect in sorted(self._effects, key=lambda each: each.drive_rank):
-            torque = effect.drive(torque, None)  # type: ignore[arg-type]
-        drop = stall / no_load * speed
-        torque = np.clip(torque, np.minimum(-stall - drop, largest), np.maximum(stall - drop, -largest))
+        torque = weight * self._given(before, speed) + (1 - weight) * self._given(after, speed)
         self.computed_effort = torch.from_numpy(self._asked)
         self.applied_effort = self._held_effort = torch.from_numpy(torque)
         return replace(control_action, joint_positions=None, joint_velocities=None, joint_efforts=self.applied_effort)
+
+    def _given(self, asked: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """What the motor gives of a torque that is asked [N m]."""
+        stall, no_load, largest = self._limits
+        torque = np.clip(asked, -largest, largest)
+        for effect in sorted(self._effects, key=lambda each: each.drive_rank):
+            torque = effect.drive(torque, None)  # type: ignore[arg-type]
+        drop = stall / no_load * speed
+        return np.clip(torque, np.minimum(-stall - drop, largest), np.maximum(stall - drop, -largest))
 
     def _control(self, target: np.ndarray, position: np.ndarray, speed: np.ndarray) -> None:
         self._targets[:-1] = self._targets[1:]
@@ -80,15 +86,15 @@ class RealDrive(PaceDCMotor):
         reading = position - self._bias
         self._feedback = -stiffness * reading - damping * speed
 
-    def _arrived(self, part: int) -> np.ndarray:
-        """The mean over a physics step of the late target: it is held, and switches within one such step [rad]."""
+    def _arrived(self, part: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The late target before and after it switches within a physics step [rad], and the part of the step before."""
         parts = self.cfg.control_decimation
         left = self._delay - part / parts
         back = np.maximum(np.ceil(left), 0).astype(int)
         older = np.take_along_axis(self._targets, (_HISTORY - 1 - back)[None], axis=0)[0]
         newer = np.take_along_axis(self._targets, np.minimum(_HISTORY - back, _HISTORY - 1)[None], axis=0)[0]
         weight = np.minimum(parts * (1 + left - back), 1.0)
-        return weight * older + (1 - weight) * newer
+        return older, newer, weight
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
         """Forget the targets of all or some environments."""

@@ -134,14 +134,14 @@ def test_the_real_robots_drive_is_the_torque_law_in_other_code():
 
     for step in range(200):
         if step % drive.control_decimation == 0:
-            target = normal(0.5)
+            target = normal(0.2)
         if step == 100:
             real.reset(torch.tensor([1]))
             model.reset(torch.tensor([1]))
-        q, v = normal(0.3), normal(5.0)
+        q, v = normal(0.1), normal(0.5)
         torques = [each.compute(ActuatorActions(joint_positions=target), q, v).joint_efforts for each in (real, model)]
         assert torch.allclose(*torques, atol=1e-6)
-    assert float(torques[0].abs().max()) > 50.0
+    assert float(torques[0].abs().max()) > 20.0
 
 
 def test_the_transfer_table_has_both_worlds_and_their_gap(tmp_path):

@@ -56,7 +56,7 @@ def run(tmp_path_factory):
     enabled = np.ones(len(target))
     enabled[300:500] = 0.0
     path = record(folder / "off.csv", Bench(off_viscous=0.2), position=target, enabled=enabled)
-    settings = {"task": BENCH, "data": [str(path)], "optimizer": "least_squares", "check_consistency": False,
+    settings = {"task": BENCH, "data": [str(path)], "check_consistency": False,
                 "log_dir": str(folder)}  # fmt: skip
     return fit(FitSettings(**settings, effects=["off_damping"]))
 

@@ -121,7 +121,7 @@ def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_b
     twins = twin_problem(problem, reference_path(problem, problem.space.from_dict(TRUTH)))
     moved = moved_by(twins, problem.space.from_dict(truth))[:, 0].numpy()
     off = np.sqrt(np.mean((moved - record(target, truth, cfg=fine).dof_pos) ** 2, axis=0))
-    assert off[[names.index("LF_HAA"), names.index("LF_HFE")]].max() < 5e-5  # 3e-4 along the wrong knee's motion
+    assert off[[names.index("LF_HAA"), names.index("LF_HFE")]].max() < 6e-5  # 3e-4 along the wrong knee's motion
 
 
 SPRUNG = FOUR_BAR.replace('"rocker"', '"rocker" stiffness="0.6" springref="0.3" damping="0.02" armature="0.002"')
