@@ -207,7 +207,6 @@ def test_a_fit_recovers_an_effect_and_writes_it(optimizer, recorded, tmp_path, m
     events = EventAccumulator(str(folder)).Reload()
     tags = events.Tags()["scalars"]
     assert "result/stribeck_friction.effort/servo" in tags
-    assert "result/std/stribeck_friction.velocity/servo" in tags
     without, _ = run_fit(tmp_path, recorded, monkeypatch, optimizer="least_squares", effects=[])
     assert without.score > 100 * result.score
 

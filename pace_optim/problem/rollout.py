@@ -375,7 +375,9 @@ class Rollout:
                     getattr(actuator, name)[rows] = own
             ids = actuator.joint_indices
             stiffness = np.zeros(recording.num_joints)
-            stiffness[ids if isinstance(ids, slice) else np.asarray(ids.cpu())] = actuator.stiffness[r].cpu().numpy()
+            stiffness[ids if isinstance(ids, slice) else torch.as_tensor(ids).cpu().numpy()] = (
+                actuator.stiffness[r].cpu().numpy()
+            )
             for name, acts in zip(("stiffness", "damping"), acting_loops(recording, stiffness), strict=True):
                 gain = getattr(actuator, name)[rows]
                 gain[:, ~torch.as_tensor(acts, device=gain.device)[ids]] = 0.0
