@@ -269,7 +269,7 @@ class Drive:
         Raises:
             ValueError: If it has another shape.
         """
-        if enabled is not None and enabled.shape.numel() != self._num_envs:
+        if isinstance(enabled, torch.Tensor) and enabled.numel() != self._num_envs:
             raise ValueError(f"torque_enable has shape {tuple(enabled.shape)}, expected ({self._num_envs},).")
         self.torque_enable = None if enabled is None else enabled.to(self._dtype).reshape(self._num_envs, 1)
         if self.effects is not None:
