@@ -197,13 +197,9 @@ class Simulation:
             damping = viscous
         elif not self.is_trapezoidal:
             damping = viscous + implicit
-        else:  # what _leap() makes act on the speed before the step is to be a part of viscous alone
-            most = armature / self.cfg.dt
-            early = torch.minimum(0.5 * viscous, most)
-            late = viscous + implicit - early
-            own = torch.minimum(late, most)
-            damping = late + own
-            self.qfrc_applied[:, columns] += (own - early) * self.qvel[:, columns]
+        else:  # _leap() lets half of the damping act on the speed before the step: of ``implicit``, nothing
+            damping = viscous + 2.0 * implicit
+            self.qfrc_applied[:, columns] += implicit * self.qvel[:, columns]
         self.expand("dof_armature")[:, columns] = armature
         self.expand("dof_frictionloss")[:, columns] = friction
         self.expand("dof_damping")[:, columns] = damping
@@ -268,13 +264,12 @@ class Simulation:
     def _leap(self, drift: Drift) -> None:
         """A step of second order around MuJoCo's, which moves the positions of its middle with the new speed.
 
-        Half of the damping acts on the speed before the step, as far as that cannot turn a rotor around.
+        Half of the damping acts on the speed before the step, half on the speed after it.
         """
         h, damping = self.cfg.dt, self.expand("dof_damping")
         whole, applied = damping.clone(), self.qfrc_applied.clone()
-        early = torch.minimum(0.5 * damping, self.expand("dof_armature") / h)
-        damping -= early
-        self.qfrc_applied.addcmul_(early, self.qvel, value=-1)
+        damping *= 0.5
+        self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
         drift(self.qpos, self.qvel, 0.5 * h)
         self._step()
         drift(self.qpos, self.qvel, -0.5 * h)

@@ -20,6 +20,7 @@ from pace_optim.export import export
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(bash|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#\s]*)(#[^)\s]*)?\)")
+COMMAND = re.compile(r"(?:scripts/(\w+)\.py|^pace ([a-z-]+))(.*)")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 
 
@@ -146,19 +147,18 @@ def elsewhere(python: str | Path, code: str, folder: Path) -> str:
 
 @pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
 def test_the_commands_exist_with_these_options(page):
-    scripts = [line for _, text in blocks(page, "bash") for line in text.splitlines() if "scripts/" in line]
-    assert scripts
-    for line in scripts:
-        words = line.split("#")[0].split()
-        script = next(word for word in words if word.startswith("scripts/"))
-        for option in (word for word in words if word.startswith("--")):
+    commands = [COMMAND.search(line) for _, text in blocks(page, "bash") for line in text.splitlines()]
+    found = [(each[1] or each[2].replace("-", "_"), each[3]) for each in commands if each]
+    assert found
+    for script, rest in found:
+        for option in re.findall(r"(?<=\s)--\w[\w-]*", rest.split("#")[0]):
             assert option in help_of(script), f"{script} has no {option}"
 
 
 @cache
 def help_of(script: str) -> str:
     """Each script is asked once."""
-    return run_script(Path(script).stem, "--help").stdout
+    return run_script(script, "--help").stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

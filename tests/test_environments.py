@@ -242,9 +242,9 @@ def arm_task(tmp_path):
             sim2real=PaceCfg(robot_name="arm", data_dir=tmp_path, joint_order=joints, bounds_params=bounds),
         )
 
-    pace_envs.register_task("Pace-Arm-v0", arm_env_cfg)
-    yield "Pace-Arm-v0"
-    del gym.registry["Pace-Arm-v0"]
+    pace_envs.register_task("Pace-RegisteredArm-v0", arm_env_cfg)
+    yield "Pace-RegisteredArm-v0"
+    del gym.registry["Pace-RegisteredArm-v0"]
 
 
 def test_a_robot_of_ones_own_takes_a_model_a_configuration_and_one_call(arm_task):
@@ -261,7 +261,7 @@ def test_a_robot_of_ones_own_takes_a_model_a_configuration_and_one_call(arm_task
 
 
 def test_a_name_can_be_registered_only_once(arm_task):
-    with pytest.raises(ValueError, match="'Pace-Arm-v0' is already registered"):
+    with pytest.raises(ValueError, match="'Pace-RegisteredArm-v0' is already registered"):
         pace_envs.register_task(arm_task, lambda: None)
 
 

@@ -67,7 +67,7 @@ def test_a_fit_takes_the_rate_of_the_logs_commands_and_its_run_keeps_it(tmp_path
             )
         )
 
-    result, run = fitted(physics_dt=0.0001)
+    result, run = fitted()
     assert result.control_dt == 0.001 and any(note.startswith("control rate: 1000 Hz") for note in result.notes)
     assert result.parameters["viscous_friction"]["pan"] == pytest.approx(0.05, rel=0.01)
     assert open_problem(run, data=[slow]).control_dt == 0.001  # whatever is held against it

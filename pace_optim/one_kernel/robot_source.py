@@ -106,9 +106,8 @@ static void advance(mjModel* m, mjData* d, long long robot, const Arguments* a) 
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
   for (int i = 0; i < n; ++i) {{
-    const double half = 0.5 * damping[i], most = m->dof_armature[i] / h, early = half < most ? half : most;
-    m->dof_damping[i] -= early;
-    d->qfrc_applied[i] -= early * d->qvel[i];
+    m->dof_damping[i] = 0.5 * damping[i];
+    d->qfrc_applied[i] -= m->dof_damping[i] * d->qvel[i];
   }}
   a->drift(m, d->qpos, d->qvel, 0.5 * h);
   a->step(m, d);
