@@ -62,6 +62,9 @@ def test_only_drive_dt_states_a_rate():
     assert of_file.assumes_loop_rate
     stated = of_file.with_drive_dt(0.001)
     assert not stated.assumes_loop_rate and stated.loop_dt == 0.001 and stated.physics_dt == 0.0005
+    continuous = of_file.with_drive_dt(0.0)
+    assert not continuous.assumes_loop_rate and continuous.physics_dt == of_file.physics_dt
+    assert all(drive.implicit for drive in continuous.plain_cfg.scene.robot.actuators.values())
 
 
 def of(weights, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
@@ -86,7 +89,7 @@ def test_both_values_of_what_depends_on_the_rate_are_told():
     values[:, 1] = [0.23, 0.15, 0.11]
     known = np.ones(space.size, dtype=bool)
     (told,) = of([1.0, 1.0, 1.0], values).sentences(space, known)
-    assert "viscous friction of servo is 0.23 at 0.4 kHz and 0.11 at 2 kHz" in told and "--drive_dt" in told
+    assert "viscous friction of servo is 0.23 with 0.4 kHz and 0.11 with 2 kHz" in told and "--drive_dt" in told
     (told,) = of([1e-4, 1.0, 1.0], values).sentences(space, known)
     assert "tell it from 0.4 kHz" in told and "1 kHz is used" in told
     written = of([1e-4, 1.0, 1.0], values).to_dict(space)

@@ -82,7 +82,10 @@ def main() -> None:
     parser.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
     add_control_option(parser)
     parser.add_argument(
-        "--drive_dt", type=number, metavar="S", help="time between two runs of the drives' own controllers (PD loops)"
+        "--drive_dt",
+        type=number,
+        metavar="S",
+        help="time between two runs of the drives' own controllers (PD loops); 0: they run continuously",
     )
     parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
     parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")

@@ -129,10 +129,9 @@ class Problem:
         return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
 
     def with_drive_dt(self, drive_dt: float) -> Problem:
-        """The same with another step of the drives' own loops, and a physics step that fits it [s]."""
+        """The same with another step of the drives' own loops, and a physics step that fits it [s]; 0: continuous."""
         plain = copy.deepcopy(self.plain_cfg)
-        for drive in plain.scene.robot.actuators.values():
-            drive.drive_dt, drive.implicit = drive_dt, False
+        _set_drive_dt(plain, drive_dt)
         set_drive_rate(plain)
         physics_dt = plain.sim.dt / max(1, math.ceil(plain.sim.dt / self.physics_dt * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, physics_dt, self.env_cfg.sim2real.effects))
@@ -202,7 +201,8 @@ def load_problem(
         validation: Recordings that are never trained on; none keeps the last 30 % of each recording for that.
         delay_mode: ``"command"`` or ``"effort"``; ``None`` keeps the configuration's.
         physics_dt: A finer physics step under the same control rate [s].
-        drive_dt: Time between two runs of the drives' own controllers [s]; ``None`` keeps the configuration's.
+        drive_dt: Time between two runs of the drives' own controllers [s]; 0: they run continuously; ``None`` keeps
+            the configuration's.
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
         unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
@@ -229,14 +229,14 @@ def load_problem(
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
-        if drive_dt is not None:
-            drive.drive_dt, drive.implicit = drive_dt, False
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.largest_delay < longest:
             raise ValueError(
                 f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
                 f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
+    if drive_dt is not None:
+        _set_drive_dt(cfg, drive_dt)
     cfg.scene.num_envs = 1
     set_drive_rate(cfg, physics_dt)
     physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
@@ -291,6 +291,12 @@ def load_problem(
     )
     env.close()
     return problem
+
+
+def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
+    """Set the period of all drives' loops [s]; 0: they run continuously."""
+    for drive in cfg.scene.robot.actuators.values():
+        drive.drive_dt, drive.implicit = drive_dt or None, drive_dt == 0
 
 
 def _read_torques(

@@ -96,7 +96,7 @@ class Run:
             own = {"data": [str(path) for path in data], "validation": []}
             settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
-            drive_dt = settings.drive_dt or self.told_drive_dt
+            drive_dt = self.told_drive_dt if settings.drive_dt is None else settings.drive_dt
             settings = replace(settings, physics_dt=physics_dt or settings.physics_dt, drive_dt=drive_dt)
             problem = problem_of(settings, self.load_cfg(), told=not data)
         except ValueError as error:
@@ -107,7 +107,7 @@ class Run:
 
     @property
     def told_drive_dt(self) -> float | None:
-        """Period of the drives' loops [s] that its recordings told where nobody stated one; ``None``: as assumed."""
+        """Period of the drives' loops [s] that its recordings told where none was stated; ``None``: as assumed."""
         path = self.folder / "result.json"
         rate = FitResult.load(path).loop_rate if path.is_file() else {}
         return rate["used_s"] if rate and rate["used_s"] != rate["assumed_s"] else None

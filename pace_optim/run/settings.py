@@ -65,7 +65,7 @@ class FitSettings:
     """A finer physics step under the same control rate [s]."""
 
     drive_dt: float | None = None
-    """Time between two runs of the drives' own controllers [s]; ``None`` keeps the robot's."""
+    """Time between two runs of the drives' own controllers [s]; 0: continuous; ``None`` keeps the robot's."""
 
     control_dt: float | None = None
     """Time between two commands [s] of a robot that a model file states; ``None``: 2.5 ms."""
@@ -122,10 +122,12 @@ class FitSettings:
             value = getattr(self, name)
             if value is not None and value < lowest:
                 raise ValueError(f"{name} is {value}, expected at least {lowest}.")
-        for name in ("epsilon", "sigma", "physics_dt", "drive_dt", "control_dt", "max_duration", "rate"):
+        for name in ("epsilon", "sigma", "physics_dt", "control_dt", "max_duration", "rate"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} is {value}, expected a number > 0.")
+        if self.drive_dt is not None and not 0 <= self.drive_dt < float("inf"):
+            raise ValueError(f"drive_dt is {self.drive_dt}, expected seconds, or 0 for loops that run continuously.")
         self.data, self.validation = without_fact_files(self.data), without_fact_files(self.validation)
 
     @property

@@ -20,8 +20,8 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import SURE, autocovariance, filtered, inverse_of
 
-_RATES = (1e3, 2e3, 4e3, 8e3, 10e3, 20e3, 40e3)
-"""Rates of servo drives' loops [Hz]."""
+_RATES = (1e3, 2e3, 4e3)
+"""Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
 _SIMULATED = (1e-3, 5e-4)
 """Periods that are simulated beside the assumed one [s]; what the others do follows from these, as its powers."""
 _CHORD_STEPS = 4
@@ -102,7 +102,7 @@ class LoopRates:
         size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(slow)), 1e-12), 0.0)
         shown = [
             f"{space.labels[i].split('/')[0].replace('_', ' ')} of {space.labels[i].split('/')[1]} is "
-            f"{self.value_at(slow)[i]:.4g} at {_rate(slow)} and {self.value_at(fast)[i]:.4g} at {_rate(fast)}"
+            f"{self.value_at(slow)[i]:.4g} with {_rate(slow)} and {self.value_at(fast)[i]:.4g} with {_rate(fast)}"
             for i in np.argsort(-size)[:_NAMED].tolist()
         ]
         return [
@@ -112,7 +112,7 @@ class LoopRates:
 
 
 def _rate(period: float) -> str:
-    return f"{1e-3 / period:.3g} kHz"
+    return f"{1e-3 / period:.3g} kHz" if period else "a continuous loop"
 
 
 def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
@@ -152,7 +152,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         return None
     values, errors = np.stack([v for v, _ in known_of]), torch.stack([r.error[0] for _, r in known_of])
     rates = [1 / f for f in _RATES if 1 / f < (1 - 1e-6) * assumed]
-    candidates = tuple(sorted({assumed, *rates, *slower[: len(known_of) - len(periods)]}, reverse=True))
+    continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
+    candidates = tuple(sorted({assumed, *rates, *continuous, *slower[: len(known_of) - len(periods)]}, reverse=True))
     weights = np.zeros((len(candidates), len(known_of)))
     for row, period in zip(weights, candidates, strict=True):
         if period > assumed:
