@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-TRIALS = 120
+TRIALS = 60
 """They take some 25 s of a processor, a folder to damage and all imports included."""
 
 

@@ -180,7 +180,7 @@ def check_search_files(folder, result):
 def test_hybrid_is_never_worse_than_either_alone(delay_mode, recordings, tmp_path, no_report):
     """On the recording of a drive that the model cannot follow exactly, and in the delay mode that is not its own."""
     scores = {
-        optimizer: run(tmp_path, recordings["wrong"], optimizer=optimizer, max_iteration=40, delay_mode=delay_mode)[
+        optimizer: run(tmp_path, recordings["wrong"], optimizer=optimizer, max_iteration=20, delay_mode=delay_mode)[
             0
         ].score
         for optimizer in ("hybrid", "least_squares", "cmaes")
@@ -276,14 +276,10 @@ def same_result(resumed, whole):
 @pytest.mark.parametrize(
     ("optimizer", "method", "count"),
     [
-        ("cmaes", "_after_generation", 1),
         ("cmaes", "_after_generation", 13),
-        ("hybrid", "_after_generation", 1),
         ("hybrid", "_after_generation", 3),
         ("hybrid", "_after_iteration", 1),
-        ("hybrid", "_after_iteration", 4),
         ("hybrid", "_after_iteration", 8),
-        ("least_squares", "_after_iteration", 1),
         ("least_squares", "_after_iteration", 4),
     ],
 )

@@ -318,7 +318,7 @@ def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path):
 
 @pytest.mark.slow
 def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
-    monkeypatch.setattr("pace_optim.plant.case.make_suite", partial(make_suite, duration=2.5))
+    monkeypatch.setattr("pace_optim.plant.case.make_suite", partial(make_suite, duration=2.0))
     case = Case(effects=("torque_gain",), background=0.5, kind="chirp")
     (_, both), (_, main), (_, rest) = (
         make_case(replace(case, part=part)) for part in ("both", "effects", "background")
