@@ -120,7 +120,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
 
     All are simulated with one physics step. Each is fitted again by Gauss–Newton steps with the derivatives J of the
     assumed rate (the chord method). Residuals and values between and beyond the simulated periods follow by the
-    polynomial through these. With residuals r of a candidate and d = r - r' their difference to the best one's,
+    polynomial through these. A rate is not told by what was fitted alone: the residuals are those on all samples, also
+    on those kept for validation. With r those of a candidate and d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
@@ -148,9 +149,9 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     known_of = [each for each in found if each is not None]
     if any(each is None for each in found[: len(periods)]):
         return None
-    if float(there.residuals.score[0]) <= min(float(r.score[0]) for _, r in known_of):
+    if float(there.residuals.score[0]) <= min(each.score for each in known_of):
         return None
-    values, errors = np.stack([v for v, _ in known_of]), torch.stack([r.error[0] for _, r in known_of])
+    values, errors = np.stack([each.values for each in known_of]), torch.stack([each.error for each in known_of])
     rates = [1 / f for f in _RATES if 1 / f < (1 - 1e-6) * assumed]
     continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
     candidates = tuple(sorted({assumed, *rates, *continuous, *slower[: len(known_of) - len(periods)]}, reverse=True))
@@ -160,17 +161,29 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
             row[-1] = 1.0
         else:
             row[: len(periods)] = _lagrange(periods, period)
-    chi2 = _against(errors, weights, there.residuals.where)
+    chi2 = _against(errors, weights, known_of[0].where)
     likelihood = np.exp(-0.5 * chi2)
     return LoopRates(
         periods=candidates, values=weights @ values, weights=likelihood / likelihood.sum(), assumed=assumed
     )
 
 
-def _refitted(
-    problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray
-) -> tuple[np.ndarray, Residuals] | None:
-    """Values and residuals at the end of a few steps with known derivatives; ``None`` where a simulation diverges."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Refit:
+    """A fit with another period."""
+
+    values: np.ndarray
+    """Physical, (size,)."""
+    score: float
+    """On the training samples [rad²]."""
+    error: torch.Tensor
+    """On all samples, (K, R, n) [rad]."""
+    where: torch.Tensor
+    """Which samples these are, (K, R) bool."""
+
+
+def _refitted(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> _Refit | None:
+    """The end of a few steps with known derivatives; ``None`` where a simulation diverges."""
     evaluator, free = problem.training_evaluator(), np.flatnonzero(known)
     hessian, _ = there.normal_equations()
     inverse = torch.from_numpy(inverse_of(hessian.numpy()[np.ix_(free, free)])[0])
@@ -189,7 +202,12 @@ def _refitted(
             break
         x = x.clone()
         x[free] = (x[free] + step).clamp(-1.0, 1.0)
-    return None if best is None else (problem.space.to_physical(best[0]).numpy(), best[1])
+    if best is None:
+        return None
+    physical = problem.space.to_physical(best[0])
+    every = problem.evaluator().residuals(physical[None], problem.dataset.sampled)
+    score = float(best[1].score[0])
+    return _Refit(values=physical.numpy(), score=score, error=every.error[0], where=every.where)
 
 
 def _lagrange(nodes: Sequence[float], at: float) -> np.ndarray:
