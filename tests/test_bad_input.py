@@ -19,6 +19,7 @@ from pace_optim.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
 from pace_optim.run.open import Run
+from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds, read_trajectory
 from pace_optim.terminal.cli import run_cli
@@ -251,6 +252,24 @@ def test_a_result_that_no_drive_can_have_is_told_with_its_file(key, value, expec
     (tmp_path / "result.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"result\.json: .*{re.escape(expected)}"):
         IdentifiedDrives.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("units/friction", ["N m"], "units/friction is a list, expected text"),
+        ("units/friction", {"servo": 1}, "units/friction/servo is 1, expected text"),
+        ("loop_rate", {"used_s": [0.001]}, "loop_rate/assumed_s must be"),
+        ("loop_rate", {"assumed_s": 0.001, "used_s": "x"}, "loop_rate/used_s must be"),
+    ],
+)
+def test_a_result_that_no_fit_writes_is_told_with_its_file(key, value, expected, finished, tmp_path):
+    content = json.loads((finished / "result.json").read_text())
+    *inner, last = key.split("/")
+    (content[inner[0]] if inner else content)[last] = value
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rf"result\.json: .*{re.escape(expected)}"):
+        FitResult.load(tmp_path)
 
 
 def test_names_in_lists_of_their_own_are_told_with_their_file(tmp_path):

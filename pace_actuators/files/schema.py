@@ -59,7 +59,9 @@ def _value(hint: Any, value: Any, where: str, cure: str) -> Any:
     if origin in (Union, UnionType):
         if value is None and NoneType in args:
             return None
-        return _value(next(arg for arg in args if arg is not NoneType), value, where, cure)
+        holds = isinstance(value, Mapping)
+        others = [arg for arg in args if arg is not NoneType]
+        return _value(min(others, key=lambda arg: (get_origin(arg) in (dict, Mapping)) != holds), value, where, cure)
     if origin is Literal:
         if value not in args or not isinstance(value, str):
             _wrong(where, f"is {_shown(value)}, expected {' or '.join(map(repr, args))}", cure)

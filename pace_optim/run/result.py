@@ -30,7 +30,7 @@ class FitResult(DriveResult):
 
     robot_name: str
     std: dict[str, dict[str, float | None]]
-    units: dict[str, Any]
+    units: dict[str, str | dict[str, str]]
     at_bound: list[str]
     no_influence: list[str]
     indistinguishable: list[list[str]]
@@ -82,6 +82,10 @@ class FitResult(DriveResult):
                 refuse(source, f"rmse/{part} has no {missing[0]}", CURE)
         if not self.rmse["train"]:
             refuse(source, "rmse/train has no values", CURE)
+        for key in ("assumed_s", "used_s") if self.loop_rate else ():
+            value = self.loop_rate.get(key)
+            if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+                refuse(source, f"loop_rate/{key} must be a time above 0 [s]", CURE)
         labels = {f"{name}/{key}" for name, entries in self.parameters.items() for key in entries}
         named = [*self.at_bound, *self.no_influence, *self.undetermined]
         named += [*(label for group in self.indistinguishable for label in group)]
