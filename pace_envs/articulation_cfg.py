@@ -59,8 +59,8 @@ class ArticulationCfg(Config):
     joint_order: tuple[str, ...] | None = None
     """Order of the joints in every tensor, and which of them are used; ``None`` means the model's order."""
 
-    fix_base: bool = False
-    """Whether the base is held in place (its free joint is removed)."""
+    fix_base: bool | None = None
+    """Whether the base is held in place or floats; ``None``: as in the file."""
 
     soft_joint_pos_limit_factor: float = 1.0
     """Part of the joint range that counts as the soft limit, 0 to 1."""

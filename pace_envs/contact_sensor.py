@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import torch
 
-from pace_actuators import match_names
+from pace_envs.robot_spec import find_geoms
 from pace_envs.simulation import Simulation
 
 _FOUND_FORCE, _NETFORCE, _ONE = 0b11, 3, 1  # fields of MuJoCo's contact sensor, its reduction, contacts reported
@@ -18,7 +18,7 @@ class ContactSensorCfg:
     """Which geoms are watched. MuJoCo computes what they need in every physics step, so name few."""
 
     geom_names: str | tuple[str, ...]
-    """Expressions of the geoms."""
+    """Expressions of colliding geoms, or of the bodies whose geoms they are."""
 
     track_velocity: bool = False
     """Whether the geoms' velocities are computed, too."""
@@ -97,10 +97,9 @@ def add_contact_sensor(spec: mujoco.MjSpec, name: str, cfg: ContactSensorCfg) ->
     """Put what a :class:`ContactSensor` reads into a model: one contact sensor per geom, then one velocity per geom.
 
     Raises:
-        ValueError: If an expression matches no geom.
+        ValueError: If an expression matches nothing.
     """
-    matched = match_names(cfg.geom_names, [geom.name for geom in spec.geoms], what="geom")
-    names = [spec.geoms[i].name for i in sorted({i for group in matched for i in group})]
+    names = [geom.name for geom in find_geoms(spec, cfg.geom_names)]
     for geom in names:
         spec.add_sensor(
             name=f"{name}/{geom}",

@@ -23,7 +23,7 @@ _TASKS = {
     "Pace-TestBench-v0": "pace_envs.tasks.pace.test_bench:test_bench_pace_env_cfg",
     "Pace-AnymalD-Velocity-v0": "pace_envs.tasks.velocity.anymal_d:anymal_d_velocity_env_cfg",
     "Pace-Go2-Velocity-v0": "pace_envs.tasks.velocity.go2:go2_velocity_env_cfg",
-    "Pace-SO101-Reach-v0": "pace_envs.tasks.reach.so101:so101_reach_env_cfg",
+    "Pace-SO101-Reach-v0": "pace_envs.tasks.reach.reach_env_cfg:so101_reach_env_cfg",
 }
 
 _REGISTERED_BY: dict[str, dict[str, Any]] = {}

@@ -105,36 +105,42 @@ class RobotState:
         return tuple("slide" if name in slides else "hinge" for name in self.joint_names)
 
     def site_pose(self, name: str | None) -> torch.Tensor:
-        """Pose of a site in the frame of the robot's base, as the state is now.
+        """Pose of a site, or of a body, in the frame of the robot's base, as the state is now.
 
         The base is the first body; where a joint moves that one on the world, it is the world.
 
         Args:
-            name: The site's name.
+            name: The site's name, or the body's.
 
         Returns:
             Position [m] and quaternion (w, x, y, z), (num_envs, 7).
 
         Raises:
-            ValueError: If the model has no such site.
+            ValueError: If the model has neither.
         """
         sim, model = self._sim, self._sim.model
         sites = [model.site(i).name for i in range(model.nsite)]
-        if name not in sites:
+        bodies = [model.body(i).name for i in range(model.nbody)]
+        if name not in sites + bodies:
             raise ValueError(
-                f"ee_site is {name!r}, expected a site of the model. Available: {', '.join(sites) or 'none'}. Add "
-                '<site name="tip"/> to the last body, and set PaceCfg.ee_site.'
+                f"The site is {name!r}, expected a site or a body of the model. Available: "
+                f"{', '.join(sites) or 'no site'}; bodies {', '.join(bodies)}. Name one in PaceCfg.ee_site, or in "
+                "reach_env_cfg."
             )
         first = self._body_ids[0]
         is_jointed = bool(model.body_jntnum[first]) and self.is_fixed_base
-        i, base = sites.index(name), 0 if is_jointed else first
+        base = 0 if is_jointed else first
         quat, place, sites_at = (sim.bind(field) for field in ("xquat", "xpos", "site_xpos"))
         sim.forward()  # fills what is bound
+        if name in sites:
+            i = sites.index(name)
+            local = sim.tensor(model.site_quat[i]).expand(self.num_envs, -1)
+            at, turned = sites_at[:, i], multiply(quat[:, int(model.site_bodyid[i])], local)
+        else:
+            at, turned = (field[:, bodies.index(name)] for field in (place, quat))
         base_quat = quat[:, base]
-        position = rotate_inverse(base_quat, sites_at[:, i] - place[:, base])
-        local = sim.tensor(model.site_quat[i]).expand(self.num_envs, -1)
-        inverse = base_quat * base_quat.new_tensor([1.0, -1.0, -1.0, -1.0])
-        rotation = multiply(inverse, multiply(quat[:, int(model.site_bodyid[i])], local))
+        position = rotate_inverse(base_quat, at - place[:, base])
+        rotation = multiply(base_quat * base_quat.new_tensor([1.0, -1.0, -1.0, -1.0]), turned)
         return torch.cat([position, rotation], dim=1)
 
     def find_joints(

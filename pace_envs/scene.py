@@ -8,12 +8,11 @@ from typing import ClassVar
 import mujoco
 import torch
 
-from pace_actuators import match_names
 from pace_actuators.config import Config
 from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
-from pace_envs.robot_spec import load_robot_spec
+from pace_envs.robot_spec import find_geoms, load_robot_spec
 from pace_envs.simulation import EnvIds, SimulationCfg, make_simulation
 
 
@@ -25,7 +24,8 @@ class TerrainCfg(Config):
     """Sliding, torsional [m] and rolling [m] friction coefficient, where the robot's geoms do not take precedence."""
 
     collision_geoms: str | tuple[str, ...] | None = None
-    """Expressions of the robot's geoms that may touch the ground; ``None`` means all that the model lets touch it."""
+    """Expressions of the robot's geoms, or bodies, that may touch the ground, and nothing else; ``None`` leaves
+    contacts as the model has them."""
 
     impratio: float | None = None
     """Stiffness of friction over that of normal forces; ``None`` means the model's.
@@ -64,7 +64,8 @@ class InteractiveScene:
     def __init__(self, cfg: InteractiveSceneCfg, sim_cfg: SimulationCfg):
         """Build the model, start its simulations and find the robot in them."""
         self.cfg = cfg
-        spec = load_robot_spec(cfg.robot)
+        touches = sim_cfg.contacts or cfg.terrain is not None or bool(cfg.contact_sensors)
+        spec = load_robot_spec(cfg.robot, touches=touches)
         if cfg.terrain is not None:
             _add_terrain(spec, cfg.terrain)
         for name, sensor in cfg.contact_sensors.items():
@@ -139,13 +140,10 @@ class InteractiveScene:
 
 
 def _add_terrain(spec: mujoco.MjSpec, cfg: TerrainCfg) -> None:
-    colliding = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
     if cfg.collision_geoms is not None:
-        matched = match_names(cfg.collision_geoms, [geom.name for geom in colliding], what="collision geom")
-        kept = {i for group in matched for i in group}
-        for i, geom in enumerate(colliding):
-            if i not in kept:
-                geom.contype = geom.conaffinity = 0
+        kept = {geom.name for geom in find_geoms(spec, cfg.collision_geoms)}
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity = 0, int(geom.name in kept)  # the ground's contype is 1
     if cfg.impratio is not None:
         spec.option.impratio = cfg.impratio
     ground = spec.worldbody.add_geom(

@@ -240,7 +240,7 @@ def _judge(trial: Trial, err: str, out: Path, marker: Path, unchanged: bool) -> 
     last = err.rstrip("\n").splitlines()[-1:] or [""]
     if not last[0].startswith("error: ") or len(last[0]) > 1500 or any(not c.isprintable() for c in last[0]):
         return "message"
-    if "this is a fault of the program" in err or err.count("error:") > 2:
+    if "this is a fault of the program" in err or len(re.findall("^error: ", err, re.MULTILINE)) > 1:
         return "message"
     known = Path(trial.target).name in err or Path(trial.target).stem in err
     if trial.target and not known and "that nobody has named" not in err:  # a task's code, where HOME is not set

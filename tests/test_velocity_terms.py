@@ -179,7 +179,7 @@ def test_only_named_geoms_collide():
 def test_a_misspelt_collision_geom_is_named():
     cfg = load_env_cfg(ANYMAL)
     cfg.scene.terrain.collision_geoms = ".*_hoof"
-    with pytest.raises(ValueError, match=r"'\.\*_hoof' matches no collision geom\. Available: .*LF_foot"):
+    with pytest.raises(ValueError, match=r"'\.\*_hoof' matches no colliding geom or body\. Available: .*LF_foot"):
         ManagerBasedRLEnv(cfg)
 
 

@@ -1,17 +1,19 @@
-"""From a model file to an identification environment's configuration."""
+"""From a model file to an identification environment's configuration, and to a robot for training tasks."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
 
-from pace_actuators import PaceDCMotorCfg
+from pace_actuators import PaceDCMotorCfg, resolve_joint_values
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
@@ -29,6 +31,7 @@ from pace_envs.from_model.scaling import (
     start_values,
 )
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
+from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
@@ -155,6 +158,48 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             notes=robot.notes,
         ),
     )
+
+
+def robot_cfg_from_model(
+    path: str | Path, joint_pos: Mapping[str, float] | None = None, control_dt: float = 0.005
+) -> ArticulationCfg:
+    """The robot of a model file for a training task, with the joints and drives of :func:`cfg_from_model`.
+
+    It stands on the ground with its lowest colliding geom.
+
+    Args:
+        path: MJCF (``.xml``) or URDF (``.urdf``).
+        joint_pos: Its stance, by expressions of joints [rad]; other joints are as in the file's home posture.
+        control_dt: Time between two commands to the drives [s].
+
+    Raises:
+        ValueError: If the file cannot be used, or an expression matches no joint.
+    """
+    robot = replace(cfg_from_model(path, control_dt).scene.robot, fix_base=None)
+    names = robot.joint_order or ()
+    own = resolve_joint_values(dict(joint_pos or {}), names, field="joint_pos", default=math.nan).tolist()
+    stated = {re.escape(name): value for name, value in zip(names, own, strict=True) if not math.isnan(value)}
+    stance = {**dict(robot.init_state.joint_pos), **stated}  # type: ignore[arg-type]
+    state = replace(robot.init_state, joint_pos=stance)
+    return replace(robot, init_state=replace(state, pos=(0.0, 0.0, _height_on_ground(robot, stance))))
+
+
+def _height_on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> float:
+    """Height of the base at which the lowest colliding geom touches the ground [m]; 0 if nothing collides."""
+    at_origin = replace(robot, fix_base=True, init_state=InitialStateCfg(rot=robot.init_state.rot))
+    with warnings.catch_warnings(action="ignore"):  # those who build the environment are told
+        spec = load_robot_spec(at_origin, touches=True)
+    depth = 1e3
+    ground = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, -depth])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for j in range(model.njnt):
+        data.qpos[model.jnt_qposadr[j]] = stance.get(re.escape(model.joint(j).name), 0.0)
+    mujoco.mj_kinematics(model, data)
+    colliding = model.geom_contype | model.geom_conaffinity
+    own = [g for g in range(model.ngeom) if colliding[g] and model.geom_bodyid[g]]
+    above = [mujoco.mj_geomDistance(model, data, ground.id, g, 2 * depth, None) for g in own]
+    return depth - min(above, default=depth)
 
 
 def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous: bool) -> PaceDCMotorCfg:

@@ -20,11 +20,11 @@ _MEMORY = 4e9
 _WAIT = 10.0
 """Longest time of a clock for it, as a multiple of that of a processor."""
 _REFUSED = 3
-_checked: set[tuple[str, int, int]] = set()
+_checked: set[tuple[str, str, int, int]] = set()
 """Files that were within the limits, as long as they are what they were."""
 
 
-def check_limits(path: Path, read: Callable[[], object]) -> None:
+def check_limits(path: Path, read: Callable[[], object], key: str = "") -> None:
     """Refuse a model file that takes too long, or too much memory, such as one that repeats a body 1e8 times.
 
     MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once; other faults of
@@ -33,13 +33,14 @@ def check_limits(path: Path, read: Callable[[], object]) -> None:
     Args:
         path: The file.
         read: Reads, compiles and allocates it.
+        key: What tells this way of reading it from others.
 
     Raises:
         ValueError: If it is beyond a limit, or ends the process that reads it.
     """
     info = path.stat()
-    key = str(path.resolve()), info.st_mtime_ns, info.st_size
-    if key in _checked or not hasattr(os, "fork"):
+    state = str(path.resolve()), key, info.st_mtime_ns, info.st_size
+    if state in _checked or not hasattr(os, "fork"):
         return
     memory = min(_MEMORY, 0.9 * available_memory())
     collects = gc.isenabled()
@@ -61,7 +62,7 @@ def check_limits(path: Path, read: Callable[[], object]) -> None:
             f"The model of {path} does not fit into {memory / 1e9:.2g} GB of memory, or ends MuJoCo. Look for what the "
             "file repeats or sizes (replicate, composite, flexcomp, size, hfield), and make it smaller."
         )
-    _checked.add(key)
+    _checked.add(state)
 
 
 def _read_in_fork(read: Callable[[], object], memory: int) -> None:

@@ -24,7 +24,7 @@ class ModelFile:
     path: Path
     """The file."""
     spec: mujoco.MjSpec
-    """The model; meshes and surfaces that the dynamics do not need are left out of it."""
+    """The model; meshes and surfaces that are not needed are left out of it."""
     notes: tuple[str, ...]
     """What was left out although the file names it, in plain sentences."""
     urdf: UrdfFacts | None = None
@@ -41,7 +41,7 @@ def is_model_file(text: str) -> bool:
     return Path(text).suffix.lower() in MODEL_SUFFIXES
 
 
-def read_model_file(path: str | Path) -> ModelFile:
+def read_model_file(path: str | Path, *, touches: bool = False) -> ModelFile:
     """Read an MJCF or a URDF.
 
     Mesh geoms of bodies whose inertia is stated are left out: the dynamics do not need them. A mesh that is needed for
@@ -49,6 +49,7 @@ def read_model_file(path: str | Path) -> ModelFile:
 
     Args:
         path: The file.
+        touches: Whether the robot touches anything: mesh geoms that collide stay, and MuJoCo takes their convex hulls.
 
     Raises:
         ValueError: If the file is missing or is no model, or takes too much time or memory.
@@ -56,13 +57,14 @@ def read_model_file(path: str | Path) -> ModelFile:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"The model file {path} does not exist. Correct its path.")
-    check_limits(path, lambda: mujoco.MjData(_read(path).spec.compile()))
-    return _read(path)
+    check_limits(path, lambda: mujoco.MjData(_read(path, touches).spec.compile()), key=str(touches))
+    return _read(path, touches)
 
 
-def _read(path: Path) -> ModelFile:
+def _read(path: Path, touches: bool) -> ModelFile:
     text = path.read_bytes().decode("utf-8", errors="replace")
-    facts = read_urdf(text, path) if "<robot" in text and "<mujoco model" not in text[: text.find("<robot")] else None
+    is_urdf = "<robot" in text and "<mujoco model" not in text[: text.find("<robot")]
+    facts = read_urdf(text, path, touches=touches) if is_urdf else None
     keep_quiet()
     try:
         spec = mujoco.MjSpec.from_file(str(path)) if facts is None else mujoco.MjSpec.from_string(facts.xml)
@@ -71,7 +73,7 @@ def _read(path: Path) -> ModelFile:
     if facts is not None:
         spec.modelname = spec.modelname or facts.name
         _write_urdf_facts(spec, facts)
-    notes = [*(() if facts is None else facts.notes), *leave_out_meshes(spec, path)]
+    notes = [*(() if facts is None else facts.notes), *leave_out_meshes(spec, path, touches=touches)]
     leave_out_surfaces(spec, path)
     return ModelFile(path=path, spec=spec, notes=tuple(notes), urdf=facts)
 

@@ -10,30 +10,41 @@ _FROM_GEOMS = 1
 """``compiler/inertiafromgeom="true"``: stated inertias are not used."""
 
 
-def leave_out_meshes(spec: mujoco.MjSpec, path: Path) -> list[str]:
+_HULL_VERTICES = 64
+"""Most vertices of a mesh's convex hull, where the file states none: a contact searches all of them."""
+
+
+def leave_out_meshes(spec: mujoco.MjSpec, path: Path, *, touches: bool = False) -> list[str]:
     """Delete geoms of meshes where no mass comes from them, and where their files are missing.
 
     Args:
         spec: The model; it is changed.
         path: Its file.
+        touches: Whether geoms that collide stay.
 
     Returns:
         What was left out although it is needed, in plain sentences.
     """
     files = {mesh.name or Path(mesh.file).stem: mesh.file for mesh in spec.meshes}
     missing = {name for name, file in files.items() if file and not _exists(spec, path, file)}
-    gone, massless = set(), []
+    gone, massless, weighed = set(), [], set()
     for body in spec.bodies:
         stated = body.explicitinertial and int(spec.compiler.inertiafromgeom) != _FROM_GEOMS
         for geom in [geom for geom in body.geoms if geom.meshname]:
-            if stated or geom.meshname in missing:
+            if touches and geom.meshname not in missing and (geom.contype or geom.conaffinity):
+                weighed |= set() if stated else {geom.meshname}
+            elif stated or geom.meshname in missing:
                 if not stated and geom.meshname in missing and _has_mass(geom):
                     massless.append(body.name or "world")
                 gone.add(geom.name)
                 spec.delete(geom)
     used = {geom.meshname for geom in spec.geoms if geom.meshname}
-    for mesh in [mesh for mesh in spec.meshes if (mesh.name or Path(mesh.file).stem) not in used]:
-        spec.delete(mesh)
+    for mesh in list(spec.meshes):
+        if (name := mesh.name or Path(mesh.file).stem) not in used:
+            spec.delete(mesh)
+        elif touches and name not in weighed:
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # of no mass: its surface may have holes
+            mesh.maxhullvert = mesh.maxhullvert if mesh.maxhullvert > 0 else _HULL_VERTICES
     _delete_references(spec, gone - {""})
     notes = []
     if missing:

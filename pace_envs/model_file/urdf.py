@@ -22,6 +22,8 @@ _SMALLEST_INERTIA, _SMALLEST_AREA = 1e-9, 1e-6
 """Where no body can have the stated inertia, it is at least this [kg m^2], and this per mass [m^2]."""
 _ZERO = 1e-15
 """A stated inertia that is smaller everywhere is zero [kg m^2]."""
+_READABLE = (".stl", ".obj", ".msh")
+"""Files of meshes that MuJoCo reads."""
 _TOLD = 1e-3
 """A change of an inertia by a smaller part is not told: a flat plate's moments are rounded."""
 _NUMBERS = {
@@ -61,12 +63,13 @@ class UrdfFacts:
     notes: tuple[str, ...]
 
 
-def read_urdf(text: str, path: Path) -> UrdfFacts:
+def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     """Read a URDF.
 
     Args:
         text: Its content.
-        path: Its file, for messages.
+        path: Its file.
+        touches: Whether the meshes of collisions stay, under the absolute paths of their files.
 
     Raises:
         ValueError: If it is no URDF, still a xacro, or a number in it is none.
@@ -78,9 +81,14 @@ def read_urdf(text: str, path: Path) -> UrdfFacts:
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise ValueError(f"{path} is a xacro, not yet a URDF. Expand it first: xacro {path.name} > robot.urdf")
     _check_numbers(root, path)
-    meshes = _without_meshes(root)
+    meshes = _without_meshes(root, path if touches else None)
     notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
-    if meshes:
+    if meshes and touches:
+        notes.append(
+            f"Nothing touches its collision meshes {_listed(meshes)}, which are not there or none of "
+            f"{', '.join(_READABLE)}: convert them, or put them where the file looks for them."
+        )
+    elif meshes:
         notes.append(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
@@ -109,7 +117,8 @@ def _hold_what_floats(root: ElementTree.Element) -> list[str]:
     floating = [joint for joint in root.findall("joint") if joint.get("type") == "floating"]
     for joint in floating:
         joint.set("type", "fixed")
-    return [f"Held in the air: {_listed([joint.get('name', '') for joint in floating])}."] if floating else []
+    names = _listed([joint.get("name", "") for joint in floating])
+    return [f"Taken as fixed, not as floating: {names}."] if floating else []
 
 
 def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
@@ -227,20 +236,44 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def _without_meshes(root: ElementTree.Element) -> list[str]:
-    """Take visuals and meshes out of the tree; returns the meshes' files, each once."""
-    meshes = [e.get("filename", "") for e in root.iter("mesh")]
+def _without_meshes(root: ElementTree.Element, path: Path | None) -> list[str]:
+    """Take visuals and meshes out of the tree; returns the meshes' files, each once.
+
+    With the URDF's own file given, meshes of collisions stay that MuJoCo can read, and are not returned.
+    """
+    meshes = [] if path else [e.get("filename", "") for e in root.iter("mesh")]
     for link in root.iter("link"):
-        for part in [*link.findall("visual"), *link.findall("collision")]:
-            if part.tag == "visual" or part.find("geometry/mesh") is not None:
+        for visual in link.findall("visual"):
+            link.remove(visual)
+        for part in link.findall("collision"):
+            if (mesh := part.find("geometry/mesh")) is None:
+                continue
+            if path and (file := _found(mesh.get("filename", ""), path)):
+                mesh.set("filename", str(file))
+            else:
                 link.remove(part)
+                meshes.append(mesh.get("filename", ""))
     if (extension := root.find("mujoco/compiler")) is not None:
         for key in ("meshdir", "discardvisual", "fusestatic"):
             extension.attrib.pop(key, None)
     else:
         extension = ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler")
+    extension.set("strippath", "false")
     extension.set("fusestatic", "false")  # a fixed link keeps its name: loads are bolted to it
     return list(dict.fromkeys(meshes))
+
+
+def _found(name: str, path: Path) -> Path | None:
+    """The file of a mesh, by its name in the URDF at a path; ``None`` if it is not there, or MuJoCo cannot read it.
+
+    The package of ``package://package/file`` is looked for beside the folders that hold the URDF, and among them.
+    """
+    _, scheme, rest = name.rpartition("://")
+    package, _, inside = rest.partition("/")
+    folders = path.resolve().parents
+    tried = [folders[0] / rest, *(folder / rest for folder in folders[1:] if scheme)]
+    tried += [folder / inside for folder in folders if scheme and folder.name == package]
+    return next((file for file in tried if file.suffix.lower() in _READABLE and file.is_file()), None)
 
 
 def _check_numbers(root: ElementTree.Element, path: Path) -> None:

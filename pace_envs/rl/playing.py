@@ -19,9 +19,9 @@ from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rl.training import EditCfg, load_cfg, make_env
 from pace_envs.rl.video import check_video_path, write_video
 from pace_envs.rl.viewer import watch
+from pace_envs.rsl_rl_cfg import play_cfg
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.reach import ReachEnvCfg
-from pace_envs.tasks.training_env_cfg import play_cfg
 from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command
 
 _FRAME_EVERY = 2  # environment steps: 25 pictures per second at 50 Hz

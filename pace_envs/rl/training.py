@@ -31,9 +31,9 @@ from pace_envs.rl.run_folder import (
     new_run_folder,
 )
 from pace_envs.rl.runner import PaceOnPolicyRunner
+from pace_envs.rsl_rl_cfg import TrainingEnvCfg, use_rewards
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.task_source import EnvironmentRecord
-from pace_envs.tasks.training_env_cfg import TrainingEnvCfg, use_rewards
 from pace_envs.tasks.velocity import VelocityEnvCfg, add_randomization
 
 

@@ -111,7 +111,7 @@ class PaceCfg(Config):
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
     ee_site: str | None = None
-    """The site of the model whose pose objectives of your own compare with the recordings' ``real_ee_pose``."""
+    """The site or body of the model whose pose objectives of your own compare with the series ``real_ee_pose``."""
 
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""

@@ -1,4 +1,4 @@
-"""What the reaching tasks of all arms share."""
+"""Reaching: the task of any arm, and of the SO-101."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pace_envs.managers import (
     TerminationTermCfg,
     UniformNoiseCfg,
 )
-from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
+from pace_envs.robots import so101_cfg
+from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg, TrainingEnvCfg
 from pace_envs.scene import InteractiveSceneCfg
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.reach.terms import ReachCommandCfg, closeness, distance, to_command
-from pace_envs.tasks.training_env_cfg import TrainingEnvCfg
 
 COMMAND = "ee_position"
 """Name of the command."""
@@ -30,7 +30,7 @@ class ReachEnvCfg(TrainingEnvCfg):
     """Configuration of a reaching task."""
 
     site: str
-    """The site that is brought to the commanded places."""
+    """The site, or the body, that is brought to the commanded places."""
 
 
 def reach_env_cfg(robot: ArticulationCfg, *, site: str, action_scale: float, experiment_name: str) -> ReachEnvCfg:
@@ -38,7 +38,7 @@ def reach_env_cfg(robot: ArticulationCfg, *, site: str, action_scale: float, exp
 
     Args:
         robot: The arm; its initial state is where episodes begin, its base is held.
-        site: The site of its hand.
+        site: The site of its hand, or the hand's body.
         action_scale: Change of a target per unit of action [rad].
         experiment_name: Name of the folder of the runs.
     """
@@ -83,3 +83,13 @@ def reach_env_cfg(robot: ArticulationCfg, *, site: str, action_scale: float, exp
         reward_sets={"reach": rewards},
         runner=RslRlOnPolicyRunnerCfg(experiment_name=experiment_name, max_iterations=200),
     )
+
+
+def so101_reach_env_cfg() -> ReachEnvCfg:
+    """The SO-101's; friction and armature are a guess of the size that others measured, until ``--identified``."""
+    robot = so101_cfg()
+    robot.actuators = {
+        name: dataclasses.replace(drive, armature=0.028, friction=0.1, viscous_friction=0.15)
+        for name, drive in robot.actuators.items()
+    }
+    return reach_env_cfg(robot, site="gripper_frame", action_scale=0.5, experiment_name="so101_reach")

@@ -20,7 +20,7 @@ _PLACES = 4096
 
 
 class ReachCommand(CommandTerm):
-    """Where a site is to be in the base's frame [m]: a place that it takes at random joint positions."""
+    """Where a site or a body is to be in the base's frame [m]: a place that it takes at random joint positions."""
 
     cfg: ReachCommandCfg
 
@@ -28,10 +28,10 @@ class ReachCommand(CommandTerm):
         """Find places that the arm reaches.
 
         Raises:
-            ValueError: If the model has no such site, or it is nowhere high enough.
+            ValueError: If the model has no such site or body, or it is nowhere high enough.
         """
         super().__init__(cfg, env)
-        env.scene["robot"].site_pose(cfg.site)  # complains if there is none
+        env.scene["robot"].site_pose(cfg.site)  # complains if there is neither
         self._places = env.sim.tensor(_reachable(env, cfg))
         self._command = torch.zeros(env.num_envs, 3, dtype=env.dtype, device=env.device)
         self._errors = torch.zeros(env.num_envs, 2, dtype=env.dtype, device=env.device)  # distance, steps
@@ -65,7 +65,7 @@ class ReachCommandCfg(CommandTermCfg):
     """The term's class."""
 
     site: str
-    """The site that is to be there."""
+    """The site, or the body, that is to be there."""
 
     joint_share: float = 0.5
     """How much of each joint's range, about the initial position, the places take."""
@@ -104,11 +104,13 @@ def _reachable(env: Any, cfg: ReachCommandCfg) -> np.ndarray:
     high = np.where(np.isfinite(high), high, start + np.pi)
     half = 0.5 * cfg.joint_share * (high - low)
     at = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
-    base, site, found = 1, model.site(cfg.site).id, []
+    base, found = 1, []
+    is_site = any(model.site(i).name == cfg.site for i in range(model.nsite))
+    hand = data.site(cfg.site) if is_site else data.body(cfg.site)
     for drawn in rng.uniform(-1.0, 1.0, (_PLACES, len(at))):
         data.qpos[at] = np.clip(start + half * drawn, low, high)
         mujoco.mj_kinematics(model, data)
-        found.append(data.xmat[base].reshape(3, 3).T @ (data.site_xpos[site] - data.xpos[base]))
+        found.append(data.xmat[base].reshape(3, 3).T @ (hand.xpos - data.xpos[base]))
     places = np.stack(found)
     places = places[places[:, 2] >= cfg.lowest]
     if not len(places):

@@ -1,6 +1,6 @@
 """Walking on flat ground after a commanded velocity."""
 
-from pace_envs.tasks.training_env_cfg import play_cfg, use_rewards
+from pace_envs.rsl_rl_cfg import play_cfg, use_rewards
 from pace_envs.tasks.velocity.options import add_randomization, fix_command, set_drives
 from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
 from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg

@@ -9,6 +9,9 @@ from pace_envs import mdp
 from pace_envs.managers import EventTermCfg, SceneEntityCfg
 from pace_envs.tasks.velocity.velocity_env_cfg import COMMAND, VelocityEnvCfg
 
+_BASE = 1
+"""The model's first body after the world."""
+
 
 def set_drives(cfg: VelocityEnvCfg, drives: Mapping[str, PaceDCMotorCfg]) -> None:
     """Put other drives into the robot, such as identified ones."""
@@ -43,7 +46,7 @@ def add_randomization(
         "mass": EventTermCfg(
             func=mdp.randomize_body_mass,
             mode="startup",
-            params={"asset_cfg": SceneEntityCfg(body_names=cfg.base_body), "mass_range": mass_range},
+            params={"asset_cfg": SceneEntityCfg(body_ids=[_BASE]), "mass_range": mass_range},
         ),
         "push": EventTermCfg(
             func=mdp.push_by_setting_velocity,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 from pace_actuators import JointValue
@@ -16,9 +17,9 @@ from pace_envs.managers import (
     TerminationTermCfg,
     UniformNoiseCfg,
 )
+from pace_envs.rsl_rl_cfg import TrainingEnvCfg
 from pace_envs.scene import InteractiveSceneCfg, TerrainCfg
 from pace_envs.simulation import SimulationCfg
-from pace_envs.tasks.training_env_cfg import TrainingEnvCfg
 
 COMMAND = "base_velocity"
 """Name of the velocity command."""
@@ -31,27 +32,32 @@ class VelocityEnvCfg(TrainingEnvCfg):
     copper_loss: JointValue = 0.0
     """Winding losses over squared torque, R / (r² k²) of each drive [W/(N m)²]: for the cost of transport."""
 
-    base_body: str = "base"
-    """Name of the body whose mass is randomised."""
-
 
 def velocity_env_cfg(
-    robot: ArticulationCfg, *, feet: str, base: str, knees: str, action_scale: float, minimum_height: float
+    robot: ArticulationCfg,
+    *,
+    feet: str,
+    base: str,
+    knees: str,
+    action_scale: float,
+    minimum_height: float | None = None,
 ) -> VelocityEnvCfg:
     """A velocity task without rewards: 50 Hz policy over 200 Hz physics and control.
 
+    Expressions name colliding geoms, or the bodies whose geoms they are. Meshes collide as their convex hulls.
+
     Args:
         robot: The robot; its initial state is the stance, its drives run at 200 Hz.
-        feet: Expression of the foot geoms.
-        base: Expression of the base's geoms, whose touching the ground ends an episode.
-        knees: Expression of the geoms at the knees, whose touching the ground is undesired.
+        feet: Expression of the feet.
+        base: Expression of what ends an episode where it touches the ground.
+        knees: Expression of what should not touch the ground.
         action_scale: Change of a target per unit of action [rad].
-        minimum_height: Height of the base below which it has fallen [m].
+        minimum_height: Height of the base below which it has fallen [m]; ``None``: half of that in the stance.
     """
     return VelocityEnvCfg(
         scene=InteractiveSceneCfg(
             num_envs=512,
-            robot=robot,
+            robot=dataclasses.replace(robot, fix_base=False),
             terrain=TerrainCfg(collision_geoms=(feet, base, knees), impratio=1.0),
             contact_sensors={
                 "feet": ContactSensorCfg(geom_names=feet, track_velocity=True),
@@ -71,7 +77,8 @@ def velocity_env_cfg(
             "base_contact": TerminationTermCfg(func=mdp.illegal_contact, params={"sensor_name": "base"}),
             "bad_orientation": TerminationTermCfg(func=mdp.bad_orientation, params={"limit_angle": 1.0}),
             "base_height": TerminationTermCfg(
-                func=mdp.root_height_below_minimum, params={"minimum_height": minimum_height}
+                func=mdp.root_height_below_minimum,
+                params={"minimum_height": 0.5 * robot.init_state.pos[2] if minimum_height is None else minimum_height},
             ),
             "diverged": TerminationTermCfg(func=mdp.diverged),
         },
