@@ -1,6 +1,7 @@
 """Bad input to scripts/fit.py: one line that names the fault and its cure, exit status 2, nothing half-written."""
 
 import json
+import math
 import re
 import runpy
 import shutil
@@ -15,6 +16,7 @@ from problems import ANYMAL, BENCH, env_cfg, record
 
 from pace_actuators import IdentifiedDrives
 from pace_envs.tasks.pace import Parameter, test_bench
+from pace_optim.comparison import compare
 from pace_optim.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
@@ -270,6 +272,17 @@ def test_a_result_that_no_fit_writes_is_told_with_its_file(key, value, expected,
     (tmp_path / "result.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"result\.json: .*{re.escape(expected)}"):
         FitResult.load(tmp_path)
+
+
+@pytest.mark.parametrize("value", [1e160, math.inf, math.nan])
+def test_a_simulation_that_diverged_is_told_with_its_file(value, finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    content = torch.load(run / "best_trajectory.pt")
+    content["recordings"][0]["sim_dof_pos"][3:] = value
+    torch.save(content, run / "best_trajectory.pt")
+    with pytest.raises(ValueError, match=r"best_trajectory\.pt: the simulation of .* diverges"):
+        compare([run])
 
 
 def test_names_in_lists_of_their_own_are_told_with_their_file(tmp_path):

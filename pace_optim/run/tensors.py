@@ -13,12 +13,14 @@ from pace_actuators.files import read_tensors, refuse
 
 _ANEW = "Fit again, or go on with the run."
 _LARGEST = 1e15
-"""Beyond it no position or bound is one, and differences are no numbers any more."""
+"""Beyond it no position or bound is one, and differences are no numbers any more; a simulation has diverged."""
 _SERIES = ("des_dof_pos", "dof_pos", "sim_dof_pos")
 
 
 def read_trajectory(folder: Path) -> dict[str, Any]:
     """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
+
+    Where the simulation has diverged, ``sim_dof_pos`` is NaN.
 
     Raises:
         ValueError: If it is missing or damaged; the message names the key.
@@ -51,6 +53,8 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
         shape = (len(time), joints)
         if not _is_series(entry[name], 2, finite=name != "sim_dof_pos") or tuple(entry[name].shape) != shape:
             refuse(where, f"{name} is no series of finite numbers of shape {shape}", _ANEW)
+    simulated = entry["sim_dof_pos"]
+    entry["sim_dof_pos"] = simulated.where(simulated.abs() < _LARGEST, torch.nan)
     for name in ("train", "torque_enable"):
         flags = entry[name] if name == "train" else entry.get(name, entry["train"])
         if not (isinstance(flags, torch.Tensor) and flags.dtype == torch.bool and flags.shape == time.shape):
