@@ -86,11 +86,41 @@ column = "t_ms"
 unit = "ms"
 """
 
-_URDF = """<robot name="swing"><link name="base"/>
+_URDF = """<robot name="swing"><link name="base"><inertial><mass value="2"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><box size="0.2 0.2 0.1"/></geometry></collision></link>
 <link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.4"/>
-<inertia ixx="2e-3" iyy="2e-3" izz="4e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<inertia ixx="2e-3" iyy="2e-3" izz="4e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0 0 -0.2"/><geometry><mesh filename="package://world/foot.obj"/></geometry></collision></link>
 <joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
 <limit lower="-2" upper="2" effort="6" velocity="9"/><dynamics damping="0.1" friction="0.05"/></joint></robot>
+"""
+
+_FOOT = """v 0 0 0
+v 0.1 0 0
+v 0 0.1 0
+v 0 0 0.1
+f 1 3 2
+f 1 2 4
+f 2 3 4
+f 1 4 3
+"""
+
+_HOPPER = """from pathlib import Path
+
+from pace_envs import register_task
+from pace_envs.from_model import robot_cfg_from_model
+from pace_envs.tasks.velocity import velocity_env_cfg, velocity_rewards
+
+
+def cfg():
+    robot = robot_cfg_from_model(Path(__file__).parent / "arm.urdf")
+    cfg = velocity_env_cfg(robot, feet="arm", base="base", knees="base", action_scale=0.25)
+    cfg.rewards = velocity_rewards()
+    return cfg
+
+
+register_task("Hopper-v0", cfg)
 """
 
 TRAP = 'open({path!r}, "a").write("executed")\n'
@@ -133,6 +163,8 @@ def build(folder: Path, *, quick: bool = False) -> Path:
     (folder / "arm.xml").write_text(_MODEL)
     (folder / "trap.py").write_text(TRAP.format(path=str(folder.parent / "executed")))
     (folder / "arm.urdf").write_text(_URDF)
+    (folder / "foot.obj").write_text(_FOOT)
+    (folder / "hopper.py").write_text(_HOPPER)
     (folder / "map.toml").write_text(_MAP)
     (folder / "log.csv").write_text(_log())
     _write_parquet(folder)
@@ -265,6 +297,8 @@ COMMANDS: dict[str, tuple[str, Sequence[str], Sequence[str]]] = {
         f"{TRAINING}/{name}" for name in ("settings.json", "identified.json", "model_0.pt"))),
     "train from": ("train", ("--task", WALK, "--num_envs", "2", "--max_iterations", "2", "--log_dir", "new",
                              "--start_from", f"{TRAINING}/model_0.pt"), (f"{TRAINING}/model_0.pt",)),
+    "train own": ("train", ("--task", "hopper.py:Hopper-v0", "--num_envs", "2", "--max_iterations", "1", "--log_dir",
+                            "new"), ("arm.urdf", "foot.obj")),
     "play": ("play", ("--checkpoint", f"{TRAINING}/model_0.pt", "--num_envs", "2", "--seconds", "0.1"), tuple(
         f"{TRAINING}/{name}" for name in ("settings.json", "identified.json", "model_0.pt"))),
     "replay": ("play", ("--task", WALK, "--replay", GO2), (f"{GO2}/result.json", f"{GO2}/settings.json")),
