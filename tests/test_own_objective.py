@@ -144,7 +144,10 @@ def test_a_fit_takes_a_class_and_writes_all_that_a_fit_writes(file, tmp_path):
     assert any(Path(entry["file"]) == Path(__file__) for entry in record_.values())
     more, _ = resume(folder, max_iteration=27, progress=Silent())
     assert more.generations == 27
-    assert "objective" in (folder / "report.html").read_text()
+    report = (folder / "report.html").read_text()
+    assert f"<dd>{result.objective['train']:.2e}</dd>" in report
+    assert f"Mean over the training samples of the objective {__name__}:PositionAndVelocity." in report
+    assert "score [rad²]" not in report
 
 
 def test_positions_and_velocities_find_the_truth_that_positions_find(recording):

@@ -291,6 +291,19 @@ def test_a_training_does_not_begin_with_an_optimizer_that_lacks_a_moment(run, tm
     assert {each.name: each.stat().st_mtime_ns for each in folder.iterdir()} == before
 
 
+@pytest.mark.parametrize(("key", "value"), [("mlp.2.weight", 1e160), ("mlp.2.weight", 1e38), ("mlp.0.bias", 1e160)])
+def test_a_training_does_not_begin_with_a_policy_whose_actions_are_not_finite(run, tmp_path, key, value):
+    """It was missed in the first step, when the folder had been made, and the checkpoint was not named."""
+    content = torch.load(latest_checkpoint(run), weights_only=True)
+    weights = content["actor_state_dict"]
+    weights[key] = torch.full_like(weights[key], value, dtype=torch.float64)
+    torch.save(content, tmp_path / "model_2.pt")
+    settings = RunSettings(task=TASKS[0], num_envs=2, start_from=str(tmp_path / "model_2.pt"), log_dir=str(tmp_path))
+    with pytest.raises(ValueError, match=r"model_2\.pt is no checkpoint .*what they say is not finite"):
+        train(settings)
+    assert [each.name for each in tmp_path.iterdir()] == ["model_2.pt"]
+
+
 def test_a_film_needs_a_known_ending_and_pictures(tmp_path):
     with pytest.raises(ValueError, match=r"expected \.mp4 or \.gif"):
         write_video(tmp_path / "walk.avi", [np.zeros((4, 4, 3), np.uint8)], 25)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
 
 from pace_actuators.files import read_tensors, replacing
 from pace_actuators.files.reading import tensors_in
@@ -81,6 +82,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         try:
             if self.alg.load(content, load_cfg, strict):
                 self.current_learning_iteration = int(content["iter"])
+            self._check_networks()
             infos = content["infos"] or {}
             scales = dict(infos.get("env", {}).get("command_scale", {}))
             _check_optimizer(self.alg.optimizer, before)
@@ -92,6 +94,16 @@ class PaceOnPolicyRunner(OnPolicyRunner):
             raise ValueError(f"{path} is no checkpoint of this task's networks ({first}). Check --task.") from None
         self.current_learning_iteration += 1
         return infos
+
+    def _check_networks(self) -> None:
+        """See whether the networks have outputs: a weight that the file can hold may be none in single precision."""
+        sizes = self.env.unwrapped.observation_manager.group_obs_dim
+        observations = {name: torch.ones(1, *size, device=self.device) for name, size in sizes.items()}
+        for network in (self.alg.actor, self.alg.critic):
+            with torch.inference_mode():
+                values = [*network.state_dict().values(), network(TensorDict(observations, batch_size=[1]))]
+            if not all(bool(value.isfinite().all()) for value in values):
+                raise ValueError("what they say is not finite")
 
     def _env_state(self) -> dict[str, Any]:
         return {"command_scale": {name: term.scale for name, term in self._velocity_commands().items()}}

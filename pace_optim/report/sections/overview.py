@@ -97,6 +97,9 @@ def _worst_joint(result: FitResult) -> tuple[str, float]:
     return max(((joint, value) for joint, value in errors.items() if joint != ALL), key=lambda item: item[1])
 
 
+_PARTS = ("train", "validation")
+
+
 def _figures(result: FitResult) -> Markup:
     """The handful of numbers that everyone asks for."""
     worst, error = _worst_joint(result)
@@ -114,6 +117,9 @@ def _figures(result: FitResult) -> Markup:
         ("Score", f"{result.score:.2e}", units_for("rad², sum over the joints", result.joint_types)),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
+    if result.objective:
+        own, kept = ("–" if part is None else f"{part:.2e}" for part in map(result.objective.get, _PARTS))
+        figures.insert(5, ("Objective", own, f"in training, {kept} in validation"))
     return html(
         '<dl class="figures">{% for name, value, about in figures %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd>'
         "<dd class='small'>{{ about }}</dd></div>{% endfor %}</dl>",

@@ -7,6 +7,8 @@ from pace_actuators.joint_units import units_for
 from ..markup import Section, figure
 from ..run_data import RunData
 
+_SQUARED = "the squared error, summed over the joints"
+
 
 def scores(run: RunData) -> Section | None:
     """The score over iterations, simulated steps or time."""
@@ -25,7 +27,8 @@ def scores(run: RunData) -> Section | None:
         ("refinement, best", history.refine_best, "var(--simulated)", False),
     ]
     curves = [curve for curve in curves if curve[1]]
-    unit = units_for("rad²", run.result.joint_types)
+    own = run.result.optimizer if run.result.objective else None
+    unit = "" if own else units_for("rad²", run.result.joint_types)
     mode = "lines+markers" if len(search) + len(refine) < 80 else "lines"
     data = [
         {
@@ -50,12 +53,12 @@ def scores(run: RunData) -> Section | None:
     ]
     layout = {
         "xaxis": {"title": {"text": axes["Iterations"][2]}},
-        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": f"score [{unit}]"}},
+        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": "objective" if own else f"score [{unit}]"}},
         "hovermode": "x unified",
     }
     return Section(
         id="scores",
         title="Score",
-        lead="Mean over the training samples of the squared error, summed over the joints.",
+        lead=f"Mean over the training samples of {f'the objective {own}' if own else _SQUARED}.",
         html=figure("score", data, layout, views=views),
     )
