@@ -21,6 +21,9 @@ BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
 NOT_NEGATIVE = ("armature", "viscous_friction", "friction", "delay")
 """Parameters of which no value is below 0."""
 
+_ABOVE_ZERO = ("saturation_effort", "velocity_limit")
+"""Limits that make a torque-speed line, which has a slope."""
+
 CURE = "Fit again."
 
 _LONGEST = 100.0
@@ -91,6 +94,11 @@ class DriveResult:
             for key, value in self.parameters[name].items():
                 if value < 0:
                     refuse(source, f"{name} of {key} is {value:g}, expected at least 0", CURE)
+        for name, values in self.drive.items():
+            for key, value in values.items():
+                if value < 0 or (value == 0 and name in _ABOVE_ZERO):
+                    bound = "above 0" if name in _ABOVE_ZERO else "of at least 0"
+                    refuse(source, f"drive/{name} of {key} is {value:g}, expected a number {bound}", CURE)
         if not 0 <= self.delay_s <= _LONGEST:
             refuse(source, f"delay_s is {self.delay_s:g}, expected 0 to {_LONGEST:g} [s]", CURE)
         if not 1e-9 < self.physics_dt <= self.control_dt * (1 + 1e-6) <= _LONGEST:

@@ -245,6 +245,9 @@ def test_a_run_that_cannot_be_resumed(name, content, expected, fails, finished, 
         ("delay_s", -1.0, "delay_s is -1"),
         ("delay_s", 1e308, "delay_s is 1e+308"),
         ("parameters/friction", {"all": -1.0}, "friction of all is -1"),
+        ("drive", {"velocity_limit": {"servo": -1.0}}, "drive/velocity_limit of servo is -1"),
+        ("drive", {"saturation_effort": {"servo": 0.0}}, "drive/saturation_effort of servo is 0"),
+        ("drive", {"damping": {"servo": -1.0}}, "drive/damping of servo is -1"),
     ],
 )
 def test_a_result_that_no_drive_can_have_is_told_with_its_file(key, value, expected, finished, tmp_path):

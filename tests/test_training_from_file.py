@@ -46,6 +46,21 @@ def walker(mesh="package://walker/meshes/box.obj"):
     return text + "</robot>"
 
 
+MJCF = """
+<mujoco>
+  <asset><mesh name="ball" vertex="{}"/></asset>
+  <default><default class="seen"><geom contype="0" conaffinity="0"/></default></default>
+  <worldbody>
+    <body name="trunk"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+      <geom type="mesh" mesh="ball"/><geom type="mesh" mesh="ball" class="seen"/>
+      <body name="leg"><joint name="hip" axis="0 1 0"/><geom name="leg" size="0.01"/><geom size="0.02"/></body>
+    </body>
+    {}
+  </worldbody>
+</mujoco>
+"""
+
+
 @pytest.fixture
 def folder(tmp_path):
     """``walker/urdf/robot.urdf`` and ``walker/meshes/box.obj``, a cube of 1 m with a hole in its surface."""
@@ -82,6 +97,14 @@ def test_a_urdf_of_meshes_stands_on_its_feet_in_a_velocity_task(folder):
     env.close()
 
 
+def test_a_base_that_the_file_has_turned_and_raised_stands_as_it_is_turned(tmp_path):
+    text = MJCF.format("0 0 0 0.2 0 0 0 0.2 0 0 0 0.2", "").replace('"trunk"', '"trunk" pos="0 0 3" euler="0 0 90"')
+    (tmp_path / "robot.xml").write_text(text)
+    state = robot_cfg_from_model(tmp_path / "robot.xml").init_state
+    assert state.rot == pytest.approx((0.5**0.5, 0.0, 0.0, 0.5**0.5))
+    assert 0.0 < state.pos[2] < 0.1  # of the ball's centre, not 3 m
+
+
 def test_meshes_are_kept_only_where_something_touches(folder):
     path = folder / "robot.urdf"
     alone, touching = (read_model_file(path, touches=t).spec.compile() for t in (False, True))
@@ -103,21 +126,6 @@ def test_meshes_that_cannot_touch_are_told(folder, name):
     (folder.parent / "meshes" / "box.dae").write_text("<COLLADA/>")
     with pytest.warns(UserWarning, match=rf"Nothing touches its collision meshes {name}.*\.stl"):
         load_robot_spec(ArticulationCfg(mjcf_path=folder / "robot.urdf"), touches=True)
-
-
-MJCF = """
-<mujoco>
-  <asset><mesh name="ball" vertex="{}"/></asset>
-  <default><default class="seen"><geom contype="0" conaffinity="0"/></default></default>
-  <worldbody>
-    <body name="trunk"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
-      <geom type="mesh" mesh="ball"/><geom type="mesh" mesh="ball" class="seen"/>
-      <body name="leg"><joint name="hip" axis="0 1 0"/><geom name="leg" size="0.01"/><geom size="0.02"/></body>
-    </body>
-    {}
-  </worldbody>
-</mujoco>
-"""
 
 
 def test_expressions_name_geoms_or_else_bodies(tmp_path):

@@ -180,12 +180,11 @@ def robot_cfg_from_model(
     own = resolve_joint_values(dict(joint_pos or {}), names, field="joint_pos", default=math.nan).tolist()
     stated = {re.escape(name): value for name, value in zip(names, own, strict=True) if not math.isnan(value)}
     stance = {**dict(robot.init_state.joint_pos), **stated}  # type: ignore[arg-type]
-    state = replace(robot.init_state, joint_pos=stance)
-    return replace(robot, init_state=replace(state, pos=(0.0, 0.0, _height_on_ground(robot, stance))))
+    return replace(robot, init_state=_on_ground(robot, stance))
 
 
-def _height_on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> float:
-    """Height of the base at which the lowest colliding geom touches the ground [m]; 0 if nothing collides."""
+def _on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> InitialStateCfg:
+    """A stance whose lowest colliding geom touches the ground; the base's origin is on it if nothing collides."""
     at_origin = replace(robot, fix_base=True, init_state=InitialStateCfg(rot=robot.init_state.rot))
     with warnings.catch_warnings(action="ignore"):  # those who build the environment are told
         spec = load_robot_spec(at_origin, touches=True)
@@ -199,7 +198,10 @@ def _height_on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> fl
     colliding = model.geom_contype | model.geom_conaffinity
     own = [g for g in range(model.ngeom) if colliding[g] and model.geom_bodyid[g]]
     above = [mujoco.mj_geomDistance(model, data, ground.id, g, 2 * depth, None) for g in own]
-    return depth - min(above, default=depth)
+    base = data.body(1)
+    w, x, y, z = base.xquat.tolist()
+    height = float(base.xpos[2]) + depth - min(above) if above else 0.0
+    return InitialStateCfg(pos=(0.0, 0.0, height), rot=(w, x, y, z), joint_pos=dict(stance))
 
 
 def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous: bool) -> PaceDCMotorCfg:

@@ -42,9 +42,10 @@ def leave_out_meshes(spec: mujoco.MjSpec, path: Path, *, touches: bool = False) 
     for mesh in list(spec.meshes):
         if (name := mesh.name or Path(mesh.file).stem) not in used:
             spec.delete(mesh)
-        elif touches and name not in weighed:
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # of no mass: its surface may have holes
+        elif touches:
             mesh.maxhullvert = mesh.maxhullvert if mesh.maxhullvert > 0 else _HULL_VERTICES
+            if name not in weighed:
+                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # of no mass: its surface may have holes
     _delete_references(spec, gone - {""})
     notes = []
     if missing:
