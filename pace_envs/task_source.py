@@ -82,7 +82,7 @@ class EnvironmentRecord:
             folder: Where relative paths begin; ``None`` means the present folder.
         """
         module = None if is_model_file(task) else split_reference(task)[0] or registered_by(task)
-        files = model_files(Path(cfg.scene.robot.mjcf_path).resolve())
+        files = model_files(Path(cfg.scene.robot.mjcf_path).resolve(), touches=cfg.scene.terrain is not None)
         code = code_of([*([module] if module else []), *effects])
         trust(entry["sha256"] for entry in code.values())  # it runs here already
         return cls(
@@ -155,15 +155,15 @@ class EnvironmentRecord:
         return cfg
 
 
-def model_files(path: Path) -> list[Path]:
-    """A model file and what it includes and needs, as far as it is there."""
+def model_files(path: Path, *, touches: bool = False) -> list[Path]:
+    """A model file and what it includes and needs, as far as it is there; with the meshes that touch, or without."""
     found = [path]
     for file in found:
         for name in _included(file):
             if (each := (path.parent / name).resolve()).is_file() and each not in found:
                 found.append(each)
     try:
-        spec = read_model_file(path).spec  # less the meshes that the dynamics do not need
+        spec = read_model_file(path, touches=touches).spec  # less the meshes that are not needed
     except (ValueError, OSError):
         return found
     meshes = [path.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file]

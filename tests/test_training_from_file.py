@@ -10,6 +10,7 @@ from pace_envs import ArticulationCfg, ManagerBasedRLEnv, registration
 from pace_envs.from_model import robot_cfg_from_model
 from pace_envs.model_file import read_model_file
 from pace_envs.robot_spec import find_geoms, load_robot_spec
+from pace_envs.task_source import model_files
 from pace_envs.tasks.reach import reach_env_cfg
 from pace_envs.tasks.reach.terms import site_position
 from pace_envs.tasks.velocity import add_randomization, velocity_env_cfg, velocity_rewards
@@ -109,6 +110,7 @@ def test_meshes_are_kept_only_where_something_touches(folder):
     path = folder / "robot.urdf"
     alone, touching = (read_model_file(path, touches=t).spec.compile() for t in (False, True))
     assert (alone.nmesh, alone.ngeom) == (0, 0) and touching.ngeom == 6
+    assert [file.name for file in model_files(path, touches=True)] == ["robot.urdf", "box.obj"]
     assert touching.body_mass.tolist() == alone.body_mass.tolist()
     assert touching.body_inertia.tolist() == alone.body_inertia.tolist()
 
