@@ -9,7 +9,9 @@ import torch
 from pace_envs import ArticulationCfg, ManagerBasedRLEnv, registration
 from pace_envs.from_model import robot_cfg_from_model
 from pace_envs.model_file import read_model_file
+from pace_envs.rendering import drawn
 from pace_envs.robot_spec import find_geoms, load_robot_spec
+from pace_envs.robots import go2_cfg
 from pace_envs.task_source import model_files
 from pace_envs.tasks.reach import reach_env_cfg
 from pace_envs.tasks.reach.terms import site_position
@@ -150,6 +152,19 @@ def test_a_file_with_several_bases_is_told_where_one_is_to_float(tmp_path):
     (tmp_path / "robot.xml").write_text(MJCF.format("0 0 0 1 0 0 0 1 0 0 0 1", '<body name="table"/>'))
     with pytest.raises(ValueError, match=r"one body without a joint in the world, found trunk, table\. Give the base"):
         load_robot_spec(ArticulationCfg(mjcf_path=tmp_path / "robot.xml", fix_base=False))
+
+
+def test_bodies_whose_meshes_are_left_out_show_what_collides():
+    """A film of a public robot was of one colour: its collision geoms are in a group that MuJoCo does not draw."""
+    text = '<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" group="4"/>{}</worldbody></mujoco>'
+    bodies = (
+        '<body><geom name="alone" size="1" group="3"/></body><body><geom size="1"/><geom name="b" size="1" group="3"/>'
+    )
+    model = drawn(mujoco.MjModel.from_xml_string(text.format(bodies + "</body>")))
+    assert [int(model.geom(name).group[0]) for name in ("floor", "alone", "b")] == [2, 2, 3]
+    shipped = load_robot_spec(go2_cfg()).compile()
+    before = shipped.geom_group.tolist()
+    assert drawn(shipped).geom_group.tolist() == before
 
 
 def test_a_body_of_an_arm_reaches(folder):

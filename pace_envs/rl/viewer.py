@@ -9,6 +9,7 @@ import time
 import mujoco
 import torch
 
+from pace_envs.rendering import drawn
 from pace_envs.rl.evaluation import Policy
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 
@@ -25,7 +26,7 @@ def watch(env: RslRlVecEnvWrapper, policy: Policy) -> None:
     from mujoco import viewer
 
     base = env.unwrapped
-    model = base.sim.model_of(0)
+    model = drawn(base.sim.model_of(0))
     data = mujoco.MjData(model)
     obs, _ = env.reset()
     with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
