@@ -32,7 +32,7 @@ from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.recordings import read_all, tell_on_stderr
+from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques
 from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
@@ -187,6 +187,7 @@ def load_problem(
     effects: Sequence[EffectCfg | str] = (),
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
+    joints: str | None = None,
     columns: str | Path | None = None,
     rate: float | None = None,
     strict: bool = False,
@@ -208,6 +209,7 @@ def load_problem(
         unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
+        joints: Regular expression of the joints to identify; the others are held. ``None``: those of the recordings.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
@@ -225,6 +227,12 @@ def load_problem(
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
     cfg.prepare()
     control_dt = cfg.sim.dt * cfg.decimation
+    logs = _logs(cfg, data, validation, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
+    cfg = cfg.holding(logs.held)
+    cfg.prepare()
+    if logs.note:
+        cfg.sim2real.notes = (*cfg.sim2real.notes, logs.note)
+        tell(f"note: {logs.note}")
     set_control_step(cfg)
     drives = cfg.scene.robot.actuators.values()
     for drive in drives:
@@ -243,10 +251,7 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings, held_out = (
-        read_all(paths, env, control_dt, columns=columns, rate=rate, strict=strict, tell=tell)
-        for paths in (data or [cfg.sim2real.recording], validation)
-    )
+    recordings, held_out = (conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups)
     recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
@@ -297,6 +302,21 @@ def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
     """Set the period of all drives' loops [s]; 0: they run continuously."""
     for drive in cfg.scene.robot.actuators.values():
         drive.drive_dt, drive.implicit = drive_dt or None, drive_dt == 0
+
+
+def _logs(
+    cfg: PaceSim2realEnvCfg, data: Sequence[str | Path], validation: Sequence[str | Path], **options: Any
+) -> Logs:
+    """The recordings as their files have them, and which joints of the robot they are of."""
+    whole = copy.deepcopy(cfg)
+    whole.scene.num_envs = 1
+    set_control_step(whole)
+    set_drive_rate(whole)
+    env = ManagerBasedRLEnv(whole)
+    try:
+        return read_logs((data or [cfg.sim2real.recording], validation), env, **options)
+    finally:
+        env.close()
 
 
 def _read_torques(

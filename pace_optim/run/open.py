@@ -93,7 +93,7 @@ class Run:
         """
         settings = self.settings
         if data:
-            own = {"data": [str(path) for path in data], "validation": []}
+            own = {"data": [str(path) for path in data], "validation": [], "joints": ".*"}
             settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
             drive_dt = self.told_drive_dt if settings.drive_dt is None else settings.drive_dt
@@ -152,6 +152,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         effects=settings.effects,
         unknown=settings.unknown,
         env_cfg=env_cfg,
+        joints=settings.joints,
         columns=settings.columns,
         rate=settings.rate,
         strict=settings.strict,
