@@ -16,6 +16,7 @@ from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
+from pace_optim.run.tensors import read_bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +104,8 @@ class Run:
             if data or str(self.folder) in str(error):
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
+        if data:  # other recordings have other bounds; the run's values must be within
+            problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)
 
     @property

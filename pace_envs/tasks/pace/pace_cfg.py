@@ -116,6 +116,9 @@ class PaceCfg(Config):
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
 
+    joint_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Between which positions each joint moves [rad, of slides m]: its limits, else where recordings have it."""
+
     assumed_gains: tuple[str, ...] = ()
     """Joints whose gains nobody has stated: those of their drives are assumed."""
 
@@ -178,6 +181,7 @@ class PaceCfg(Config):
             start_params=_of_joints(self.start_params, names),
             effect_bounds=_of_joints(self.effect_bounds, names),
             slide_joints=tuple(name for name in self.slide_joints if name in names),
+            joint_ranges={name: each for name, each in self.joint_ranges.items() if name in names},
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             extra_parameters=(),
