@@ -118,6 +118,9 @@ class EnvironmentRecord:
         ):
             if key in values and not isinstance(values[key], kind):
                 raise TypeError(f"environment.{key} is {values[key]!r}")
+        held = values.get("held_joints", {})
+        if not all(isinstance(place, (int, float)) for place in held.values()):
+            raise TypeError(f"environment.held_joints is {held!r}")
         checked_record(content)
         return cls(**{"task": task} | values)
 
@@ -157,7 +160,7 @@ class EnvironmentRecord:
         path = Path(cfg.scene.robot.mjcf_path)
         if self.folder and not path.is_absolute() and not path.is_file():
             cfg.scene.robot.mjcf_path = Path(self.folder) / path
-        return cfg.holding(self.held_joints) if self.held_joints else cfg
+        return cfg.holding(self.held_joints) if self.held_joints and hasattr(cfg, "holding") else cfg
 
 
 def model_files(path: Path) -> list[Path]:

@@ -144,7 +144,7 @@ def test_joints_that_move_without_a_command_are_held_only_if_one_asks_for_it(duo
         duo({LEFT: MOTION, RIGHT: MOTION})
     problem = duo({LEFT: MOTION, RIGHT: MOTION}, joints="left.*")
     assert problem.joint_names == (LEFT,)
-    assert any("they move (right_elbow" in note for note in problem.env_cfg.sim2real.notes)
+    assert any("some move (right_elbow" in note for note in problem.env_cfg.sim2real.notes)
 
 
 def test_of_joints_that_all_move_those_asked_for_are_identified(duo):
@@ -165,6 +165,13 @@ def test_a_run_knows_where_its_joints_were_held(duo):
     assert again.sim2real.joint_order == (LEFT,)
     assert again.scene.robot.held_joints == held(problem)
     assert again.sim2real.excitation.scale and set(again.sim2real.sample_params["armature"]) == {LEFT}
+
+
+def test_a_record_whose_joints_are_held_at_no_number_is_damaged(duo):
+    problem = duo({LEFT: MOTION})
+    content = EnvironmentRecord.of(problem.task, problem.env_cfg).to_dict() | {"held_joints": {WAIST: "here"}}
+    with pytest.raises(TypeError, match="held_joints"):
+        EnvironmentRecord.read(content, problem.task)
 
 
 def test_names_without_a_side_are_those_asked_for(duo, tmp_path, monkeypatch):

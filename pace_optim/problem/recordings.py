@@ -224,9 +224,9 @@ def _held(
         if not logged
         else f"where the recordings have them ({listed(logged, 3)}) or the robot begins"
     )
-    note = f"{len(held)} joints are held, {where}: {listed(places, 3)}."
+    note = f"{len(held)} {'joint is' if len(held) == 1 else 'joints are'} held, {where}: {listed(places, 3)}."
     if moving:
-        note += f" In the recordings they move ({listed(moving, 3)}): what that does to the others is not simulated."
+        note += f" In the recordings some move ({listed(moving, 3)}): what that does to the others is not simulated."
     return held, note
 
 
