@@ -244,15 +244,8 @@ def load_problem(
         raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
     cfg.prepare()
     control_dt = cfg.sim.dt * cfg.decimation
-    logs = _logs(cfg, data, validation, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
-    cfg = cfg.holding(logs.held)
-    cfg.prepare()
-    if logs.note:
-        cfg.sim2real.notes = (*cfg.sim2real.notes, logs.note)
-        tell(f"note: {logs.note}")
     set_control_step(cfg)
-    drives = cfg.scene.robot.actuators.values()
-    for drive in drives:
+    for drive in cfg.scene.robot.actuators.values():
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.largest_delay < longest:
@@ -260,6 +253,12 @@ def load_problem(
                 f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
                 f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
+    logs = _logs(cfg, data, validation, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
+    cfg = cfg.holding(logs.held)
+    cfg.prepare()
+    if logs.note:
+        cfg.sim2real.notes = (*cfg.sim2real.notes, logs.note)
+        tell(f"note: {logs.note}")
     if drive_dt is not None:
         _set_drive_dt(cfg, drive_dt)
     cfg.scene.num_envs = 1
@@ -308,7 +307,7 @@ def load_problem(
         dataset=make_dataset(recordings, held_out),
         space=space,
         trees=trees,
-        delay_mode=next(iter(drives)).delay_mode,
+        delay_mode=next(iter(plain.scene.robot.actuators.values())).delay_mode,
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
@@ -331,7 +330,6 @@ def _logs(
     """The recordings as their files have them, and which joints of the robot they are of."""
     whole = copy.deepcopy(cfg)
     whole.scene.num_envs = 1
-    set_control_step(whole)
     set_drive_rate(whole)
     env = ManagerBasedRLEnv(whole)
     try:
