@@ -158,12 +158,15 @@ def test_a_joint_of_another_name_is_not_a_joint_that_the_log_has_not(duo):
         duo({LEFT: MOTION, WAIST: 0.0, "rigth_elbow": MOTION}, targets=(LEFT, WAIST, "rigth_elbow"))
 
 
-def test_a_run_knows_where_its_joints_were_held(duo):
+def test_a_run_knows_where_its_joints_were_held(duo, tmp_path):
     problem = duo({LEFT: MOTION, RIGHT: 0.7})
     record = EnvironmentRecord.of(problem.task, problem.env_cfg)
     again = EnvironmentRecord.read(record.to_dict(), problem.task).load_cfg("settings.json")
     assert again.sim2real.joint_order == (LEFT,)
     assert again.scene.robot.held_joints == held(problem)
+    opened = load_problem(problem.task, data=[tmp_path / "log.npz"], env_cfg=again, tell=lambda _: None)
+    assert opened.joint_names == (LEFT,) and held(opened) == held(problem)
+    assert any("Held as before: " in note and "right_elbow at 0.7" in note for note in opened.env_cfg.sim2real.notes)
     assert again.sim2real.excitation.scale and set(again.sim2real.sample_params["armature"]) == {LEFT}
 
 

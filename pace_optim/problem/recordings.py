@@ -215,7 +215,8 @@ def _held(
             "are then held where they are in the median."
         )
     if not held:
-        return held, ""
+        before = [f"{name} at {value:.3g}" for name, value in env.cfg.scene.robot.held_joints.items()]
+        return held, f"Held as before: {listed(before, 3)}." if before else ""
     places = [f"{name} at {units_for(f'{value:.3g} rad', [types[name]])}" for name, value in held.items()]
     where = (
         "where the recordings have them"
