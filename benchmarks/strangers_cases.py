@@ -184,10 +184,17 @@ def run(name: str, row: Row, cases: Path, folder: Path) -> None:
     done.write_text(json.dumps(content, indent=1))
 
 
+def without_paths(row: Row, said: str) -> str:
+    """What was said, with files named by their own names: a folder's name says what is wrong in it."""
+    for name in (row.task, *row.data, *row.validation):
+        said = re.sub(rf"\S*{re.escape(name)}", Path(name).name, said) if name else said
+    return said
+
+
 def judged(row: Row, content: dict) -> list[str]:
     """What is wrong with what was found, nothing if it is right."""
     wrong = []
-    said, code, found = content["said"], content["code"], content["found"]
+    said, code, found = without_paths(row, content["said"]), content["code"], content["found"]
     refused = code == 2 and len(said.strip().splitlines()) >= 1 and "fault of the program" not in said
     if "fault of the program" in said or "Traceback" in said:
         wrong.append("crash")
@@ -233,7 +240,7 @@ def table(folder: Path) -> str:
 
 def _said(row: Row, content: dict) -> str:
     """The line that says what must be said, or the last error or warning."""
-    lines = content["said"].splitlines()
+    lines = without_paths(row, content["said"]).splitlines()
     told = [line for line in lines if row.says and re.search(row.says, line)]
     told = told or [line for line in lines if line.startswith(("error:", "warning:"))]
     return told[0].strip()[:160] if told else ""

@@ -62,5 +62,8 @@ class ArticulationCfg(Config):
     fix_base: bool | None = None
     """Whether the base is held in place or floats; ``None``: as in the file."""
 
+    held_joints: Mapping[str, float] = field(default_factory=dict)
+    """Joints of the model that do not move, and where they are held [rad, of slides m]: they are taken out of it."""
+
     soft_joint_pos_limit_factor: float = 1.0
     """Part of the joint range that counts as the soft limit, 0 to 1."""

@@ -22,7 +22,7 @@ from pace_actuators.trusted_code import trust
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.registration import load_env_cfg, registered_by
 
-_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt")
+_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt", "held_joints")
 
 
 def use_task(text: str) -> str:
@@ -71,6 +71,9 @@ class EnvironmentRecord:
     control_dt: float | None = None
     """Time between two commands [s] of a model file, which does not say it."""
 
+    held_joints: Mapping[str, float] = field(default_factory=dict)
+    """Joints that are held, beside those that the task itself holds, and where [rad, of slides m]."""
+
     @classmethod
     def of(cls, task: str, cfg: Any, effects: Iterable[str] = (), folder: str | None = None) -> EnvironmentRecord:
         """The record of a task that is known.
@@ -92,6 +95,7 @@ class EnvironmentRecord:
             code=code,
             files={str(file): file_digest(file) for file in files},
             control_dt=cfg.sim.dt * cfg.decimation if is_model_file(task) else None,
+            held_joints=dict(cfg.scene.robot.held_joints),
         )
 
     @classmethod
@@ -110,9 +114,13 @@ class EnvironmentRecord:
             ("folder", str),
             ("files", Mapping),
             ("control_dt", float | None),
+            ("held_joints", Mapping),
         ):
             if key in values and not isinstance(values[key], kind):
                 raise TypeError(f"environment.{key} is {values[key]!r}")
+        held = values.get("held_joints", {})
+        if not all(isinstance(place, (int, float)) for place in held.values()):
+            raise TypeError(f"environment.held_joints is {held!r}")
         checked_record(content)
         return cls(**{"task": task} | values)
 
@@ -152,7 +160,7 @@ class EnvironmentRecord:
         path = Path(cfg.scene.robot.mjcf_path)
         if self.folder and not path.is_absolute() and not path.is_file():
             cfg.scene.robot.mjcf_path = Path(self.folder) / path
-        return cfg
+        return cfg.holding(self.held_joints) if self.held_joints and hasattr(cfg, "holding") else cfg
 
 
 def model_files(path: Path, *, touches: bool = False) -> list[Path]:

@@ -169,6 +169,20 @@ def test_the_ladder_is_in_the_last_run_alone(tmp_path):
     assert "stribeck_friction" in text and "3.00, 3.00" in text and "noise floor" in text
 
 
+def test_the_error_is_split_by_recording_and_by_the_drive_s_state(bench):
+    run, _ = bench
+    content = compare([run])
+    lines = comparison_lines(content)
+    start = next(i for i, line in enumerate(lines) if line.startswith("recording"))
+    assert [line.split()[0] for line in lines[start + 1 : start + 4]] == ["first", "again", "heavy"]
+    heavy = content["joints"]["servo"]["recordings"][2]["rmse"]
+    assert float(lines[start + 3].split()[1]) == pytest.approx(1e3 * next(iter(heavy.values())), rel=0.3)
+    assert not any(line.startswith("drive") for line in lines)  # it is never off
+    content["joints"]["servo"]["where"]["drive"] = {"rms": [0.002, 0.001]}
+    off, on = comparison_lines(content)[(i := lines.index("", start)) + 2 : i + 4]
+    assert off.split() == ["off", "2.00", "2.00", "servo"] and on.split() == ["on", "1.00", "1.00", "servo"]
+
+
 # ---------------------------------------------------------------- the command line
 
 

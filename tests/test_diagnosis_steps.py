@@ -191,7 +191,7 @@ def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):
 def two_joints(bench):
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
-    bounds = {side: getattr(one, side).repeat(2, 1) for side in ("lower", "upper")}
+    bounds = {side: getattr(one, side).repeat(2, 1) for side in ("lower", "upper", "ranges")}
     return replace(one, has=none, slides=one.slides.repeat(2), **bounds)
 
 

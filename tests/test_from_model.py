@@ -13,6 +13,7 @@ import torch
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
+from pace_envs.from_model.robot import read_robot
 from pace_envs.model_file import limits, read_model_file
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.commands.new_robot import main as new_robot
@@ -400,3 +401,37 @@ def test_a_model_that_takes_too_long_or_too_much_memory_is_refused(head, body, m
         read_model_file(path)
     path.write_text(f"<mujoco><worldbody>{joint}</worldbody></mujoco>")
     assert read_model_file(path).spec.joint("hinge") is not None
+
+
+BESIDE = """
+<mujoco>
+  <option density="1.2" wind="1 0 0"/>
+  <worldbody>
+    <body>
+      <joint name="lift" axis="0 1 0" stiffness="3"/>
+      <geom size=".1" mass="1"/>
+      <body pos="0 0 .2"><joint name="flap" axis="0 1 0"/><geom size=".05" mass=".2"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift" gear="-9" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_what_acts_beside_the_drives_is_told(tmp_path):
+    (tmp_path / "robot.xml").write_text(BESIDE)
+    notes = "\n".join(read_robot(tmp_path / "robot.xml").notes)
+    assert "no drive: flap" in notes and "free to move" in notes
+    assert "stiffness lift 3" in notes
+    assert "density 1.2, wind 1 0 0 m/s" in notes
+    assert "gears: lift -9" in notes and "negative gear: lift" in notes
+
+
+def test_an_mjcf_s_impossible_inertia_is_told_with_its_body_and_no_word_of_meshes(tmp_path):
+    inertial = '<inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 .5"/><geom type="mesh" mesh="m"/>'
+    body = f'<body name="shin"><joint name="j" axis="0 1 0"/>{inertial}</body>'
+    asset = '<asset><mesh name="m" file="nowhere.stl"/></asset>'
+    (tmp_path / "robot.xml").write_text(f"<mujoco>{asset}<worldbody>{body}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match=r"inertia that is stated for shin.*balanceinertia") as refused:
+        read_robot(tmp_path / "robot.xml")
+    assert "mesh" not in str(refused.value)

@@ -2,14 +2,21 @@
 
 import json
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import TRUTH, chirp, record
+from scipy.signal import savgol_filter
 
+import pace_optim.fit as fit_module
+from pace_optim.fit import fit_with_torques
 from pace_optim.measured_effort import read_drives, read_law
 from pace_optim.problem.problem import load_problem
-from pace_optim.recording import Drive, Recording, conform_recording
+from pace_optim.recording import Drive, Recording, conform_recording, save_recording
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.progress import ProgressLine
 
 BENCH, DT = "Pace-TestBench-v0", 0.0025
 CASE = Path(__file__).parents[2] / "shared/cases/bench/measured_effort_and_speed.csv"
@@ -250,3 +257,27 @@ def test_a_log_at_another_rate_than_the_drive_is_read_at_its_own_samples():
     law = read_law(conform_recording(recording, joint_order=("servo",), control_dt=DT), 0, 10)
     assert law.stiffness == pytest.approx(40, rel=0.03) and law.damping == pytest.approx(1, rel=0.03)
     assert 2 - law.resolution <= law.delay <= 2 + law.resolution
+
+
+def test_a_gain_that_torques_contradict_is_used_where_it_fits_better(tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_module, "write_report", lambda folder: None)
+    kp, kd, delay, stated = 85.0, 0.6, 2, 60.0
+    made = record(target := chirp(2.0), TRUTH | {"delay": float(delay)}, noise=1e-4)
+    q, late = made.dof_pos, np.maximum(np.arange(len(target)) - delay, 0)
+    speed = savgol_filter(q, 9, 3, deriv=1, delta=DT, axis=0)
+    gains = Drive(stiffness=np.array([stated]), damping=np.array([kd]))
+    made = replace(made, dof_effort=kp * (target[late] - q) - kd * speed, drive=gains)
+    save_recording(tmp_path / "log.npz", made)
+    told = StringIO()
+    settings = FitSettings(
+        task=BENCH,
+        data=[str(tmp_path / "log.npz")],
+        optimizer="least_squares",
+        check_consistency=False,
+        log_dir=str(tmp_path),
+    )
+    result, folder = fit_with_torques(settings, ProgressLine(told))
+    assert "they are used" in told.getvalue() and len(list(folder.parent.iterdir())) == 2
+    assert result.parameters["armature"]["servo"] == pytest.approx(0.1, rel=0.05)
+    assert result.rmse["train"]["all"] < 2e-4
+    assert "stiffness" in FitSettings.load(folder / "settings.json")[0].unknown

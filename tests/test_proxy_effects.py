@@ -114,7 +114,8 @@ def test_an_effect_that_leaves_little_once_its_size_may_differ_is_there_and_depe
 def four_joints(problem):
     """A search on joints near the floor, one of which got a spring that brings it there."""
     one = JointModel.base(problem)
-    four = {"lower": one.lower.expand(4, -1), "upper": one.upper.expand(4, -1), "slides": one.slides.expand(4)}
+    four = {side: getattr(one, side).expand(4, -1) for side in ("lower", "upper", "ranges")}
+    four["slides"] = one.slides.expand(4)
     model = replace(one, has=torch.zeros(0, 4, dtype=torch.bool), **four)
     values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
     base = Fitted.start(model, values)

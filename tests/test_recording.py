@@ -281,6 +281,7 @@ DEGREES = 180.0 / np.pi
         ({}, {"joint_order": ("hip", "knee")}, ["'ankle'", "3 joints", "the robot has 2"]),
         ({}, {"joint_order": (*JOINTS, "toe")}, ["no column for toe", "3 joints", "the robot has 4"]),
         ({"joint_names": ()}, {"joint_order": ("hip", "knee")}, ["3 joints", "2 (hip, knee)"]),
+        ({"des_dof_pos": recording().des_dof_pos * [1, np.nan, 1]}, {}, ["knee: no command", "--joints"]),
         ({}, {"joint_order": ("hip", "hip", "knee")}, ["joint_order names a joint twice"]),
         ({}, {"control_dt": 0.0}, ["control_dt is 0.0"]),
         ({"dof_pos": recording().dof_pos + 1.0}, {}, ["dof_pos of", "limits", "column order"]),

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
 
+from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
 from pace_optim.report import write_report
-from pace_optim.report.motion import motions_of, scene_of
+from pace_optim.report.motion import looks_of, motions_of, scene_of
 from pace_optim.report.motion.window import add_ghost
 from pace_optim.report.run_data import RecordingData
 
@@ -147,22 +148,73 @@ def test_a_joint_that_the_model_does_not_have_is_told_of():
         motions_of(mujoco.MjModel.from_xml_string(LEG), ["elbow"], [recording(1)], [0.0])
 
 
-def test_a_fine_mesh_is_drawn_as_its_hull():
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(300, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    points = np.concatenate([points, 0.2 * rng.normal(size=(4000, 3))])
+def ball(rings: int = 80) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a ball of 0.1 m."""
+    up, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, rings), indexing="ij")
+    points = 0.1 * np.stack([np.sin(up) * np.cos(around), np.sin(up) * np.sin(around), np.cos(up)], axis=-1)
+    i, j = (each.ravel() for each in np.meshgrid(np.arange(rings - 1), np.arange(rings - 1), indexing="ij"))
+    a = i * rings + j
+    faces = np.concatenate([np.stack([a, a + rings, a + 1], 1), np.stack([a + 1, a + rings, a + rings + 1], 1)])
+    return points.reshape(-1, 3), faces
+
+
+def test_a_fine_mesh_is_drawn_with_fewer_triangles():
+    vertices, faces = ball()
     spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="blob", uservert=(0.1 * points).ravel().tolist())
-    mesh.userface = rng.integers(0, 4000, size=3 * 3000).tolist()
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    body = spec.worldbody.add_body(name="ball")
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="blob")
-    model = spec.compile()
-    (geom,) = scene_of(model)["geoms"]
-    vertices = np.array(geom["vertices"]).reshape(-1, 3)
-    assert geom["shape"] == "mesh" and max(geom["faces"]) < len(vertices) < 400
-    assert np.linalg.norm(vertices, axis=1) == pytest.approx(0.1, abs=0.06)
+    mesh = spec.add_mesh(name="ball", uservert=vertices.ravel().tolist(), userface=faces.ravel().tolist())
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    spec.worldbody.add_body(name="ball").add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="ball")
+    (geom,) = scene_of(spec.compile())["geoms"]
+    drawn, triangles = np.array(geom["vertices"]).reshape(-1, 3), np.array(geom["faces"]).reshape(-1, 3)
+    assert geom["shape"] == "mesh" and triangles.max() < len(drawn) and 500 < len(triangles) <= 1500
+    assert np.linalg.norm(drawn, axis=1) == pytest.approx(0.1, abs=0.005)
+
+
+BARE = """
+<mujoco>
+  <worldbody>
+    <body name="base"><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+      <body name="thigh" pos="0 0.1 0"><joint name="hip" axis="0 1 0"/>
+        <inertial pos="0 0 -.1" mass="1" diaginertia=".01 .01 .01"/>
+        <body name="shin" pos="0 0 -0.3"><joint name="knee" axis="0 1 0" pos="0.02 0 0"/>
+          <inertial pos="0 0 -.2" mass="1" diaginertia=".01 .01 .01"/></body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_links_without_a_shape_have_bones_from_joint_to_joint():
+    scene = scene_of(mujoco.MjModel.from_xml_string(BARE))
+    thigh, shin = (
+        next(g for g in scene["geoms"] if scene["bodies"][g["body"]]["name"] == n) for n in ("thigh", "shin")
+    )
+    assert thigh["shape"] == shin["shape"] == "capsule"
+    assert thigh["pos"] == pytest.approx([0.01, 0, -0.15]) and thigh["size"][1] == pytest.approx(
+        0.5 * np.hypot(0.3, 0.02)
+    )
+    assert shin["pos"] == pytest.approx([0.01, 0, -0.1])  # to its centre of mass
+    assert 0.4 < scene["size"] < 0.8 and scene["center"][2] == pytest.approx(-0.25, abs=0.05)
+
+
+def test_a_urdf_s_meshes_are_drawn_though_the_dynamics_leave_them_out(tmp_path):
+    vertices, faces = ball(12)
+    rows = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "ball.obj").write_text("\n".join(rows))
+    mesh = '<visual><origin xyz="0 0 0.2" rpy="0 0 1.5708"/><geometry><mesh filename="package://bot/meshes/{}"/></geometry></visual>'
+    mass = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    joint = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/></joint>'
+    (tmp_path / "bot.urdf").write_text(
+        f'<robot name="bot"><link name="base"/><link name="arm">{mass}{mesh.format("ball.obj")}</link>'
+        f'<link name="hand">{mass}{mesh.format("gone.stl")}</link>'
+        f"{joint.format('shoulder', 'base', 'arm')}{joint.format('elbow', 'arm', 'hand')}</robot>"
+    )
+    model = read_model_file(tmp_path / "bot.urdf").spec.compile()
+    shapes = {model.body(geom["body"]).name: geom for geom in scene_of(model, looks_of(tmp_path / "bot.urdf"))["geoms"]}
+    assert shapes["arm"]["shape"] == "mesh" and shapes["arm"]["pos"][2] == pytest.approx(0.2, abs=0.01)
+    assert shapes["hand"]["shape"] == "capsule"
 
 
 def test_a_run_without_a_model_has_no_replay(tmp_path):

@@ -375,7 +375,6 @@ def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path
     ("change", "expected"),
     [
         (("= 40.0", "= -1"), "stiffness of hip is -1"),
-        (('des_dof_pos = "c2"\n', ""), "knee: no command"),
         (("[joints.knee]", "[joints.ankle]"), "has no dof_pos of knee"),
     ],
 )

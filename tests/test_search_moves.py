@@ -96,6 +96,7 @@ def base_model(n=1):
         upper=bounds,
         log=torch.zeros(len(BASE), dtype=torch.bool),
         slides=torch.zeros(n, dtype=torch.bool),
+        ranges=torch.zeros(n, 2),
     )
 
 
@@ -351,6 +352,7 @@ def test_joints_take_over_a_trimmed_fit_where_it_is_better_on_validation_recordi
             upper=bounds,
             log=torch.zeros(bounds.shape[1], dtype=torch.bool),
             slides=torch.zeros(2, dtype=torch.bool),
+            ranges=torch.zeros(2, 2),
         )
         jacobian, error = (torch.full(shape, value) for shape in ((bounds.shape[1], 3, 1, 2), (3, 1, 2)))
         return Fitted(model=model, x=value * bounds, score=score, jacobian=jacobian, error=error)

@@ -51,6 +51,13 @@ class EffectParameter:
     possible: tuple[float, float] = (-math.inf, math.inf)
     """Between what physics allows it: a bound that a search runs into is widened within."""
 
+    is_position: bool = False
+    """Whether it is a position of the joint, which is sought in all of the joint's range."""
+
+    def reaching(self, low: float, high: float) -> tuple[float, float]:
+        """Its bounds, of a position of the joint as far as the joint's range [rad] too."""
+        return (min(self.lower, low), max(self.upper, high)) if self.is_position else (self.lower, self.upper)
+
     def widest(self, friction: float = 0.0) -> tuple[float, float]:
         """Its bounds four times as far from the null, or on a logarithmic scale from each other; the null stays one.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -48,13 +48,26 @@ def read_drives(model: mujoco.MjModel) -> tuple[list[FileDrive], list[str]]:
     """
     found: dict[str, FileDrive] = {}
     notes: list[str] = []
+    gears: dict[str, float] = {}
     for i in range(model.nu):
         drive, note = _read(model, i)
         notes += [note] if note else []
         if drive is not None:
             found[drive.joint] = _both(found[drive.joint], drive) if drive.joint in found else drive
+            gears[drive.joint] = float(model.actuator_gear[i, 0])
     order = [model.joint(j).name for j in range(model.njnt)]
+    notes += _gear_notes(gears)
     return [_within_joint_limit(model, found[name]) for name in order if name in found], list(dict.fromkeys(notes))
+
+
+def _gear_notes(gears: Mapping[str, float]) -> list[str]:
+    """Where a log may have the motor's side, or the other sign, of what is the joint's here."""
+    notes = []
+    if geared := [f"{joint} {gear:g}" for joint, gear in gears.items() if abs(gear) != 1]:
+        notes.append(f"gears: {', '.join(geared)}: gains, limits, targets and torques are the joint's, not the motor's")
+    if turned := [joint for joint, gear in gears.items() if gear < 0]:
+        notes.append(f"negative gear: {', '.join(turned)}: targets and torques count in the joint's own direction")
+    return notes
 
 
 def _read(model: mujoco.MjModel, i: int) -> tuple[FileDrive | None, str]:

@@ -90,6 +90,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
             *_degrees_note(joints, file),
             *file.notes,
             *notes,
+            *_beside_drives(model, names),
             *_assumptions(joints, key, model, control_dt),
             _loop_note(joints, model, control_dt),
         ),
@@ -273,6 +274,29 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
         notes.append("the base is held in the air, and nothing touches")
+    return notes
+
+
+def _beside_drives(model: mujoco.MjModel, driven: Sequence[str]) -> list[str]:
+    """What the file lets act on the joints beside their drives: it stays in the model."""
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    follow, notes = followers(model), []
+    joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    loose = [model.joint(j).name for j in joints if j not in follow and model.joint(j).name not in driven]
+    if loose:
+        notes.append(
+            f"no drive: {_listed(loose)} (no actuator, transmission or ros2_control command): free to move. Name the "
+            "joint there if it is driven"
+        )
+    springs = {model.joint(j).name: float(np.ravel(model.jnt_stiffness[j])[0]) for j in joints}
+    if sprung := [f"{name} {value:g}" for name, value in springs.items() if value]:
+        notes.append(f"springs of the file act beside the drives: stiffness {_listed(sprung)}")
+    option = model.opt
+    medium = {"density": option.density, "viscosity": option.viscosity}
+    acting = [f"{name} {value:g}" for name, value in medium.items() if value]
+    if acting:
+        wind = [f"wind {' '.join(f'{each:g}' for each in option.wind)} m/s"] if option.wind.any() else []
+        notes.append(f"a medium of the file acts on the robot: {', '.join([*acting, *wind])}")
     return notes
 
 

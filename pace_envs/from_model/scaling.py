@@ -67,14 +67,24 @@ def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel, contr
     )
 
 
+def largest_parameters(effort: float, velocity_limit: float, *, is_slide: bool) -> dict[str, float]:
+    """What a drive has at most of armature, viscous and Coulomb friction, by its largest torque [N m] and speed."""
+    length = defaults.SLIDE_LENGTH if is_slide else 1.0
+    speed = min(velocity_limit, defaults.USUAL_SPEED * length)  # of a faster drive friction may take more
+    return {
+        "armature": effort / (_SLIDE_ACCELERATION if is_slide else _ACCELERATION),
+        "viscous_friction": effort / speed,
+        "friction": _OF_EFFORT * effort,
+    }
+
+
 def base_bounds(joint: JointFacts) -> dict[str, Bounds]:
     """Bounds of armature, viscous friction, Coulomb friction and encoder bias."""
-    effort, length = joint.effort, unit_length(joint)
-    slowest = effort / (_SLIDE_ACCELERATION if joint.is_slide else _ACCELERATION)
+    most = largest_parameters(joint.effort, joint.velocity_limit, is_slide=joint.is_slide)
+    slowest = most["armature"]
     armature = max(_SEEN_BY_FILE * joint.armature, 0.25 * slowest) if joint.armature else slowest
-    speed = min(joint.velocity_limit, defaults.USUAL_SPEED * length)  # of a faster drive friction may take more
-    viscous = max(4.0 * joint.viscous_friction, effort / speed)
-    friction = max(4.0 * joint.friction, _OF_EFFORT * effort)
+    viscous = max(4.0 * joint.viscous_friction, most["viscous_friction"])
+    friction = max(4.0 * joint.friction, most["friction"])
     bias = defaults.LARGEST_BIAS
     if joint.is_slide:
         low, high = joint.range

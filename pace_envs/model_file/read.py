@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +93,13 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = 
     try:
         model = spec.compile()
     except ValueError as error:
+        if "balanceinertia" in str(error):
+            body = re.search(r"Element name '([^']*)'", str(error))
+            raise ValueError(
+                f"{path}: no body can have the inertia that is stated for {body[1] if body else 'a body'}: one of its "
+                "principal moments is above the sum of the other two. Correct it, or let MuJoCo make them equal: "
+                '<compiler balanceinertia="true"/>.'
+            ) from None
         needed = " Put them where the file looks for them." if notes else ""
         raise ValueError(
             " ".join([f"MuJoCo cannot compile {path}: {error}{'.' * bool(notes)}", *notes]) + needed

@@ -38,6 +38,11 @@ def main() -> None:
     parser.add_argument(
         "--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning"
     )
+    parser.add_argument(
+        "--joints",
+        metavar="REGEX",
+        help="joints to identify, the others are held where the log or the keyframe says (default: those of the log)",
+    )
     parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
     parser.add_argument(
         "--effects",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pace_actuators.files import refuse_taken
 from pace_optim.recording import SUFFIXES, save_recording, written_files
+from pace_optim.recording.keys import listed
 from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, with_rate, write_map
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_overwrite_option, add_rate_option, take_common_options
@@ -34,9 +35,12 @@ def main() -> None:
         print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
         parts = [(recording, columns) for recording in found]
     else:
-        each = understood(path, _robot(args.task), columns)
+        robot = _robot(args.task)
+        each = understood(path, robot, columns)
         for line in each[0].lines:
             print(line)
+        if absent := [name for name in robot.joint_names if name not in each[0].recording.joint_names]:
+            print(f"  not in the log: {listed(absent)}; a fit holds them")
         if len(each) > 1:
             print(f"  {len(each)} episodes")
         parts = [(one.recording, one.columns) for one in each]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import joint_label, units_for
@@ -29,11 +31,35 @@ def comparison_lines(content: dict[str, Any]) -> list[str]:
         cells = "".join(_cell(joint["rmse"].get(part), factor) for part in parts)
         share = f"{100 * joint['share_above_floor']:.0f} %"
         lines.append(f"{label:{width}}{cells}{_cell(joint['noise_floor'], factor)}  {share:>11}")
+    lines += _split(content, factor, "recording", [each["name"] for each in content["recordings"]])
+    lines += _split(content, factor, "drive", ["off", "on"])
     lines += ["", content["summary"]]
     lines += [f"  {place['sentence']}" for place in content["worst_places"]]
     if "ladder" in content:
         lines += ["", *ladder_table(content["ladder"], types)]
     return lines + [f"note: {note}" for note in content["notes"]]
+
+
+def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[str]) -> list[str]:
+    """The error of all joints, and the largest joint's, in each part of a dimension; nothing where it has one part.
+
+    Args:
+        content: Of comparison.json.
+        factor: From SI units to those of the table.
+        name: The dimension.
+        labels: Of its parts.
+    """
+    found = {joint: one["where"][name]["rms"] for joint, one in content["joints"].items() if name in one["where"]}
+    if not found:
+        return []
+    width = max(len(name), *(len(label) for label in labels))
+    lines = ["", f"{name:{width}}  {'all joints':>10}  {'largest':>10}"]
+    for i, label in enumerate(labels):
+        values = {joint: rms[i] for joint, rms in found.items()}
+        worst = max(values, key=lambda joint: values[joint])
+        whole = math.sqrt(sum(value**2 for value in values.values()) / len(values))
+        lines.append(f"{label:{width}}{_cell(whole, factor)}{_cell(values[worst], factor)}  {worst}")
+    return lines
 
 
 def _cell(value: float | None, factor: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,8 @@ from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
-from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
+from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
 from pace_optim.problem.drive_steps import (
@@ -32,8 +33,8 @@ from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.loop_check import refuse_open_loops
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.recordings import read_all, tell_on_stderr
-from pace_optim.problem.start import start_by_torques
+from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
+from pace_optim.problem.start import start_by_torques, widen_bounds
 from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
@@ -124,6 +125,22 @@ class Problem:
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
+    def reaching(self, bounds: Mapping[str, tuple[float, float]]) -> Problem:
+        """The same, its base parameters sought as far as another problem sought them too.
+
+        Args:
+            bounds: Lower and upper bound by label, ``<parameter>/<joint>``; of this problem's parameters alone.
+        """
+        labels = [f"{group}/{joint}" for group in PARAMETER_GROUPS for joint in self.joint_names] + [f"delay/{GLOBAL}"]
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            own = each.sim2real.bounds_params.clone()
+            for row, label in enumerate(labels):
+                low, high = bounds.get(label, own[row].tolist())
+                own[row] = own.new_tensor([min(low, float(own[row, 0])), max(high, float(own[row, 1]))])
+            each.sim2real.bounds_params = own
+        return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
     def with_physics_dt(self, physics_dt: float) -> Problem:
         """The same with another physics step [s]."""
         return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
@@ -187,6 +204,7 @@ def load_problem(
     effects: Sequence[EffectCfg | str] = (),
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
+    joints: str | None = None,
     columns: str | Path | None = None,
     rate: float | None = None,
     strict: bool = False,
@@ -208,6 +226,7 @@ def load_problem(
         unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
+        joints: Regular expression of the joints to identify; the others are held. ``None``: those of the recordings.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
@@ -226,8 +245,7 @@ def load_problem(
     cfg.prepare()
     control_dt = cfg.sim.dt * cfg.decimation
     set_control_step(cfg)
-    drives = cfg.scene.robot.actuators.values()
-    for drive in drives:
+    for drive in cfg.scene.robot.actuators.values():
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
         longest = float(cfg.sim2real.bounds_params[-1, 1])
         if drive.largest_delay < longest:
@@ -235,6 +253,12 @@ def load_problem(
                 f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
                 f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
             )
+    logs = _logs(cfg, data, validation, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
+    cfg = cfg.holding(logs.held)
+    cfg.prepare()
+    if logs.note:
+        cfg.sim2real.notes = (*cfg.sim2real.notes, logs.note)
+        tell(f"note: {logs.note}")
     if drive_dt is not None:
         _set_drive_dt(cfg, drive_dt)
     cfg.scene.num_envs = 1
@@ -243,11 +267,12 @@ def load_problem(
     plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
     env = ManagerBasedRLEnv(cfg)
     plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings, held_out = (
-        read_all(paths, env, control_dt, columns=columns, rate=rate, strict=strict, tell=tell)
-        for paths in (data or [cfg.sim2real.recording], validation)
-    )
+    recordings, held_out = (conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups)
     recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
+    for each in (plain, cfg):
+        each.sim2real.joint_ranges = _ranges(env, recordings)
+        if is_model_file(task):
+            widen_bounds(each.sim2real, env, recordings)
     count = len(recordings)
     measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
     told, bounds = lift_limits(plain, measured.recordings, unknown)
@@ -282,7 +307,7 @@ def load_problem(
         dataset=make_dataset(recordings, held_out),
         space=space,
         trees=trees,
-        delay_mode=next(iter(drives)).delay_mode,
+        delay_mode=next(iter(plain.scene.robot.actuators.values())).delay_mode,
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
@@ -297,6 +322,20 @@ def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
     """Set the period of all drives' loops [s]; 0: they run continuously."""
     for drive in cfg.scene.robot.actuators.values():
         drive.drive_dt, drive.implicit = drive_dt or None, drive_dt == 0
+
+
+def _logs(
+    cfg: PaceSim2realEnvCfg, data: Sequence[str | Path], validation: Sequence[str | Path], **options: Any
+) -> Logs:
+    """The recordings as their files have them, and which joints of the robot they are of."""
+    whole = copy.deepcopy(cfg)
+    whole.scene.num_envs = 1
+    set_drive_rate(whole)
+    env = ManagerBasedRLEnv(whole)
+    try:
+        return read_logs((data or [cfg.sim2real.recording], validation), env, **options)
+    finally:
+        env.close()
 
 
 def _read_torques(
@@ -326,6 +365,18 @@ def _read_torques(
     known = [fact for fact in unknown if len(measured.taken.get(fact, ())) == len(sim2real.joint_order)]
     measured = read(known) if len(known) < len(unknown) and measured.laws else measured
     return measured, tuple(fact for fact in unknown if fact not in known or fact in GAINS)
+
+
+def _ranges(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
+    """Between which positions each joint moves [rad]: its limits, else where recordings have it."""
+    robot = env.scene["robot"]
+    limits = robot.data.joint_pos_limits.tolist()
+    logged = [(min(r.dof_pos[:, j].min() for r in recordings), max(r.dof_pos[:, j].max() for r in recordings))
+              for j in range(robot.num_joints)]  # fmt: skip
+    return {
+        joint: (low, high) if math.isfinite(high - low) else (float(own[0]), float(own[1]))
+        for joint, (low, high), own in zip(robot.joint_names, limits, logged, strict=True)
+    }
 
 
 def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from pace_actuators import match_names
+from pace_actuators.joint_units import units_for
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
+from pace_optim.recording.conform import with_columns
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.robot_logs import ColumnMap, Robot, load_recordings, paired_files, read_map, with_rate
+from pace_optim.recording.keys import listed
+from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
+
+_T = TypeVar("_T", str, Recording)
+_STILL = 0.02
+"""A joint that moves less is held where it is [rad, of slides m]."""
 
 
 def tell_on_stderr(text: str) -> None:
@@ -27,48 +36,107 @@ def tell_nobody(text: str) -> None:
     """Told before, by the fit whose recordings are read again."""
 
 
-def read_all(
-    paths: Sequence[str | Path],
+@dataclass(frozen=True, kw_only=True)
+class Logs:
+    """Recordings as their files have them, of some joints of a robot."""
+
+    groups: tuple[tuple[Recording, ...], ...]
+    """Recordings of each group of files, with the columns of the joints that are identified alone."""
+    joints: tuple[str, ...]
+    """Those joints, in the robot's order."""
+    held: Mapping[str, float] = field(default_factory=dict)
+    """The robot's other joints, and where they are held [rad, of slides m]."""
+    note: str = ""
+    """What is to be said of them."""
+
+
+def read_logs(
+    groups: Sequence[Sequence[str | Path]],
     env: ManagerBasedEnv,
-    control_dt: float,
     *,
+    joints: str | None = None,
     columns: str | Path | None = None,
     rate: float | None = None,
     strict: bool = False,
     tell: Callable[[str], None] = tell_on_stderr,
-) -> list[Recording]:
-    """Read recordings and logs, and put each on the robot's joints and control grid.
+) -> Logs:
+    """Read recordings and logs, and find which of the robot's joints they are of.
+
+    The joints that are not commanded in any recording are held: where the recordings have them, else where the robot
+    begins. Two files that are the halves of one log (states, commands) are joined.
 
     Args:
-        paths: Files and folders, each as :func:`pace_optim.robot_logs.load_recordings` takes it; two files that are the
-            halves of one log (states, commands) are joined.
+        groups: Files and folders, each as :func:`pace_optim.robot_logs.load_recordings` takes it.
         env: The robot.
-        control_dt: Control step [s].
+        joints: Regular expression of the joints that are to be identified; ``None``: those of the recordings.
         columns: Column map of the logs among them; ``None``: guessed.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one that cannot be used refuses all, instead of being set aside.
         tell: Is told what was understood of logs, and what was set aside.
 
     Raises:
-        ValueError: If none can be used, or one cannot and ``strict``.
+        ValueError: If none of a group can be used, or one cannot and ``strict``; or a joint can be neither identified
+            nor held.
     """
     chosen = with_rate(None if columns is None else read_map(Path(columns)), rate)
-    names = paired_files([str(path) for path in paths])
-    result: list[Recording] = []
-    faults: list[str] = []
-    for name in names:
-        try:
-            result += _conformed(name, env, control_dt, chosen, tell)
-        except ValueError as error:
-            if strict or len(names) == 1 or not Path(name).exists():
-                raise
-            faults.append(" ".join(str(error).split()))
-    if faults and not result:
-        more = f" (The other {len(faults) - 1} files cannot be used either.)" if len(faults) > 1 else ""
-        raise ValueError(faults[0] + more)
-    for fault in faults:
-        tell(f"warning: set aside (--strict would refuse all): {fault}")
-    return result
+    known = known_robot(env)
+    names = known.joint_names
+    wanted = () if joints is None else tuple(names[i] for i in sorted(match_names(joints, names)[0]))
+    known = replace(known, wanted=wanted)
+
+    def read(path: str) -> list[Recording]:
+        return load_recordings(path, known, chosen, tell)
+
+    read_groups = [_each(paired_files([str(path) for path in group]), read, strict, tell) for group in groups]
+    every = [recording for group in read_groups for recording in group]
+    kept = wanted or _commanded(every, env)
+    held, note = _held(every, [name for name in names if name not in kept], env, is_asked=bool(wanted))
+    known_names = {*names, *env.cfg.scene.robot.held_joints}
+    narrowed = tuple(
+        tuple(_of_joints(recording, kept, known_names, is_asked=bool(wanted)) for recording in group)
+        for group in read_groups
+    )
+    return Logs(groups=narrowed, joints=kept, held=held, note=note)
+
+
+def conform_all(
+    recordings: Sequence[Recording],
+    env: ManagerBasedEnv,
+    control_dt: float,
+    *,
+    strict: bool = False,
+    tell: Callable[[str], None] = tell_on_stderr,
+) -> list[Recording]:
+    """Put recordings on a robot's joints and control grid, split at their gaps.
+
+    Args:
+        recordings: As :func:`read_logs` reads them.
+        env: The robot, its other joints held.
+        control_dt: Control step [s].
+        strict: As for :func:`read_logs`.
+        tell: Is told what was set aside.
+
+    Raises:
+        ValueError: As for :func:`read_logs`.
+    """
+    robot, known = env.scene["robot"], known_robot(env)
+    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
+
+    def conformed(recording: Recording) -> list[Recording]:
+        return [
+            conform_recording(
+                part,
+                joint_order=known.joint_names,
+                control_dt=control_dt,
+                joint_pos_limits=known.limits,
+                joint_types=robot.joint_types,
+                load_bodies=robot.body_names,
+                accepts_load=sim2real.apply_load is not None,
+            )
+            for part in split_at_gaps(recording)
+        ]
+
+    return _each(recordings, conformed, strict, tell)
 
 
 def known_robot(env: ManagerBasedEnv) -> Robot:
@@ -85,21 +153,87 @@ def known_robot(env: ManagerBasedEnv) -> Robot:
     )
 
 
-def _conformed(
-    name: str, env: ManagerBasedEnv, control_dt: float, columns: ColumnMap | None, tell: Callable[[str], None]
+def _each(
+    items: Sequence[_T], read: Callable[[_T], list[Recording]], strict: bool, tell: Callable[[str], None]
 ) -> list[Recording]:
-    robot, known = env.scene["robot"], known_robot(env)
-    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
-    return [
-        conform_recording(
-            recording,
-            joint_order=known.joint_names,
-            control_dt=control_dt,
-            joint_pos_limits=known.limits,
-            joint_types=robot.joint_types,
-            load_bodies=robot.body_names,
-            accepts_load=sim2real.apply_load is not None,
+    """What is read of each item; those that cannot be used are set aside, and told."""
+    result: list[Recording] = []
+    faults: list[str] = []
+    for item in items:
+        try:
+            result += read(item)
+        except ValueError as error:
+            if strict or len(items) == 1 or (isinstance(item, str) and not Path(item).exists()):
+                raise
+            faults.append(" ".join(str(error).split()))
+    if faults and not result:
+        more = f" (The other {len(faults) - 1} files cannot be used either.)" if len(faults) > 1 else ""
+        raise ValueError(faults[0] + more)
+    for fault in faults:
+        tell(f"warning: set aside (--strict would refuse all): {fault}")
+    return result
+
+
+def _commanded(recordings: Sequence[Recording], env: ManagerBasedEnv) -> tuple[str, ...]:
+    """The robot's joints that recordings command; all where a recording has joints that the robot has not.
+
+    Of such a recording a joint that is missing may be one that is misspelt.
+    """
+    names = tuple(env.scene["robot"].joint_names)
+    known = {*names, *env.cfg.scene.robot.held_joints}
+    if not all(recording.joint_names and known.issuperset(recording.joint_names) for recording in recordings):
+        return names
+    found = {
+        name
+        for recording in recordings
+        for name, commanded in zip(recording.joint_names, recording.is_commanded, strict=True)
+        if commanded
+    }
+    return tuple(name for name in names if name in found)
+
+
+def _held(
+    recordings: Sequence[Recording], names: Sequence[str], env: ManagerBasedEnv, *, is_asked: bool
+) -> tuple[dict[str, float], str]:
+    """Where joints are held [rad], and what is to be said of it."""
+    robot = env.scene["robot"]
+    home = dict(zip(robot.joint_names, robot.data.default_joint_pos[0].tolist(), strict=True))
+    types = dict(zip(robot.joint_names, robot.joint_types, strict=True))
+    held, logged, moving = {}, [], []
+    for name in names:
+        series = [r.dof_pos[:, r.joint_names.index(name)] for r in recordings if name in r.joint_names]
+        held[name] = float(np.median(np.concatenate(series))) if series else home[name]
+        if series:
+            logged.append(name)
+            low, high = min(each.min() for each in series), max(each.max() for each in series)
+            if high - low > _STILL:
+                moving.append(f"{name} by {units_for(f'{high - low:.3g} rad', [types[name]])}")
+    if moving and not is_asked:
+        raise ValueError(
+            f"{recordings[0].label}: joints move that nothing commands: {listed(moving, 3)}. Add their commands "
+            "(des_dof_pos, des_dof_vel or des_dof_effort), or name the joints to identify with --joints: the others "
+            "are then held where they are in the median."
         )
-        for whole in load_recordings(name, known, columns, tell)
-        for recording in split_at_gaps(whole)
-    ]
+    if not held:
+        before = [f"{name} at {value:.3g}" for name, value in env.cfg.scene.robot.held_joints.items()]
+        return held, f"Held as before: {listed(before, 3)}." if before else ""
+    places = [f"{name} at {units_for(f'{value:.3g} rad', [types[name]])}" for name, value in held.items()]
+    where = (
+        "where the recordings have them"
+        if len(logged) == len(held)
+        else "where the robot begins (its keyframe, or 0)"
+        if not logged
+        else f"where the recordings have them ({listed(logged, 3)}) or the robot begins"
+    )
+    note = f"{len(held)} {'joint is' if len(held) == 1 else 'joints are'} held, {where}: {listed(places, 3)}."
+    if moving:
+        note += f" In the recordings some move ({listed(moving, 3)}): what that does to the others is not simulated."
+    return held, note
+
+
+def _of_joints(recording: Recording, kept: Sequence[str], known: set[str], *, is_asked: bool) -> Recording:
+    """The recording without columns of joints that are held; as it is where it may be of another robot."""
+    names = recording.joint_names
+    if tuple(names) == tuple(kept) or not set(kept) <= set(names) or not (is_asked or known >= set(names)):
+        return recording
+    return with_columns(recording, [names.index(name) for name in kept], tuple(kept))

@@ -1,4 +1,4 @@
-"""Where a fit of a model file begins: what the torques that the log's drives asked for leave possible."""
+"""Where a fit of a model file begins and how far it seeks, by the torques of the log's drives."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from pace_envs import ManagerBasedRLEnv
+from pace_envs.from_model import defaults
+from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
+from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
 
@@ -52,10 +55,61 @@ def start_by_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) ->
     }
 
 
+def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> None:
+    """Seek as far as the drives allow that the recordings state; a start moves with its bound.
+
+    A model file's bounds are parts of its effort limits. Where it has none, they come from its inertia and gravity: of
+    a light link with a strong drive they exclude what is there. A drive's scale then is the limit that a recording
+    states; without one, what its gains ask for at an error of half a radian, and what they did ask for.
+
+    Args:
+        sim2real: The bounds and starts; changed.
+        env: The environment, for the limits and gains that a recording does not state.
+        recordings: On the robot's joints, in its order.
+    """
+    n, bounds = len(sim2real.joint_order), sim2real.bounds_params.clone()
+    effort = np.max([_scale(env, sim2real, recording) for recording in recordings], axis=0)
+    speed = np.nan_to_num(of_joints(env, "velocity_limit"), nan=np.inf)
+    for j, joint in enumerate(sim2real.joint_order):
+        most = largest_parameters(float(effort[j]), float(speed[j]), is_slide=joint in sim2real.slide_joints)
+        for group, name in enumerate(PARAMETER_GROUPS):
+            if most.get(name, 0.0) > bounds[group * n + j, 1]:
+                bounds[group * n + j, 1] = most[name]
+                starts = sim2real.start_params[name] | {joint: OF_BOUNDS * most[name]}  # type: ignore[operator]
+                sim2real.start_params = {**sim2real.start_params, name: starts}
+    sim2real.bounds_params = bounds
+
+
+def _scale(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> np.ndarray:
+    """Largest torque of each drive as a recording has it, (n,) [N m]; 0 where nothing states its gains."""
+    drive, configured = recording.drive, of_joints(env, "effort_limit")
+    limit = configured if drive.effort_limit is None else drive.effort_limit
+    stated = drive.stiffness is not None or drive.damping is not None
+    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), defaults.SLIDE_LENGTH, 1.0)
+    asked = np.zeros(len(length))
+    if stated:
+        kp = of_joints(env, "stiffness") if drive.stiffness is None else drive.stiffness
+        asked = np.maximum(0.5 * kp * length, np.abs(_torque(env, recording)).max(axis=0))
+    return np.where(np.isfinite(limit), 0.0 if drive.effort_limit is None else limit, asked)
+
+
 def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     """Mean squares of torque, speed and acceleration about their means, (3, n), without the ends."""
-    time, half = recording.time, max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
+    time, half = recording.time, _half(recording)
     speed = np.gradient(_smooth(recording.dof_pos, half), time, axis=0)
+    inner = slice(half + 2, -half - 2)
+    parts = (_torque(env, recording), speed, np.gradient(speed, time, axis=0))
+    return np.array([np.var(each[inner], axis=0) for each in parts])
+
+
+def _half(recording: Recording) -> int:
+    """Samples on each side that a position is averaged with."""
+    return max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
+
+
+def _torque(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+    """What the drives were asked for, within the configured limits, (T, n) [N m]."""
+    speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
     kp, kd = (
         of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
         for name in ("stiffness", "damping")
@@ -65,9 +119,7 @@ def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     torque = kp * (recording.sampled_command - recording.dof_pos) + kd * (asked_speed - speed)
     torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
     limit = of_joints(env, "effort_limit")
-    torque = np.clip(torque, -limit, limit)
-    inner = slice(half + 2, -half - 2)
-    return np.array([np.var(each[inner], axis=0) for each in (torque, speed, np.gradient(speed, time, axis=0))])
+    return np.clip(torque, -limit, limit)
 
 
 def _smooth(position: np.ndarray, half: int) -> np.ndarray:

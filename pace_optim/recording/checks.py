@@ -74,7 +74,7 @@ def check_recording(
         torque_enable=torque_enable,
         real_ee_pose=None if pose is None else _pose(pose, len(time), source),
         time_origin=_origin(fields.get("time_origin"), origin, source),
-        drive=drive_of(fields, joint_names, num_joints, source),
+        drive=drive_of(fields, joint_names, _commanded(series, num_joints), source),
         load=load_of(fields, source),
         notes=tuple(notes),
         source=source,
@@ -248,24 +248,38 @@ def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], sou
     )
 
 
+def _commanded(series: Mapping[str, np.ndarray], num_joints: int) -> np.ndarray:
+    """Which columns have commands of any kind, (n,) bool."""
+    told = [~np.isnan(series[key]).all(axis=0) for key in COMMAND_SERIES if key in series]
+    return np.any(told, axis=0) if told else np.zeros(num_joints, dtype=bool)
+
+
 def _check_commands(recording: Recording) -> None:
-    """Refuse joints that nothing commands, and a position loop that has no target."""
+    """Refuse columns without a name that nothing commands, and a position loop that has no target."""
     names = recording.joint_names or tuple(f"column {j}" for j in range(recording.num_joints))
-    position = recording.has_position_command
-    commanded = position | recording.has_velocity_command | recording.has_effort_command
-    if not commanded.all():
-        idle = [name for name, flag in zip(names, commanded, strict=True) if not flag]
-        raise ValueError(
-            f"{recording.source}: {listed(idle)}: no command (des_dof_pos, des_dof_vel and des_dof_effort are NaN or "
-            "missing). Add one, or leave the joint out."
-        )
+    commanded = recording.is_commanded
+    if not (commanded.any() if recording.joint_names else commanded.all()):
+        refuse_uncommanded(recording, names)
     stiffness = recording.drive.stiffness
-    if stiffness is not None and np.any(loop := ~position & (stiffness > 0.0)):
+    if stiffness is not None and np.any(loop := commanded & ~recording.has_position_command & (stiffness > 0.0)):
         joint = int(np.argmax(loop))
         raise ValueError(
             f"{recording.source}: {names[joint]} has a stiffness of {stiffness[joint]:g} but no des_dof_pos. Add its "
             "position targets, or state a stiffness of 0."
         )
+
+
+def refuse_uncommanded(recording: Recording, names: Sequence[str]) -> None:
+    """Say which joints nothing commands.
+
+    Raises:
+        ValueError: Always.
+    """
+    idle = [name for name, flag in zip(names, recording.is_commanded, strict=True) if not flag]
+    raise ValueError(
+        f"{recording.label}: {listed(idle)}: no command (des_dof_pos, des_dof_vel and des_dof_effort are NaN or "
+        "missing). Add one, or leave the joint out: --joints names those to identify, the others are held."
+    )
 
 
 def _check_precision(key: str, time: np.ndarray, source: str) -> None:

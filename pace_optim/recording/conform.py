@@ -10,7 +10,7 @@ import numpy as np
 
 from pace_actuators.joint_units import JointType
 
-from .checks import MIN_SAMPLES
+from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
 from .keys import JOINT_SERIES, SAMPLED_SERIES, listed
@@ -61,6 +61,8 @@ def conform_recording(
     check_load(recording, load_bodies, accepts_load)
     columns, notes = column_order(recording, joint_order)
     recording = with_columns(recording, columns, tuple(joint_order))
+    if not recording.is_commanded.all():
+        refuse_uncommanded(recording, joint_order)
     notes += check_motion(recording, joint_pos_limits, limit_margin, joint_types)
     if recording.command is not None:
         _check_conformed(recording, control_dt)

@@ -144,6 +144,11 @@ class Recording:
         return _has_values(self.des_dof_effort, self.num_joints)
 
     @property
+    def is_commanded(self) -> np.ndarray:
+        """Which joints have commands of any kind, (n,) bool."""
+        return self.has_position_command | self.has_velocity_command | self.has_effort_command
+
+    @property
     def sample_steps(self) -> np.ndarray:
         """Control step of each sample, (T,); once conformed."""
         return np.arange(self.num_samples) * self.sample_stride if self.sample_at is None else self.sample_at

@@ -63,10 +63,17 @@ def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], num_joints: int, source: str) -> Drive:
-    """Read the drive's facts: a number for all joints, one per joint in column order, or {joint: value}."""
+def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], commanded: np.ndarray, source: str) -> Drive:
+    """Read the drive's facts: a number for all joints, one per joint in column order, or {joint: value}.
+
+    Args:
+        fields: The file's keys and values.
+        joint_names: Names of the columns, () where there are none.
+        commanded: Which columns have commands, (n,) bool: the others may be left out of {joint: value}.
+        source: Path, for messages.
+    """
     given = {key: fields[key] for key in DRIVE_FACTS if fields.get(key) is not None}
-    return Drive(**{k: _per_joint(k, v, joint_names, num_joints, source) for k, v in given.items()})
+    return Drive(**{k: _per_joint(k, v, joint_names, commanded, source) for k, v in given.items()})
 
 
 def load_of(fields: Mapping[str, Any], source: str) -> Load:
@@ -75,9 +82,10 @@ def load_of(fields: Mapping[str, Any], source: str) -> Load:
     return Load(added_mass=_added_mass(fields.get("added_mass"), source), **bench)
 
 
-def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], num_joints: int, source: str) -> np.ndarray:
+def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], commanded: np.ndarray, source: str) -> np.ndarray:
+    num_joints = len(commanded)
     if isinstance(value, Mapping):
-        value = _in_column_order(key, value, joint_names, source)
+        value = _in_column_order(key, value, joint_names, commanded, source)
     array = as_array(value)
     if array.dtype.kind not in "iuf":
         raise ValueError(
@@ -96,7 +104,9 @@ def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], num_joints: i
     return array
 
 
-def _in_column_order(key: str, value: Mapping, joint_names: tuple[str, ...], source: str) -> list:
+def _in_column_order(
+    key: str, value: Mapping, joint_names: tuple[str, ...], commanded: np.ndarray, source: str
+) -> list:
     if not joint_names:
         raise ValueError(
             f"{source}: {key} is given by joint name, but the recording has no joint_names. "
@@ -108,9 +118,11 @@ def _in_column_order(key: str, value: Mapping, joint_names: tuple[str, ...], sou
                 f"{source}: {key} names the unknown joint '{name}'{did_you_mean(str(name), joint_names)} "
                 f"Joints of the recording: {listed(joint_names)}."
             )
-    if missing := [name for name in joint_names if name not in value]:
+    missing = [name for name, needed in zip(joint_names, commanded, strict=True) if needed and name not in value]
+    if missing:
         raise ValueError(f"{source}: {key} has no value for {listed(missing)}. Give one for every joint.")
-    return [value[name] for name in joint_names]
+    of_undriven = np.inf if key in _MAY_BE_INFINITE else 0.0
+    return [value.get(name, of_undriven) for name in joint_names]
 
 
 def _added_mass(value: Any, source: str) -> dict[str, float]:

@@ -38,7 +38,8 @@ def column_order(recording: Recording, joint_order: Sequence[str]) -> tuple[list
         found += [f"no column for {listed(missing)}."] if missing else []
         raise ValueError(
             f"{source}: {' '.join(found)} The recording has {len(names)} joints ({listed(names)}), the robot "
-            f"has {len(joint_order)} ({listed(joint_order)}). Rename the columns, or choose the robot's task."
+            f"has {len(joint_order)} ({listed(joint_order)}). Rename the columns, choose the robot's task, or name the "
+            "joints to identify with --joints."
         )
     return [names.index(name) for name in joint_order], []
 

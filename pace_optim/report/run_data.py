@@ -53,6 +53,8 @@ class RunData:
     settings: dict[str, Any]
     model_digest: str | None
     """SHA-256 of ``model.mjb`` as the fit wrote it; ``None`` in runs of earlier versions."""
+    model_file: Path | None
+    """The robot's model file, if it is what it was for the fit."""
     new: Mapping[str, Any]
     """Content of JSON files that are about to be written, by name."""
 
@@ -84,6 +86,7 @@ class RunData:
             bounds=read_bounds(folder),
             settings=settings.get("settings", {}),
             model_digest=settings.get("model"),
+            model_file=_model_file(settings),
             new=new or {},
         )
 
@@ -138,6 +141,14 @@ class RunData:
     def read_json(self, name: str) -> Any | None:
         """Another file of the folder, ``None`` if it is not there; for sections about later steps."""
         return self.new[name] if name in self.new else _read_json(self.folder / name)
+
+
+def _model_file(settings: Mapping[str, Any]) -> Path | None:
+    """The first of the files that the run's environment names, which the others belong to."""
+    environment = settings.get("environment")
+    files = environment.get("files") if isinstance(environment, dict) else None
+    name, digest = next(iter(files.items()), ("", "")) if isinstance(files, dict) else ("", "")
+    return Path(name) if name and Path(name).is_file() and file_digest(name) == digest else None
 
 
 def _recording(content: dict[str, Any]) -> RecordingData:

@@ -32,6 +32,8 @@ class Robot:
     """In order; () where no robot is known: the log's own names are kept."""
     limits: np.ndarray | None = None
     """Lower and upper limit of each joint, (n, 2) [rad]; infinite where there is none."""
+    wanted: tuple[str, ...] = ()
+    """Those of them that a log must have; (): the ones that it names, if it names no others."""
     joint_types: tuple[JointType, ...] = ()
     """Whether each joint turns or slides; none where it is not known."""
     stiffness: np.ndarray | None = None
@@ -98,7 +100,9 @@ def guess_map(log: Log, robot: Robot) -> Guess:
         groups[each.channel.table, each.series].append(each)
     notes: list[str] = []
     chosen: dict[str, dict[str, tuple[tuple[float, int, int], _Candidate]]] = {name: {} for name in names}
-    named = {c.channel.table for c in candidates if not only_numbers([c.label]) and match(c.label, names)}
+    named = {
+        c.channel.table for c in candidates if not only_numbers([c.label]) and _meant(c.label, names, robot.wanted)
+    }
     for series in (*JOINT_SERIES, *GAINS.values()):
         for (table, of), group in groups.items():
             if of != series:
@@ -106,13 +110,14 @@ def guess_map(log: Log, robot: Robot) -> Guess:
             if series in GAINS.values() and [each.label for each in group] == [""]:  # one for all
                 pairs = [(name, 0.3, group[0]) for name in names]
             else:
-                pairs = _by_name(group, names) or _by_place(group, names, chosen, table in named, notes)
+                pairs = _by_name(group, names, robot.wanted)
+                pairs = pairs or _by_place(group, robot.wanted or names, chosen, table in named, notes)
             for name, score, each in pairs:
                 rank = (score, len(pairs), len(each.channel.time))
                 if series not in chosen[name] or rank > chosen[name][series][0]:
                     chosen[name][series] = (rank, each)
     picked = {name: {s: c for s, (_, c) in sorted(by.items(), key=_order)} for name, by in chosen.items()}
-    facts, more = _gains(picked)
+    facts, more = _gains({name: by for name, by in picked.items() if set(COMMAND_SERIES) & set(by)})
     facts_from = {by[fact].channel.key for by in picked.values() for fact in facts if fact in by}
     notes += more
     picked = _without_plans(picked, notes)
@@ -126,7 +131,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     return Guess(
         columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable),
         notes=(*notes, *more),
-        missing=tuple(_missing(sources, names, candidates)),
+        missing=tuple(_missing(sources, robot.wanted or _found(sources, robot, candidates) or names)),
         unit_stated=tuple(name for name, by in picked.items() if "dof_pos" in by and by["dof_pos"].unit),
         facts_from=tuple(facts_from),
     )
@@ -200,10 +205,17 @@ def _own_names(candidates: Sequence[_Candidate]) -> tuple[str, ...]:
     return tuple(name for name in names if name in meant) or names
 
 
-def _by_name(group: Sequence[_Candidate], names: Sequence[str]) -> list[tuple[str, float, _Candidate]]:
+def _meant(label: str, names: Sequence[str], wanted: Sequence[str]) -> tuple[str, float] | None:
+    """The joint that a label means; one of those wanted where it could be several."""
+    return match(label, names) or match(label, wanted)
+
+
+def _by_name(
+    group: Sequence[_Candidate], names: Sequence[str], wanted: Sequence[str]
+) -> list[tuple[str, float, _Candidate]]:
     found: dict[str, list[tuple[float, _Candidate]]] = defaultdict(list)
     for each in group:
-        if each.label and (meant := match(each.label, names)):
+        if each.label and (meant := _meant(each.label, names, wanted)):
             found[meant[0]].append((meant[1], each))
     pairs = []
     for name, those in found.items():
@@ -339,9 +351,17 @@ def _effort_as_command(sources: dict[str, dict[str, Source]], notes: list[str]) 
         )
 
 
-def _missing(
-    sources: dict[str, dict[str, Source]], names: Sequence[str], candidates: Sequence[_Candidate]
-) -> list[str]:
+def _found(
+    sources: Mapping[str, Mapping[str, Source]], robot: Robot, candidates: Sequence[_Candidate]
+) -> tuple[str, ...]:
+    """The robot's joints that the log has, with commands, if it has no others: one without may have another name."""
+    labels = {each.label for each in candidates if each.series == "dof_pos"}
+    if not all(match(label, robot.joint_names) for label in labels):
+        return ()
+    return tuple(name for name, by in sources.items() if "dof_pos" in by and any(s in COMMAND_SERIES for s in by))
+
+
+def _missing(sources: dict[str, dict[str, Source]], names: Sequence[str]) -> list[str]:
     if not names:
         return ["positions of joints (dof_pos)"]
     missing = []

@@ -111,8 +111,7 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
             if twice := [key for key in own.facts if key in add_json_facts({}, beside)]:
                 notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
                 used = replace(used, facts={key: value for key, value in used.facts.items() if key not in twice})
-        names = robot.joint_names or tuple(used.joints)
-        _check_map(path, used, names)
+        names = _joints_of(path, used, robot)
         fields, more = fields_of(log, used, names)
         more += [left] if (left := unused(log, used, facts_from)) else []
         recording = check_recording(add_json_facts(fields, beside), source=str(path), default_name=log.name)
@@ -236,13 +235,18 @@ def _joined(paths: Sequence[Path], columns: ColumnMap | None) -> Log:
     )
 
 
-def _check_map(path: Path, columns: ColumnMap, names: Sequence[str]) -> None:
-    missing = [name for name in names if "dof_pos" not in columns.joints.get(name, {})]
-    if missing:
+def _joints_of(path: Path, columns: ColumnMap, robot: Robot) -> tuple[str, ...]:
+    """The joints of the recording, in the robot's order: those of the map, unless it has others than the robot."""
+    mapped = [name for name, by in columns.joints.items() if "dof_pos" in by]
+    names = robot.joint_names or tuple(columns.joints)
+    if robot.wanted or set(columns.joints) <= set(names):
+        names = tuple(name for name in names if name in mapped or name in robot.wanted)
+    if missing := [name for name in names if name not in mapped]:
         raise ValueError(
             f"{path}: the column map has no dof_pos of {listed(missing)}; it has the joints {listed(columns.joints)}. "
-            "Add them."
+            "Add them, or name the joints to identify with --joints."
         )
+    return names
 
 
 def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: ColumnMap, notes: Sequence[str]) -> str:

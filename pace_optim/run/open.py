@@ -16,6 +16,7 @@ from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
+from pace_optim.run.tensors import read_bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +94,7 @@ class Run:
         """
         settings = self.settings
         if data:
-            own = {"data": [str(path) for path in data], "validation": []}
+            own = {"data": [str(path) for path in data], "validation": [], "joints": ".*"}
             settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
             drive_dt = self.told_drive_dt if settings.drive_dt is None else settings.drive_dt
@@ -103,6 +104,8 @@ class Run:
             if data or str(self.folder) in str(error):
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
+        if data:  # other recordings have other bounds; the run's values must be within
+            problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)
 
     @property
@@ -152,6 +155,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         effects=settings.effects,
         unknown=settings.unknown,
         env_cfg=env_cfg,
+        joints=settings.joints,
         columns=settings.columns,
         rate=settings.rate,
         strict=settings.strict,

@@ -82,6 +82,9 @@ class FitSettings:
     check_consistency: bool = True
     """Whether each of several recordings is fitted alone too, to see whether they agree."""
 
+    joints: str | None = None
+    """Regular expression of the joints to identify, the others are held; ``None``: those that recordings command."""
+
     columns: str | None = None
     """Column map of logs that are not in this project's own form; ``None``: guessed."""
 

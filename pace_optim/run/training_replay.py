@@ -20,7 +20,7 @@ from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.registration import set_physics_dt
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.recordings import read_all
+from pace_optim.problem.recordings import conform_all, read_logs
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import make_dataset
 from pace_optim.run.open import Run
@@ -108,10 +108,15 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     control_dt = _control_dt(env_cfg)
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
     paths = settings.data or [str(fitted_cfg.sim2real.recording)]
-    trained, held_out = (
-        read_all(each, env, control_dt, columns=settings.columns, rate=settings.rate, strict=settings.strict)
-        for each in (paths, settings.validation)
+    logs = read_logs(
+        (paths, settings.validation),
+        env,
+        joints=".*",
+        columns=settings.columns,
+        rate=settings.rate,
+        strict=settings.strict,
     )
+    trained, held_out = (conform_all(each, env, control_dt, strict=settings.strict) for each in logs.groups)
     dataset = make_dataset(trained, held_out)
     env.close()
     env = ManagerBasedRLEnv(_with_envs(env_cfg, dataset.num_recordings))

@@ -32,6 +32,8 @@ class JointModel:
     """Which entries have a logarithmic scale, (P,) bool."""
     slides: torch.Tensor
     """Which joints slide, (n,) bool: effects that mean nothing there are not tried."""
+    ranges: torch.Tensor
+    """Between which positions each joint moves, (n, 2) [rad]: effects' positions are sought there."""
     barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
     """Effects that some joints cannot get, (n,) bool."""
     shared: frozenset[type[Effect]] = frozenset()
@@ -40,7 +42,7 @@ class JointModel:
     @classmethod
     def base(cls, problem: Problem) -> JointModel:
         """The base model with the bounds of a problem."""
-        space, n = problem.space, len(problem.joint_names)
+        space, n, sim2real = problem.space, len(problem.joint_names), problem.env_cfg.sim2real
         lower = [space.lower[space[name]].expand(n) for name in BASE]
         upper = [space.upper[space[name]].expand(n) for name in BASE]
         return cls(
@@ -49,7 +51,10 @@ class JointModel:
             lower=torch.stack(lower, dim=1),
             upper=torch.stack(upper, dim=1),
             log=torch.zeros(len(BASE), dtype=torch.bool),
-            slides=torch.tensor([joint in problem.env_cfg.sim2real.slide_joints for joint in problem.joint_names]),
+            slides=torch.tensor([joint in sim2real.slide_joints for joint in problem.joint_names]),
+            ranges=torch.tensor(
+                [sim2real.joint_ranges.get(joint, (0.0, 0.0)) for joint in problem.joint_names], dtype=torch.float64
+            ),
         )
 
     @property
@@ -106,6 +111,7 @@ class JointModel:
             upper=self.upper[joints][:, entries],
             log=self.log[entries],
             slides=self.slides[joints],
+            ranges=self.ranges[joints],
             barred={effect: barred[joints] for effect, barred in self.barred.items()},
         )
         return model, entries
@@ -132,11 +138,7 @@ class JointModel:
             has = self.has.clone()
             has[self.effects.index(effect)] |= joints
             return replace(self, has=has)
-        n = self.num_joints
-        bounds = [
-            torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64).expand(n, -1)
-            for side in ("lower", "upper")
-        ]
+        bounds = self._declared(effect)
         return replace(
             self,
             effects=(*self.effects, effect),
@@ -171,10 +173,12 @@ class JointModel:
             physical[joints, columns] = values[joints]
         lower, upper = model.lower.clone(), model.upper.clone()
         # what was held for a joint's old values is not held for its new ones
-        for column, p in enumerate(effect.parameters, start=columns.start):
+        declared = [each[joints] for each in model._declared(effect)]
+        for k, p in enumerate(effect.parameters):
+            column, (low, high) = columns.start + k, (each[:, k] for each in declared)
             own, (least, most) = physical[joints, column], model._widest(p, joints)
-            lower[joints, column] = torch.where(own < p.lower, least, p.lower)
-            upper[joints, column] = torch.where(own > p.upper, most, p.upper)
+            lower[joints, column] = torch.where(own < low, least, low)
+            upper[joints, column] = torch.where(own > high, most, high)
         return replace(model, lower=lower, upper=upper), physical
 
     def widened(self, effect: type[Effect], joints: torch.Tensor) -> JointModel:
@@ -184,19 +188,24 @@ class JointModel:
             lower[joints, column], upper[joints, column] = self._widest(parameter, joints)
         return replace(self, lower=lower, upper=upper)
 
+    def _declared(self, effect: type[Effect]) -> tuple[torch.Tensor, torch.Tensor]:
+        """The bounds of an effect on each joint, as it declares them, (n, parameters) each."""
+        bounds = [[p.reaching(low, high) for p in effect.parameters] for low, high in self.ranges.tolist()]
+        own = torch.tensor(bounds, dtype=torch.float64).reshape(self.num_joints, -1, 2)
+        return own[..., 0], own[..., 1]
+
     def _widest(self, parameter: EffectParameter, joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The widest bounds of an effect's parameter on some joints, (n,) bool; physical, one for each of them."""
         friction = self.upper[joints, BASE.index("friction")].tolist()
         bounds = torch.tensor([parameter.widest(each) for each in friction], dtype=torch.float64).reshape(-1, 2)
-        return bounds[:, 0], bounds[:, 1]
+        ranges = self.ranges[joints].tolist()
+        own = torch.tensor([parameter.reaching(*each) for each in ranges], dtype=torch.float64).reshape(-1, 2)
+        return torch.minimum(bounds[:, 0], own[:, 0]), torch.maximum(bounds[:, 1], own[:, 1])
 
     def is_wide(self, effect: type[Effect]) -> torch.Tensor:
         """Joints on which an effect's bounds are wider than it declares them, (n,) bool."""
         columns, has = self.columns(effect), self.has[self.effects.index(effect)]
-        least, most = (
-            torch.tensor([getattr(p, side) for p in effect.parameters], dtype=torch.float64)
-            for side in ("lower", "upper")
-        )
+        least, most = self._declared(effect)
         return has & ((self.lower[:, columns] < least) | (self.upper[:, columns] > most)).any(dim=1)
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:

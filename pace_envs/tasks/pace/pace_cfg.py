@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,9 @@ class PaceCfg(Config):
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
 
+    joint_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Between which positions each joint moves [rad, of slides m]: its limits, else where recordings have it."""
+
     assumed_gains: tuple[str, ...] = ()
     """Joints whose gains nobody has stated: those of their drives are assumed."""
 
@@ -162,18 +165,35 @@ class PaceCfg(Config):
             raise ValueError(f"bounds_params row {row} is ({low:g}, {high:g}), expected lower <= upper.")
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
-        """The same for some of the joints, in their order here; only the base parameters, and no motion to record."""
+        """The same for some of the joints, in their order here; effects and parameters of one's own are left out."""
         kept, n = [i for i, name in enumerate(self.joint_order) if name in joint_names], len(self.joint_order)
         rows = [group * n + i for group in range(len(PARAMETER_GROUPS)) for i in kept]
+        names = tuple(self.joint_order[i] for i in kept)
+        motion = self.excitation and {
+            each.name: tuple(getattr(self.excitation, each.name)[i] for i in kept) for each in fields(ExcitationCfg)
+        }
         return replace(
             self,
-            joint_order=tuple(self.joint_order[i] for i in kept),
+            joint_order=names,
             bounds_params=self.bounds_params[[*rows, -1]],
-            excitation=None,
-            sample_params={},
+            excitation=ExcitationCfg(**motion) if motion else None,
+            sample_params=_of_joints(self.sample_params, names),
+            start_params=_of_joints(self.start_params, names),
+            effect_bounds=_of_joints(self.effect_bounds, names),
+            slide_joints=tuple(name for name in self.slide_joints if name in names),
+            joint_ranges={name: each for name, each in self.joint_ranges.items() if name in names},
+            assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             extra_parameters=(),
         )
+
+
+def _of_joints(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Values by joint, of some of the joints; those of all joints as they are."""
+    return {
+        key: {name: each[name] for name in names if name in each} if isinstance(each, Mapping) else each
+        for key, each in values.items()
+    }
 
 
 def make_bounds(

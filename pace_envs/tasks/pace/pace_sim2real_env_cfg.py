@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from pace_actuators import resolve_joint_values
+from pace_actuators import JointValue, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_envs import mdp
@@ -116,6 +116,47 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         robot = dataclasses.replace(robot, init_state=dataclasses.replace(robot.init_state, joint_pos=own))
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, robot=robot))
 
+    def holding(self, positions: Mapping[str, float]) -> PaceSim2realEnvCfg:
+        """The same with some of the joints held: they have no drives, and nothing of them is identified.
+
+        Args:
+            positions: Where each is held [rad, of slides m], by name.
+
+        Raises:
+            ValueError: If no joint is left, or parameters of the user's own are for all joints.
+        """
+        if not positions:
+            return self
+        robot, names = self.scene.robot, self.sim2real.joint_order
+        kept = [name for name in names if name not in positions]
+        if not kept:
+            raise ValueError(f"All joints are held ({', '.join(names)}): nothing is left to identify.")
+        if self.sim2real.extra_parameters:
+            raise ValueError(
+                f"extra_parameters are written for all joints of the robot: {', '.join(positions)} cannot be held. "
+                "Record all joints, or leave these parameters out."
+            )
+        drives = {group: cfg.on_joints(names, kept) for group, cfg in robot.actuators.items()}
+        state = robot.init_state
+        state = dataclasses.replace(
+            state,
+            joint_pos=_of_kept(state.joint_pos, names, kept, "joint_pos"),
+            joint_vel=_of_kept(state.joint_vel, names, kept, "joint_vel"),
+        )
+        robot = dataclasses.replace(
+            robot,
+            actuators={group: cfg for group, cfg in drives.items() if cfg is not None},
+            init_state=state,
+            joint_order=None,
+            held_joints={**robot.held_joints, **positions},
+        )
+        effects = [cfg for cfg in effect_cfgs(self.sim2real.effects) if not set(cfg.joints(names)).isdisjoint(kept)]
+        return dataclasses.replace(
+            self,
+            scene=dataclasses.replace(self.scene, robot=robot),
+            sim2real=dataclasses.replace(self.sim2real.on_joints(kept), effects=tuple(effects)),
+        )
+
     def on_joints(self, joint_names: Sequence[str]) -> PaceSim2realEnvCfg:
         """The same for some of the joints: the drives of the others, effects and terms of one's own are left out."""
         robot, names = self.scene.robot, self.sim2real.joint_order
@@ -144,3 +185,19 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
             rewards={},
             curriculum={},
         )
+
+
+def _of_kept(value: JointValue, names: Sequence[str], kept: Sequence[str], field: str) -> JointValue:
+    """Values of an initial state without those of the joints that are held; patterns of joints without drives stay."""
+    if isinstance(value, (int, float)):
+        return value
+    own, others = value, {}
+    names = list(names)
+    if isinstance(value, Mapping):
+        driven = {pattern for pattern in value if any(re.fullmatch(pattern, name) for name in names)}
+        own = {pattern: value[pattern] for pattern in driven}
+        others = {pattern: each for pattern, each in value.items() if pattern not in driven}
+    each = resolve_joint_values(own, names, field=field, default=0.0)
+    if not isinstance(value, Mapping):
+        return each[[names.index(name) for name in kept]]
+    return {re.escape(name): float(each[names.index(name)]) for name in kept} | others

@@ -156,11 +156,12 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             given = cfg.effect_bounds.get(f"{kind.name}.{parameter.name}", {})
             each = []
             for joint, i in zip(own, ids, strict=True):
-                lower, upper = parameter.lower, parameter.upper
+                lower, upper = parameter.reaching(*cfg.joint_ranges.get(joint, (0.0, 0.0)))
                 if kind is DynamicFriction:
                     lower, upper = cfg.friction_ratio_bounds
                 elif effect.wide:
-                    lower, upper = parameter.widest(float(cfg.bounds_params[_FRICTION * len(joints) + i, 1]))
+                    widest = parameter.widest(float(cfg.bounds_params[_FRICTION * len(joints) + i, 1]))
+                    lower, upper = min(lower, widest[0]), max(upper, widest[1])
                 each.append(given.get(joint, (lower, min(max(parameter.start, lower), upper), upper)))
             if effect.shared and each:
                 lows, starts, highs = zip(*each, strict=True)

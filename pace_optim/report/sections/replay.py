@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..markup import Section, choice, html, json_script
-from ..motion import Motion, motions_of, scene_of
+from ..motion import Motion, looks_of, motions_of, scene_of
 from ..motion.scene import scalar_joints
 from ..run_data import RunData
 
@@ -34,14 +34,14 @@ def replay(run: RunData) -> Section | None:
         id="replay",
         title="Replay",
         lead="Blue: measured. Solid: simulated, coloured by its error. Drag to turn, wheel to come closer.",
-        html=viewer(model, motions),
+        html=viewer(model, motions, None if run.model_file is None else looks_of(run.model_file)),
     )
 
 
-def viewer(model: mujoco.MjModel, motions: Sequence[Motion]) -> Markup:
+def viewer(model: mujoco.MjModel, motions: Sequence[Motion], looks: mujoco.MjModel | None = None) -> Markup:
     """HTML of a viewer that the page's script brings to life."""
     content = {
-        "scene": scene_of(model),
+        "scene": scene_of(model, looks),
         "joints": [model.joint(j).name for j in scalar_joints(model)],
         "scale": _scale(motions),
         "recordings": [_encode(motion) for motion in motions],
