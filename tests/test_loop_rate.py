@@ -23,7 +23,7 @@ def recorded_at(period, duration=1.0, noise=1e-4):
         drive.drive_dt = period
     set_drive_rate(cfg)
     problem = make_problem(record(chirp(duration), CALM, cfg=cfg, drive=GAINS, noise=noise))
-    return dataclasses.replace(problem, task="robot.xml")
+    return dataclasses.replace(problem, assumed_loop=problem.loop_dt)
 
 
 def fitted(problem):
@@ -58,7 +58,7 @@ def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state():
 def test_only_drive_dt_states_a_rate():
     problem = make_problem(record(drive=GAINS))
     assert not problem.assumes_loop_rate  # a configuration says how its drives run
-    of_file = dataclasses.replace(problem, task="robot.xml")
+    of_file = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     assert of_file.assumes_loop_rate
     stated = of_file.with_drive_dt(0.001)
     assert not stated.assumes_loop_rate and stated.loop_dt == 0.001 and stated.physics_dt == 0.0005
@@ -70,7 +70,11 @@ def test_only_drive_dt_states_a_rate():
 def of(weights, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
     weights = np.array(weights)
     return LoopRates(
-        periods=(0.0025, 0.001, 0.0005), values=np.array(values), weights=weights / weights.sum(), assumed=0.0025
+        periods=(0.0025, 0.001, 0.0005),
+        values=np.array(values),
+        weights=weights / weights.sum(),
+        assumed=0.0025,
+        fitted=0.0025,
     )
 
 
@@ -91,7 +95,7 @@ def test_both_values_of_what_depends_on_the_rate_are_told():
     (told,) = of([1.0, 1.0, 1.0], values).sentences(space, known)
     assert "viscous friction of servo is 0.23 with 0.4 kHz and 0.11 with 2 kHz" in told and "--drive_dt" in told
     (told,) = of([1e-4, 1.0, 1.0], values).sentences(space, known)
-    assert "tell it from 0.4 kHz" in told and "1 kHz is used" in told
+    assert "allow 1 kHz to 2 kHz; 1 kHz is used" in told
     written = of([1e-4, 1.0, 1.0], values).to_dict(space)
     assert (
         written["used_s"] == 0.001

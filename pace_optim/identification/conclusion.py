@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from pace_optim.run.summary import summary
 from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
 from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
-from pace_optim.uncertainty.loop_rate import LoopRates, loop_rates
+from pace_optim.uncertainty.loop_rate import LoopRates, loop_rates, used_loop
 from pace_optim.uncertainty.step_share import change_without_step, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
 from pace_optim.uncertainty.undetermined import DELAY, held_at_prior, undetermined, without_delay
@@ -163,8 +164,8 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         undetermined=end.left_open,
         times_noise=end.times,
         std_means_nothing=end.is_far,
-        assumes_loop_rate=rates is not None or run.problem.assumes_loop_rate,
-        loop_rate={} if rates is None else rates.to_dict(problem.space),
+        assumes_loop_rate=run.problem.assumes_loop_rate,
+        loop_rate=_loop_rate(end),
         warnings=[
             *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
             *rough_motion(end.noise, float(end.jacobian.residuals.score[0])),
@@ -173,6 +174,14 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
             *end.consistency.sentences,
         ],
     )
+
+
+def _loop_rate(end: _End) -> dict[str, Any]:
+    """What is known of the loops' rate; nothing where it is stated, or as assumed for want of a comparison."""
+    if end.rates is not None:
+        return end.rates.to_dict(end.problem.space)
+    assumed, used = end.problem.assumed_loop, end.problem.loop_dt
+    return {} if assumed in (None, used) else used_loop(assumed, used)
 
 
 def _reached(run: Optimization, outcome: Outcome) -> _End:
@@ -194,8 +203,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
 
 
 def _known_at(run: Optimization, problem: Problem, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
-    ended = run.descents[-1] if run.descents else None
-    return assess(problem, _assessor(run, problem), run.colouring, x, held, ended)
+    return assess(problem, _assessor(run, problem), run.colouring, x, held, run.ended)
 
 
 def _assessor(run: Optimization, problem: Problem) -> Evaluator:
@@ -211,7 +219,7 @@ def _told_of_rate(run: Optimization, end: _End) -> _End:
     if rates is None:
         return end
     end = replace(end, rates=rates)
-    if rates.chosen == rates.assumed:
+    if rates.chosen == rates.fitted:
         return end
     x = end.problem.space.to_normalised(torch.from_numpy(rates.value_at(rates.chosen)))
     return replace(end, problem=end.problem.with_drive_dt(rates.chosen)).moved(run, x)

@@ -13,7 +13,7 @@ from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg
 from pace_optim.optimizers.search import agree_to_stop, search
-from pace_optim.optimizers.way_down import PIECES, WayDown, WayDownCfg
+from pace_optim.optimizers.way_down import PIECES, WHOLE, WayDown, WayDownCfg
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.problem.processes import Processes
@@ -28,6 +28,10 @@ from pace_optim.uncertainty.undetermined import at_prior
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 _INTERRUPTED = "interrupted"
+_LOOP_IN_DOUBT = 1.5
+"""Times the noise above which a fit with an assumed loop tries the other kind."""
+OTHER_LOOP = "other loop, "
+"""What the stages' names begin with on the way of the other kind of loop."""
 _FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
@@ -44,6 +48,18 @@ class Outcome:
     def is_interrupted(self) -> bool:
         """Whether that is only the best so far."""
         return self.stop_reasons == [_INTERRUPTED]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Course:
+    """A problem and the way down with it."""
+
+    problem: Problem
+    evaluator: Evaluator
+    """On the recordings that are trained on."""
+    assessor: Evaluator
+    """On all recordings."""
+    way: WayDown
 
 
 class Optimization:
@@ -71,38 +87,61 @@ class Optimization:
         self.folder = folder
         self.progress = progress
         self.history = History()
-        self.evaluator: Evaluator = problem.training_evaluator()
-        pieces = problem.for_search().on_pieces(WayDownCfg().share)
-        self.pieces = pieces.training_evaluator()
+        self._restored: list[Descent] = []
         self.searcher = make_searcher(problem.for_search(settings.device), settings)
-        self.assessor: Evaluator = problem.evaluator()
         self.processes = processes or Processes()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = (
             make_optimizer(problem, settings, self.processes) if settings.optimizer != "least_squares" else None
         )
-        self.way = WayDown(
-            self.evaluator,
-            self.colouring,
-            pieces=self.pieces,
-            noise_score=noise_score(problem),
-            on_iteration=self._after_iteration,
-        )
+        self._courses: list[_Course] = []
+        self._use(self._course(problem))
         self._steps_before = 0
         self._search_stop: list[str] = []
         self._searched = False
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
+    def _course(self, problem: Problem, name: str = "") -> _Course:
+        """A way down with this problem, as far as an interrupted run had gone it."""
+        evaluator, pieces = problem.training_evaluator(), problem.for_search().on_pieces(WayDownCfg().share)
+        way = WayDown(
+            evaluator,
+            self.colouring,
+            pieces=pieces.training_evaluator(),
+            noise_score=noise_score(problem),
+            on_iteration=self._after_iteration,
+            name=name,
+        )
+        way.descents = [d for d in self._restored if d.stage in way.stages]
+        course = _Course(problem=problem, evaluator=evaluator, assessor=problem.evaluator(), way=way)
+        self._courses.append(course)
+        return course
+
+    def _use(self, course: _Course) -> None:
+        """Take a course's end for the fit's."""
+        self.problem, self.evaluator, self.assessor = course.problem, course.evaluator, course.assessor
+        self._in_use = course
+
+    @property
+    def ended(self) -> Descent | None:
+        """The last descent of the course whose end is the fit's; ``None`` before it."""
+        return next(reversed(self._in_use.way.descents), None)
+
+    @property
+    def way(self) -> WayDown:
+        """The way of the problem as it was stated."""
+        return self._courses[0].way
+
     @property
     def descents(self) -> list[Descent]:
         """All descents so far, in the order in which they began."""
-        return self.way.descents
+        return [descent for course in self._courses for descent in course.way.descents]
 
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        every = {self.searcher, self.pieces, self.evaluator, self.assessor}
+        every = {self.searcher, *(e for c in self._courses for e in (c.evaluator, c.assessor, c.way.pieces))}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
@@ -112,7 +151,8 @@ class Optimization:
         if self.optimizer is not None and checkpoint["history"].size:
             self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process)
             self._search_stop = checkpoint["search_stop"].tolist()
-        self.way.descents = Descent.restore(checkpoint)
+        self._restored = Descent.restore(checkpoint)
+        self.way.descents = [d for d in self._restored if d.stage in self.way.stages]
 
     def run(self, keep_interrupted: bool = True) -> Outcome:
         """Search and refine; interrupted, the best so far is kept, or the interruption is passed on."""
@@ -122,7 +162,9 @@ class Optimization:
         except KeyboardInterrupt:  # --resume goes on from the checkpoint
             if not keep_interrupted:
                 raise
-            return Outcome(x=self._best_so_far(), stop_reasons=[_INTERRUPTED])
+            x = self._best_so_far()
+            self._use(next((c for c in self._courses if any(d.x is x for d in c.way.descents)), self._in_use))
+            return Outcome(x=x, stop_reasons=[_INTERRUPTED])
 
     def _optimize(self) -> Outcome:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
@@ -133,9 +175,25 @@ class Optimization:
             end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
             end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within)
+            end = self._with_other_loop(end)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
+    def _with_other_loop(self, end: Descent) -> Descent:
+        """Where a fit ends far above the noise with loops that nobody stated: the better of both kinds of loop."""
+        problem = self.problem
+        above = end.score > _LOOP_IN_DOUBT**2 * self.way.noise_score and end.score > self.way.cfg.on_whole.target_score
+        if problem.assumed_loop is None or problem.delay_mode != "command" or not above:
+            return end
+        kind, period = ("once per control step", problem.control_dt) if problem.loop_dt == 0 else ("continuously", 0.0)
+        self.progress.say(f"above the noise: fitting drives whose loops run {kind}, as nobody stated their rate")
+        other = self._course(problem.with_loop(period), OTHER_LOOP)
+        other_end = other.way.run([end.x])
+        if not other_end.score < end.score:
+            return end
+        self._use(other)
+        return other_end
 
     def _starts(self) -> list[torch.Tensor]:
         """The start of the parameters, and the same without the effects."""
@@ -202,7 +260,7 @@ class Optimization:
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
         now = next((d for d in descents if not d.stop_reason), descents[-1])
-        best, on_pieces = min(d.score for d in descents), now.stage == PIECES
+        best, on_pieces = min(d.score for d in descents), now.stage.endswith(PIECES)
         cfg = self.way.cfg.on_pieces if on_pieces else self.way.cfg.on_whole
         if not on_pieces:
             self.refuse_divergence(best)
@@ -228,9 +286,8 @@ class Optimization:
             )
 
     def _best_so_far(self) -> torch.Tensor:
-        stages = [[d for d in self.descents if (d.stage == PIECES) == on_pieces] for on_pieces in (False, True)]
-        for descents in stages:
-            known = [d for d in descents if np.isfinite(d.score)]
+        for stage in (WHOLE, PIECES):
+            known = [d for d in self.descents if d.stage.endswith(stage) and np.isfinite(d.score)]
             if known:
                 return min(known, key=lambda d: d.score).x
         if self.optimizer is not None and self.optimizer.generation:

@@ -292,6 +292,10 @@ def wrapped_targets(evidence: Evidence) -> Iterator[Change]:
             )
 
 
+_LONGER_THAN_HELD = 4
+"""Times the time for which a command is usually held: a target that stays at its end for longer is cut."""
+
+
 def clipped_targets(evidence: Evidence) -> Iterator[Change]:
     """The log and the drive disagree on where targets end."""
     view = evidence.view
@@ -319,10 +323,11 @@ def clipped_targets(evidence: Evidence) -> Iterator[Change]:
 
 
 def _flat_ends(target: np.ndarray) -> np.ndarray:
-    """Where a target stays at its largest or smallest value, (G,) bool."""
-    return ((target == target.max()) | (target == target.min())) & (
-        (np.diff(target, prepend=np.nan) == 0) | (np.diff(target, append=np.nan) == 0)
-    )
+    """Where a target stays at its largest or smallest value for longer than commands are held, (G,) bool."""
+    begins = np.flatnonzero(np.diff(target, prepend=np.nan) != 0)
+    lengths = np.diff(begins, append=len(target))
+    stays = np.repeat(lengths > _LONGER_THAN_HELD * np.median(lengths), lengths)
+    return stays & ((target == target.max()) | (target == target.min()))
 
 
 def lifted_limits(evidence: Evidence) -> Iterator[Change]:

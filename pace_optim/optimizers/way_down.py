@@ -6,6 +6,9 @@
    simulate a stated multiple of what the descents took. Descend again from its best.
 3. Descend on the whole recordings from the end that is best there.
 
+Where nobody stated how often the drives' loops run and the fit ends above the noise, a second way begins there with the
+other kind of loop, held or continuous; the better end is kept.
+
 A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
 physics is missing, the fit ends early.
 """
@@ -22,6 +25,7 @@ from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_
 from pace_optim.problem.evaluator import Evaluator
 
 PIECES, WHOLE = "pieces", "whole"
+"""What a descent's stage ends with."""
 
 
 @dataclass(kw_only=True)
@@ -58,6 +62,7 @@ class WayDown:
         noise_score: float = 0.0,
         cfg: WayDownCfg | None = None,
         on_iteration: Callable[[Sequence[Descent]], None] | None = None,
+        name: str = "",
     ):
         """Prepare the stages.
 
@@ -68,6 +73,7 @@ class WayDown:
             noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
             cfg: Numbers of the stages.
             on_iteration: Called with the stage's descents after each iteration.
+            name: What its stages' names begin with, where a fit has several ways.
         """
         self.cfg = cfg or WayDownCfg()
         self.evaluator = evaluator
@@ -76,6 +82,7 @@ class WayDown:
         self.noise_score = noise_score
         self.descents: list[Descent] = []
         """All so far, in the order in which they began."""
+        self.stages = f"{name}{PIECES}", f"{name}{WHOLE}"
         self._on_iteration = on_iteration or (lambda _: None)
 
     def run(self, starts: Sequence[torch.Tensor], search: Callable[[int], torch.Tensor] | None = None) -> Descent:
@@ -85,22 +92,23 @@ class WayDown:
             starts: Normalised vectors, (size,).
             search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
         """
-        if not any(d.stage == WHOLE for d in self.descents):
+        pieces, whole = self.stages
+        if not any(d.stage == whole for d in self.descents):
             starts = list(starts)
-            self._descend(PIECES, starts)
+            self._descend(pieces, starts)
             best = min(self.descents, key=lambda d: d.score)
             if search is not None and self.is_far(best.score):
                 spent = sum(d.simulations for d in self.descents)
                 starts.append(search(round(self.cfg.search_budget * spent)))
-                self._descend(PIECES, starts)
+                self._descend(pieces, starts)
             self.descents.append(self._best_on_whole(starts))
-        return self._descend(WHOLE, [])
+        return self._descend(whole, [])
 
     def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
         """Descend on the whole recordings from a vector that is known to be near the best."""
         if not self.descents:
-            self.descents = [Descent(x=x, stage=WHOLE)]
-        return self._descend(WHOLE, [], cfg)
+            self.descents = [Descent(x=x, stage=self.stages[1])]
+        return self._descend(self.stages[1], [], cfg)
 
     def is_far(self, score: float) -> bool:
         """Whether a score is above the noise by more than what a wrong valley may leave."""
@@ -111,7 +119,7 @@ class WayDown:
         own = [d for d in self.descents if d.stage == stage]
         added = [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=stage) for x in starts[len(own) :]]
         own, self.descents = [*own, *added], [*self.descents, *added]
-        on_pieces = stage == PIECES
+        on_pieces = stage == self.stages[0]
         cfg = cfg or (self.cfg.on_pieces if on_pieces else self.cfg.on_whole)
         evaluator = self.pieces if on_pieces else self.evaluator
         cfg = replace(cfg, noise_score=self.noise_score)
@@ -119,13 +127,13 @@ class WayDown:
 
     def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
         """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""
-        ends = [d for d in self.descents if d.stage == PIECES]
+        ends = [d for d in self.descents if d.stage == self.stages[0]]
         vectors = torch.stack([*(d.x for d in ends), *starts])
         scores = self.evaluator.residuals(self.evaluator.space.to_physical(vectors)).score
         best = int(scores.argmin())
         hessian = ends[best].hessian if best < len(ends) else None
         known = [float(scores[best])] if bool(scores[best].isfinite()) else []
-        return Descent(x=vectors[best].clone(), stage=WHOLE, hessian=hessian, damping=_DAMPING, scores=known)
+        return Descent(x=vectors[best].clone(), stage=self.stages[1], hessian=hessian, damping=_DAMPING, scores=known)
 
 
 _DAMPING = 1e-5

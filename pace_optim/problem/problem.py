@@ -69,6 +69,8 @@ class Problem:
     """Facts of the drives that are identified because nobody knows them."""
     passive_joints: bool = False
     """Whether joints without drives move too."""
+    assumed_loop: float | None = None
+    """Period of the drives' loops where nobody has stated it [s], 0: continuous; ``None``: it is stated."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -147,37 +149,26 @@ class Problem:
 
     def with_drive_dt(self, drive_dt: float) -> Problem:
         """The same with another step of the drives' own loops, and a physics step that fits it [s]; 0: continuous."""
+        return replace(self.with_loop(drive_dt), assumed_loop=None)
+
+    def with_loop(self, drive_dt: float, physics_dt: float | None = None) -> Problem:
+        """The same with another step of loops whose step remains assumed, and a physics step of at most that [s]."""
         plain = copy.deepcopy(self.plain_cfg)
         _set_drive_dt(plain, drive_dt)
         set_drive_rate(plain)
-        physics_dt = plain.sim.dt / max(1, math.ceil(plain.sim.dt / self.physics_dt * (1 - 1e-9)))
-        return replace(self, plain_cfg=plain, env_cfg=_configured(plain, physics_dt, self.env_cfg.sim2real.effects))
-
-    def with_loop(self, drive_dt: float, physics_dt: float) -> Problem:
-        """The same with another step of the drives' own loops, and a physics step that is no longer than given [s]."""
-        other = self.with_drive_dt(drive_dt)
-        longest = other.plain_cfg.sim.dt
-        return other.with_physics_dt(longest / max(1, math.ceil(longest / physics_dt * (1 - 1e-9))))
+        longest = plain.sim.dt
+        finest = longest / max(1, math.ceil(longest / (physics_dt or self.physics_dt) * (1 - 1e-9)))
+        return replace(self, plain_cfg=plain, env_cfg=_configured(plain, finest, self.env_cfg.sim2real.effects))
 
     @property
     def loop_dt(self) -> float:
-        """Shortest time between two runs of the drives' loops [s]."""
-        drives = self.plain_cfg.scene.robot.actuators.values()
-        return min(self.control_dt if drive.drive_dt is None else drive.drive_dt for drive in drives)
+        """Shortest time between two runs of the drives' loops [s]; 0: one runs continuously."""
+        return _loop_dt(self.plain_cfg, self.control_dt)
 
     @property
     def assumes_loop_rate(self) -> bool:
-        """Whether drives hold their torque over a control step that nobody has stated as their loops'.
-
-        A model file states gains at most. What a log states of its drive (gains, limits) says nothing of the rate, and
-        only ``drive_dt`` does; where even the gains are assumed, a rate is no more than they are.
-        """
-        drives = self.plain_cfg.scene.robot.actuators.values()
-        stated = any(drive.implicit or drive.drive_dt is not None for drive in drives)
-        gains = not self.plain_cfg.sim2real.assumed_gains or any(
-            r.drive.stiffness is not None for r in self.dataset.recordings
-        )
-        return is_model_file(self.task) and not stated and (gains or "stiffness" in self.unknown)
+        """Whether nobody has stated how often the drives' loops run."""
+        return self.assumed_loop is not None
 
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""
@@ -311,11 +302,35 @@ def load_problem(
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
+        assumed_loop=_assumed_loop(task, plain, drive_dt, told, unknown, control_dt),
         contradictions=(*told_of_gains(env, told, unknown), *_contradictions(env, [*recordings, *held_out])),
         passive_joints=env.scene["robot"].has_passive_joints,
     )
     env.close()
     return problem
+
+
+def _loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
+    drives = cfg.scene.robot.actuators.values()
+    return min(0.0 if drive.implicit else drive.drive_dt or control_dt for drive in drives)
+
+
+def _assumed_loop(
+    task: str,
+    cfg: PaceSim2realEnvCfg,
+    drive_dt: float | None,
+    recordings: Sequence[Recording],
+    unknown: Sequence[str],
+    control_dt: float,
+) -> float | None:
+    """Period of loops that nobody has stated [s].
+
+    A model file states gains at most, and so does a log; only ``drive_dt`` states a rate. Where even the gains are
+    assumed, a rate is no more than they are.
+    """
+    gains = not cfg.sim2real.assumed_gains or any(r.drive.stiffness is not None for r in recordings)
+    assumed = is_model_file(task) and drive_dt is None and (gains or "stiffness" in unknown)
+    return _loop_dt(cfg, control_dt) if assumed else None
 
 
 def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:

@@ -84,8 +84,8 @@ class FitResult(DriveResult):
             refuse(source, "rmse/train has no values", CURE)
         for key in ("assumed_s", "used_s") if self.loop_rate else ():
             value = self.loop_rate.get(key)
-            if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
-                refuse(source, f"loop_rate/{key} must be a time above 0 [s]", CURE)
+            if isinstance(value, bool) or not isinstance(value, int | float) or value < 0:
+                refuse(source, f"loop_rate/{key} must be a time [s], or 0 for a continuous loop", CURE)
         labels = {f"{name}/{key}" for name, entries in self.parameters.items() for key in entries}
         named = [*self.at_bound, *self.no_influence, *self.undetermined]
         named += [*(label for group in self.indistinguishable for label in group)]

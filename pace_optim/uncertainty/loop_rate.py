@@ -20,10 +20,10 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import SURE, autocovariance, filtered, inverse_of
 
-_RATES = (1e3, 2e3, 4e3)
+_RATES = (1e3, 2e3, 4e3, 8e3)
 """Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
 _SIMULATED = (1e-3, 5e-4)
-"""Periods that are simulated beside the assumed one [s]; what the others do follows from these, as its powers."""
+"""Periods that are simulated beside the assumed one and a continuous loop [s]; shorter ones follow by a polynomial."""
 _CHORD_STEPS = 4
 """Gauss–Newton steps with the derivatives of the assumed rate, at most."""
 _NOTHING_LEFT = 1e-5
@@ -45,6 +45,8 @@ class LoopRates:
     weights: np.ndarray
     """How likely each is, (periods,); their sum is 1."""
     assumed: float
+    """The period that is taken where the recordings tell none [s]."""
+    fitted: float
     """The period that was fitted with [s]."""
 
     @property
@@ -55,8 +57,8 @@ class LoopRates:
 
     @property
     def chosen(self) -> float:
-        """The assumed period where the recordings allow it, else the longest that they do [s]."""
-        return self.assumed if self.assumed in self.allowed else self.allowed[0]
+        """The fitted period where the recordings allow it, else the longest that they do [s]."""
+        return self.fitted if self.fitted in self.allowed else self.allowed[0]
 
     def value_at(self, period: float) -> np.ndarray:
         """What a fit finds with a candidate, physical (size,)."""
@@ -74,8 +76,7 @@ class LoopRates:
         """For ``result.json``: the periods, and the values at both ends of what the recordings allow."""
         ends = dict.fromkeys((self.chosen, self.allowed[-1]))
         return {
-            "assumed_s": self.assumed,
-            "used_s": self.chosen,
+            **used_loop(self.assumed, self.chosen),
             "allowed_s": list(self.allowed),
             "parameters": {f"{period:g}": space.to_dict(torch.from_numpy(self.value_at(period))) for period in ends},
         }
@@ -89,13 +90,10 @@ class LoopRates:
         """
         slow, fast = self.chosen, self.allowed[-1]
         begin = "Nobody stated how often the drives' loops run (--drive_dt). "
-        if slow != self.assumed:
-            begin += (
-                f"These recordings tell it from {_rate(self.assumed)} (a run each control step), and allow "
-                f"{_rate(slow)} {'and more' if fast < slow else 'alone'}; {_rate(slow)} is used. "
-            )
-        elif len(self.allowed) == 1:
-            return [f"{begin}These recordings allow a run each {1e3 * slow:g} ms alone, as the fit assumed."]
+        if len(self.allowed) == 1:
+            begin += f"These recordings allow {_rate(slow)} alone. "
+        elif slow != self.assumed:
+            begin += f"These recordings allow {_rate(self.allowed[0])} to {_rate(fast)}; {_rate(slow)} is used. "
         if fast == slow:
             return [begin.strip()]
         change = self.value_at(fast) - self.value_at(slow)
@@ -115,11 +113,16 @@ def _rate(period: float) -> str:
     return f"{1e-3 / period:.3g} kHz" if period else "a continuous loop"
 
 
-def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
-    """Compare the rates that the loops may have, at a fit that assumed one.
+def used_loop(assumed: float, used: float) -> dict[str, float]:
+    """For ``result.json``: the period that was assumed, and the one that the values are of [s]."""
+    return {"assumed_s": assumed, "used_s": used}
 
-    All are simulated with one physics step. Each is fitted again by Gauss–Newton steps with the derivatives J of the
-    assumed rate (the chord method). Residuals and values between and beyond the simulated periods follow by the
+
+def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
+    """Compare the rates that the loops may have, at a fit with one of them.
+
+    All are simulated with one physics step, and fitted again by Gauss-Newton steps with the derivatives J of the
+    fitted rate (the chord method). Residuals and values between the shortest simulated periods follow by the
     polynomial through these. A rate is not told by what was fitted alone: the residuals are those on all samples, also
     on those kept for validation. With r those of a candidate and d = r - r' their difference to the best one's,
 
@@ -128,43 +131,44 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2).
 
     Args:
-        problem: What was fitted; its loops run once per control step because nobody stated their rate.
+        problem: What was fitted, with loops whose rate nobody stated.
         x: The result, normalised (size,).
         there: Its residuals, and derivatives there, on the training samples.
         known: Which parameters have an error bar, (size,) bool; the others stay.
 
     Returns:
-        What was found; ``None`` where the rate is stated, a candidate cannot be simulated, or none is better than the
-        fit at its own physics step: then a simulation with that step has made the recordings.
+        What was found; ``None`` where the rate is stated, or none is better than the fit at its own physics step: then
+        a simulation with that step has made the recordings.
     """
-    if not problem.assumes_loop_rate or not known.any():
+    if problem.assumed_loop is None or not known.any():
         return None
-    assumed = problem.loop_dt
-    periods = [assumed, *(p for p in _SIMULATED if p < (1 - 1e-6) * assumed)]
-    while len(periods) < 3:  # a control step that is as short as a drive's
-        periods.append(periods[-1] / 2)
+    control, fitted = problem.control_dt, problem.loop_dt
     logged = max(r.command_dt or 0.0 for r in problem.dataset.recordings)
-    slower = [logged] if logged > (1 + _APART) * assumed else []
-    found = [_refitted(problem.with_loop(p, min(periods)), x, there, known) for p in [*periods, *slower]]
-    known_of = [each for each in found if each is not None]
-    if any(each is None for each in found[: len(periods)]):
-        return None
-    if float(there.residuals.score[0]) <= min(each.score for each in known_of):
-        return None
-    values, errors = np.stack([each.values for each in known_of]), torch.stack([each.error for each in known_of])
-    rates = [1 / f for f in _RATES if 1 / f < (1 - 1e-6) * assumed]
+    slower = [logged] if logged > (1 + _APART) * control else []
     continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
-    candidates = tuple(sorted({assumed, *rates, *continuous, *slower[: len(known_of) - len(periods)]}, reverse=True))
-    weights = np.zeros((len(candidates), len(known_of)))
+    periods = sorted({control, fitted, *(p for p in _SIMULATED if p < control), *slower, *continuous}, reverse=True)
+    finest = min(*_SIMULATED, control)
+    found = {p: end for p in periods if (end := _refitted(problem.with_loop(p, finest), x, there, known)) is not None}
+    if fitted not in found or float(there.residuals.score[0]) <= min(end.score for end in found.values()):
+        return None
+    nodes = tuple(found)[-3:]
+    between = [1 / f for f in _RATES if 1 / f < max(nodes) and 1 / f not in found] if len(nodes) > 1 else []
+    candidates = tuple(sorted({*found, *between}, reverse=True))
+    weights = np.zeros((len(candidates), len(found)))
     for row, period in zip(weights, candidates, strict=True):
-        if period > assumed:
-            row[-1] = 1.0
+        if period in found:
+            row[tuple(found).index(period)] = 1.0
         else:
-            row[: len(periods)] = _lagrange(periods, period)
-    chi2 = _against(errors, weights, known_of[0].where)
+            row[-len(nodes) :] = _lagrange(nodes, period)
+    values, errors = (np.stack([end.values for end in found.values()]), torch.stack([e.error for e in found.values()]))
+    chi2 = _against(errors, weights, found[fitted].where)
     likelihood = np.exp(-0.5 * chi2)
     return LoopRates(
-        periods=candidates, values=weights @ values, weights=likelihood / likelihood.sum(), assumed=assumed
+        periods=candidates,
+        values=weights @ values,
+        weights=likelihood / likelihood.sum(),
+        assumed=problem.assumed_loop,
+        fitted=fitted,
     )
 
 
