@@ -421,5 +421,5 @@ def test_a_descent_begins_at_the_longest_step_that_the_drives_allow(tmp_path):
     run = Optimization(
         settings, load_for_fit(settings, load_env_cfg(settings.task)), RunFolder(tmp_path), ProgressLine()
     )
-    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.pieces))
+    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.way.pieces))
     assert fine < coarse == 0.0025
