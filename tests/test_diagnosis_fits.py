@@ -309,7 +309,11 @@ def gaining(model, truth, gains):
 def test_a_descent_ends_when_every_joint_has_once_come_to_its_end(bench):
     one = JointModel.base(bench.problem)
     two = replace(
-        one, has=torch.zeros(0, 2, dtype=torch.bool), lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1)
+        one,
+        has=torch.zeros(0, 2, dtype=torch.bool),
+        lower=one.lower.repeat(2, 1),
+        upper=one.upper.repeat(2, 1),
+        ranges=one.ranges.repeat(2, 1),
     )
     small = 1e-5
     gains = [[small, 0.5], [small, 0.5], [0.5, small], [0.5, small], [0.5, 0.5]]  # the first joint gains again later
@@ -321,7 +325,11 @@ def test_a_neighbour_moves_another_entry_of_each_joint(bench):
     """As many rows as the joint with most free entries needs, whatever effects the others have."""
     one = JointModel.base(bench.problem)
     two = replace(
-        one, has=torch.zeros(0, 2, dtype=torch.bool), lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1)
+        one,
+        has=torch.zeros(0, 2, dtype=torch.bool),
+        lower=one.lower.repeat(2, 1),
+        upper=one.upper.repeat(2, 1),
+        ranges=one.ranges.repeat(2, 1),
     )
     two = two.with_effect(GAIN, torch.tensor([True, False])).with_effect(STRIBECK, torch.tensor([False, True]))
     size, most = two.size, len(BASE) + len(STRIBECK.parameters)

@@ -41,7 +41,9 @@ def test_joints_without_an_effect_do_not_fit_it(bench):
 def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(bench):
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
-    base = replace(one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1))
+    base = replace(
+        one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1), ranges=one.ranges.repeat(2, 1)
+    )
     values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
     model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
     model, physical = model.extended(physical, STRIBECK, torch.tensor([False, True]), values + 1)
@@ -52,7 +54,9 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
 def test_one_value_is_shared_where_that_explains_as_much(bench):
     base = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
-    model = replace(base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1))
+    model = replace(
+        base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1), ranges=base.ranges.repeat(2, 1)
+    )
     both = torch.tensor([True, True])
     found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
     model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, found)
