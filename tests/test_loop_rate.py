@@ -5,11 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from problems import CALM, chirp, env_cfg, make_problem, record
+from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 
+from pace_optim.identification.optimization import Optimization
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.drive_steps import set_drive_rate
+from pace_optim.run.folder import RunFolder
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.progress import ProgressLine
 from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.loop_rate import LoopRates, _against, _lagrange, loop_rates
 
@@ -53,6 +57,19 @@ def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state():
     assert (np.abs(problem.space.to_physical(x).numpy() - truth) > 5 * known.uncertainty.std).any()
     assert (np.abs(rates.value_at(0.001) - truth) < 4 * known.uncertainty.std).all()
     assert 0.001 in rates.allowed
+
+
+def test_loops_of_another_kind_are_fitted_where_they_are_better(tmp_path):
+    problem = recorded_at(0.0005).with_physics_dt(0.000625)
+    settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path))
+    run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
+    held = run.run()
+    score = run.ended.score
+    other = run.with_other_loop(held.x)
+    assert run.problem.loop_dt == 0.0 and run.problem.assumed_loop == problem.loop_dt
+    assert run.ended.score < score and torch.equal(run.ended.x, other.x)
+    stages = [descent.stage for descent in run.descents]
+    assert stages[-2:] == ["other loop, pieces", "other loop, whole"] and "whole" in stages
 
 
 def test_only_drive_dt_states_a_rate():

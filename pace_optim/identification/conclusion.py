@@ -22,7 +22,7 @@ from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.summary import summary
 from pace_optim.uncertainty.assessment import Assessment, assess, trajectories
 from pace_optim.uncertainty.consistency import Consistency, check_consistency
-from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, times_noise
+from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, far_end, noise_score, times_noise
 from pace_optim.uncertainty.loop_rate import LoopRates, loop_rates, used_loop
 from pace_optim.uncertainty.step_share import change_without_step, step_share
 from pace_optim.uncertainty.uncertainty import Uncertainty
@@ -31,6 +31,8 @@ from pace_optim.uncertainty.warnings import fit_warnings, rough_motion
 
 _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
+_LOOP_IN_DOUBT = 1.5
+"""Times the noise above which a fit with loops that nobody stated tries others."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -216,6 +218,11 @@ def _told_of_rate(run: Optimization, end: _End) -> _End:
     if end.problem.assumes_loop_rate:
         run.progress.say("simulating other rates of the drives' loops, as nobody stated theirs")
     rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
+    least = float(end.jacobian.residuals.score[0]) if rates is None else rates.score
+    doubtful = end.problem.assumes_loop_rate and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)
+    if doubtful and (outcome := run.with_other_loop(end.x)) is not None:
+        end = _reached(run, outcome)
+        rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
     if rates is None:
         return end
     end = replace(end, rates=rates)

@@ -28,10 +28,10 @@ from pace_optim.uncertainty.undetermined import at_prior
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 _INTERRUPTED = "interrupted"
-_LOOP_IN_DOUBT = 1.5
-"""Times the noise above which a fit with an assumed loop tries the other kind."""
+_USUAL_LOOP = 1e-3
+"""Period of the loops that are tried where those of the fit are continuous, the usual one of servo drives [s]."""
 OTHER_LOOP = "other loop, "
-"""What the stages' names begin with on the way of the other kind of loop."""
+"""What the stages' names begin with on the way of the other loop."""
 _FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
@@ -144,6 +144,26 @@ class Optimization:
         every = {self.searcher, *(e for c in self._courses for e in (c.evaluator, c.assessor, c.way.pieces))}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
+    def with_other_loop(self, x: torch.Tensor) -> Outcome | None:
+        """Fit loops of another rate from where those ended that nobody stated.
+
+        Args:
+            x: Where these ended, normalised (size,).
+
+        Returns:
+            Where the others end, and they are the run's problem from now on; ``None`` where they are no better.
+        """
+        smooth = self.problem.loop_dt > 0 and self.problem.delay_mode == "command"
+        period = 0.0 if smooth else _USUAL_LOOP
+        rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
+        self.progress.say(f"above the noise: fitting drives whose loops run {rate}, as nobody stated their rate")
+        ended, other = self.ended, self._course(self.problem.with_loop(period), OTHER_LOOP)
+        end = other.way.run([x])
+        if ended is not None and not end.score < ended.score:
+            return None
+        self._use(other)
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
         self._steps_before = int(checkpoint["simulated_steps"])
@@ -175,25 +195,9 @@ class Optimization:
             end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
             end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within)
-            end = self._with_other_loop(end)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
-
-    def _with_other_loop(self, end: Descent) -> Descent:
-        """Where a fit ends far above the noise with loops that nobody stated: the better of both kinds of loop."""
-        problem = self.problem
-        above = end.score > _LOOP_IN_DOUBT**2 * self.way.noise_score and end.score > self.way.cfg.on_whole.target_score
-        if problem.assumed_loop is None or problem.delay_mode != "command" or not above:
-            return end
-        kind, period = ("once per control step", problem.control_dt) if problem.loop_dt == 0 else ("continuously", 0.0)
-        self.progress.say(f"above the noise: fitting drives whose loops run {kind}, as nobody stated their rate")
-        other = self._course(problem.with_loop(period), OTHER_LOOP)
-        other_end = other.way.run([end.x])
-        if not other_end.score < end.score:
-            return end
-        self._use(other)
-        return other_end
 
     def _starts(self) -> list[torch.Tensor]:
         """The start of the parameters, and the same without the effects."""

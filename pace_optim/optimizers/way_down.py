@@ -6,9 +6,6 @@
    simulate a stated multiple of what the descents took. Descend again from its best.
 3. Descend on the whole recordings from the end that is best there.
 
-Where nobody stated how often the drives' loops run and the fit ends above the noise, a second way begins there with the
-other kind of loop, held or continuous; the better end is kept.
-
 A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
 physics is missing, the fit ends early.
 """

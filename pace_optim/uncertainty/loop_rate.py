@@ -48,6 +48,8 @@ class LoopRates:
     """The period that is taken where the recordings tell none [s]."""
     fitted: float
     """The period that was fitted with [s]."""
+    score: float = 0.0
+    """The lowest that any of them leaves on the training samples [rad²]."""
 
     @property
     def allowed(self) -> tuple[float, ...]:
@@ -169,6 +171,7 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         weights=likelihood / likelihood.sum(),
         assumed=problem.assumed_loop,
         fitted=fitted,
+        score=min(end.score for end in found.values()),
     )
 
 
