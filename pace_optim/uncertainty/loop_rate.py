@@ -24,6 +24,8 @@ _RATES = (1e3, 2e3, 4e3, 8e3)
 """Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
 _SIMULATED = (1e-3, 5e-4)
 """Periods that are simulated beside the assumed one and a continuous loop [s]; shorter ones follow by a polynomial."""
+_COARSE = 2.0 + 1e-6
+"""Times the finest of them: a longer physics step may be one that made the recordings."""
 _CHORD_STEPS = 4
 """Gauss–Newton steps with the derivatives of the assumed rate, at most."""
 _NOTHING_LEFT = 1e-5
@@ -93,7 +95,7 @@ class LoopRates:
         slow, fast = self.chosen, self.allowed[-1]
         begin = "Nobody stated how often the drives' loops run (--drive_dt). "
         if len(self.allowed) == 1:
-            begin += f"These recordings allow {_rate(slow)} alone. "
+            begin += f"These recordings favour {_rate(slow)}; the error bars hold the others. "
         elif slow != self.assumed:
             begin += f"These recordings allow {_rate(self.allowed[0])} to {_rate(fast)}; {_rate(slow)} is used. "
         if fast == slow:
@@ -139,8 +141,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         known: Which parameters have an error bar, (size,) bool; the others stay.
 
     Returns:
-        What was found; ``None`` where the rate is stated, or none is better than the fit at its own physics step: then
-        a simulation with that step has made the recordings.
+        What was found; ``None`` where the rate is stated, or none is better than the fit at its own, coarser physics
+        step: then a simulation with that step has made the recordings.
     """
     if problem.assumed_loop is None or not known.any():
         return None
@@ -151,7 +153,9 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     periods = sorted({control, fitted, *(p for p in _SIMULATED if p < control), *slower, *continuous}, reverse=True)
     finest = min(*_SIMULATED, control)
     found = {p: end for p in periods if (end := _refitted(problem.with_loop(p, finest), x, there, known)) is not None}
-    if fitted not in found or float(there.residuals.score[0]) <= min(end.score for end in found.values()):
+    least = min((end.score for end in found.values()), default=math.inf)
+    coarser = problem.physics_dt > _COARSE * finest
+    if fitted not in found or (coarser and float(there.residuals.score[0]) <= least):
         return None
     nodes = tuple(found)[-3:]
     between = [1 / f for f in _RATES if 1 / f < max(nodes) and 1 / f not in found] if len(nodes) > 1 else []
@@ -171,7 +175,7 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         weights=likelihood / likelihood.sum(),
         assumed=problem.assumed_loop,
         fitted=fitted,
-        score=min(end.score for end in found.values()),
+        score=least,
     )
 
 
