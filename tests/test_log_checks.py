@@ -16,6 +16,7 @@ from pace_envs.task_source import use_task
 from pace_optim.identification.beginning import load_for_fit
 from pace_optim.log_checks import check_log, checked
 from pace_optim.log_checks.balance import _bounded
+from pace_optim.log_checks.checks import _flat_ends
 from pace_optim.problem.problem import load_problem
 from pace_optim.run.settings import FitSettings
 
@@ -97,3 +98,9 @@ def test_logs_of_strangers_are_named(folder, says):
     here = STRANGERS / folder
     problem = load_problem(use_task(str(here / "arm.xml")), data=[here / "a.csv", here / "b.csv"], tell=lambda _: None)
     assert re.search(says, " ".join(each.sentence for each in check_log(problem)))
+
+
+@pytest.mark.parametrize(("repeat", "cut", "flat"), [(1, 1.0, 0), (3, 1.0, 0), (1, 0.8, 77), (3, 0.8, 231)])
+def test_a_target_is_cut_where_it_stays_for_longer_than_commands_are_held(repeat, cut, flat):
+    target = np.repeat(np.clip(np.sin(0.1 * np.arange(200)), -cut, cut), repeat)
+    assert _flat_ends(target).sum() == flat

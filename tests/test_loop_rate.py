@@ -1,4 +1,4 @@
-"""The rate of the drives' loops where nobody stated it: what recordings tell of it, and what the error bars hold."""
+"""The rate of the drives' loops where it is not stated: what recordings show of it, and what the error bars hold."""
 
 import dataclasses
 
@@ -42,6 +42,15 @@ def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_sa
     problem = recorded_at(0.0025)
     x, known = fitted(problem)
     assert loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std)) is None
+
+
+def test_a_rate_that_fits_best_is_compared_with_the_others_too():
+    """Its values depend on it all the same. Where the fit's own step was the best, none was compared."""
+    problem = recorded_at(0.0005).with_drive_dt(0.0005)
+    problem = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
+    x, known = fitted(problem)
+    rates = loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std))
+    assert rates.chosen == 0.0005 and len(rates.periods) > 3
 
 
 @pytest.mark.parametrize("physics_dt", [0.0025, 0.0005])

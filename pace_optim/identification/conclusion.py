@@ -32,7 +32,7 @@ from pace_optim.uncertainty.warnings import fit_warnings, rough_motion
 _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
 _LOOP_IN_DOUBT = 1.5
-"""Times the noise above which a fit with loops that nobody stated tries others."""
+"""Times the noise above which a fit with an assumed loop rate tries another."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -61,7 +61,7 @@ class _End:
     left_open: list[str] = field(default_factory=list)
     """Labels of what the recordings leave open: it is at its prior."""
     rates: LoopRates | None = None
-    """What is known of the loops' rate where nobody stated it."""
+    """What is known of the loops' rate where it is not stated."""
     without_step: torch.Tensor | None = None
     """How the motion would change without a physics step, (K, R, n) [rad]."""
     consistency: Consistency = field(default_factory=Consistency)
@@ -214,9 +214,9 @@ def _assessor(run: Optimization, problem: Problem) -> Evaluator:
 
 
 def _told_of_rate(run: Optimization, end: _End) -> _End:
-    """What depends on the rate of the drives' loops where nobody stated it; another rate, where only others fit."""
+    """Add what depends on an assumed loop rate; take another rate where only others fit."""
     if end.problem.assumes_loop_rate:
-        run.progress.say("simulating other rates of the drives' loops, as nobody stated theirs")
+        run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
     rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
     least = float(end.jacobian.residuals.score[0]) if rates is None else rates.score
     doubtful = end.problem.assumes_loop_rate and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)

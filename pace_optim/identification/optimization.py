@@ -145,18 +145,18 @@ class Optimization:
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
     def with_other_loop(self, x: torch.Tensor) -> Outcome | None:
-        """Fit loops of another rate from where those ended that nobody stated.
+        """Fit loops of another rate, from the end of the fit with the assumed one.
 
         Args:
-            x: Where these ended, normalised (size,).
+            x: That end, normalised (size,).
 
         Returns:
-            Where the others end, and they are the run's problem from now on; ``None`` where they are no better.
+            Their end; they are the run's problem from now on. ``None`` where they are no better.
         """
         smooth = self.problem.loop_dt > 0 and self.problem.delay_mode == "command"
         period = 0.0 if smooth else _USUAL_LOOP
         rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
-        self.progress.say(f"above the noise: fitting drives whose loops run {rate}, as nobody stated their rate")
+        self.progress.say(f"above the noise: fitting loops that run {rate}, as their rate is not stated")
         ended, other = self.ended, self._course(self.problem.with_loop(period), OTHER_LOOP)
         end = other.way.run([x])
         if ended is not None and not end.score < ended.score:

@@ -70,7 +70,7 @@ class Problem:
     passive_joints: bool = False
     """Whether joints without drives move too."""
     assumed_loop: float | None = None
-    """Period of the drives' loops where nobody has stated it [s], 0: continuous; ``None``: it is stated."""
+    """Assumed period of the drives' loops [s]; 0: continuous. ``None``: it is stated."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class Problem:
 
     @property
     def assumes_loop_rate(self) -> bool:
-        """Whether nobody has stated how often the drives' loops run."""
+        """Whether the rate of the drives' loops is not stated."""
         return self.assumed_loop is not None
 
     def evaluator(self) -> Evaluator:
@@ -323,7 +323,7 @@ def _assumed_loop(
     unknown: Sequence[str],
     control_dt: float,
 ) -> float | None:
-    """Period of loops that nobody has stated [s].
+    """Period of loops whose rate is not stated [s].
 
     A model file states gains at most, and so does a log; only ``drive_dt`` states a rate. Where even the gains are
     assumed, a rate is no more than they are.

@@ -49,7 +49,7 @@ class FitResult(DriveResult):
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
     """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
     assumes_loop_rate: bool = False
-    """Whether nobody stated the rate of the drives' loops; what depends on it is in ``step_error`` and ``std``."""
+    """Whether the rate of the drives' loops is assumed. What depends on it is in ``step_error`` and ``std``."""
     loop_rate: dict[str, Any] = field(default_factory=dict)
     """What the recordings say of that rate: the period that was assumed, the one that is used, those that they allow
     [s], and the parameters at both ends; empty where it is stated."""

@@ -24,7 +24,7 @@ def summary(result: FitResult) -> list[str]:
     if result.step_error:
         of = f"the physics step of {1e3 * result.physics_dt:g} ms"
         if result.assumes_loop_rate:
-            of += " and of a loop whose rate nobody stated"
+            of += " and of the assumed loop rate"
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))

@@ -1,4 +1,4 @@
-"""The rate of the drives' loops where nobody stated it: which rates the recordings allow, and what values depend on it.
+"""The rate of the drives' loops where it is not stated: which ones the recordings allow, and what depends on it.
 
 A loop that holds its torque over a period h sees the motion h / 2 late on average, which is kp h / 2 of viscous
 friction and kd h / 2 of armature. A fit with a wrong rate finds these in its values, at nearly the same error.
@@ -93,7 +93,7 @@ class LoopRates:
             known: Which of them have an error bar, (size,) bool.
         """
         slow, fast = self.chosen, self.allowed[-1]
-        begin = "Nobody stated how often the drives' loops run (--drive_dt). "
+        begin = "The rate of the drives' loops is not stated (--drive_dt). "
         if len(self.allowed) == 1:
             begin += f"These recordings favour {_rate(slow)}; the error bars hold the others. "
         elif slow != self.assumed:
@@ -135,7 +135,7 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2).
 
     Args:
-        problem: What was fitted, with loops whose rate nobody stated.
+        problem: What was fitted, with loops of an assumed rate.
         x: The result, normalised (size,).
         there: Its residuals, and derivatives there, on the training samples.
         known: Which parameters have an error bar, (size,) bool; the others stay.
