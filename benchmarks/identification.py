@@ -219,7 +219,7 @@ def main() -> int:
                         again = run_fit(optimizer, delay_mode, recording, Path(folder), args.seed)
                     run = replace(run, physics_seconds=spent[0], python_seconds=again.seconds - spent[0])
                 runs.append(run)
-    print(report(runs))
+    print(*report(runs).split("\n"), sep="\n")
     content["runs"] = [{**asdict(run), "passed": run.passed} for run in runs]
     if args.cmaes_seconds is not None:
         hybrid = [run.seconds for run in runs if run.optimizer == "hybrid" and run.delay_mode == "command"]
@@ -235,7 +235,7 @@ def main() -> int:
         )
         content["joint_cmaes"] = {"stopped_at_s": seconds, **asdict(searched)}
     write_json(args.output / "identification.json", content)
-    print(f"\n{args.output / 'identification.json'}")
+    print("", args.output / "identification.json", sep="\n")
     return int(args.check and not all(run.passed for run in runs))
 
 

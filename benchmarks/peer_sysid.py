@@ -154,13 +154,17 @@ def main() -> int:
     case = drive_problem(args.steps)
     peer = Peer(case)
     off = check_replay(case, peer)
-    print(f"{len(case.fitted)} parameters, {args.steps} steps, both simulators replay the truth to {off:.1e} rad\n")
+    print(
+        f"{len(case.fitted)} parameters, {args.steps} steps, both simulators replay the truth to {off:.1e} rad",
+        "",
+        sep="\n",
+    )
     options = {} if args.x_scale is None else {"x_scale": args.x_scale}
     runners: list[Callable[[], Trace]] = [lambda: run_ours(case)]
     runners += [lambda name=name: peer.run(name, **options) for name in args.optimizers]
     traces = median_runs(runners, args.repetitions)
     ratios = speed_ups(traces)
-    print(report(traces))
+    print(*report(traces).split("\n"), sep="\n")
     plot(traces, args.output / "peer_sysid.png")
     write_json(
         args.output / "peer_sysid.json",
@@ -174,7 +178,7 @@ def main() -> int:
             "to_the_same_score": ratios,
         },
     )
-    print(f"\n{args.output / 'peer_sysid.png'}\n{args.output / 'peer_sysid.json'}")
+    print("", args.output / "peer_sysid.png", args.output / "peer_sysid.json", sep="\n")
     fastest = min((r for r in ratios if r["score"] == max_score(traces, r["peer"])), key=lambda r: r["ratio"])
     return int(fastest["ratio"] < args.at_least)
 

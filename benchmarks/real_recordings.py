@@ -103,7 +103,7 @@ def fit_command(args: argparse.Namespace) -> None:
     result, folder = fit(settings)
     print(*summary(result), sep="\n")
     content = torch.load(folder / "best_trajectory.pt", weights_only=True)
-    print(f"\n{errors_table(content, result)}")
+    print("", *errors_table(content, result).split("\n"), sep="\n")
     for name, figure in plot_trajectories(content, title=robot.name).items():
         figure.savefig(folder / f"{name}.png", dpi=PLOT_DPI)
     print(f"plots: {folder}")

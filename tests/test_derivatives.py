@@ -15,6 +15,7 @@ from problems import (
 )
 
 from pace_optim.optimizers.derivatives import NARROW, Colouring, Jacobian, colour, stencil
+from pace_optim.optimizers.levenberg_marquardt import LinearModel
 from pace_optim.problem.evaluator import Residuals
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}
@@ -198,6 +199,25 @@ def test_derivatives_along_principal_directions_are_those_of_each_entry(joints, 
                 )
         (hessian, _), score = there.normal_equations(), float(every.score[0])
         assert around.noise(every) < 1e-12
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_an_entry_whose_influence_is_rounding_spoils_no_other_derivative(noise):
+    """The bias of an upright axis, on a robot of 17 joints: all principal directions pointed along it."""
+    joints, colours = ((0,),) * 6, tuple((entry,) for entry in range(6))
+    slope = slope_of(joints, 3)
+    slope[..., 4] *= 1e-15
+    hessian = torch.einsum("tni,tnj->ij", slope, slope) / len(slope)
+    hessian[4], hessian[:, 4] = 1e-15 * hessian[3], 1e-15 * hessian[:, 3]
+    hessian[4, 4] = 1e-30
+    colouring, residuals = linear(joints, colours, slope)
+    x = torch.full((6,), 0.2, dtype=torch.float64)
+    around = stencil(x, colouring, hessian, noise, 1.0)
+    there = around.jacobian(residuals(torch.cat([x[None], around.vectors])))
+    for entry in (0, 1, 2, 3, 5):
+        torch.testing.assert_close(there.column(entry)[:, 0, 0], slope[:, 0, entry], rtol=1e-4, atol=1e-6)
+    model = LinearModel(*there.normal_equations())
+    assert model.step(x, 1e-9)[4] == x[4]
 
 
 def test_a_step_changes_the_motion_by_ten_times_the_noise_and_at_most_by_the_error():

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import torch
 
+from pace_optim.optimizers.levenberg_marquardt import NO_INFLUENCE
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 
@@ -153,7 +154,8 @@ def _principal_directions(hessian: torch.Tensor, x: torch.Tensor, colouring: Col
     share, what these change although the others make up for it. An entry at a bound, or without influence, is alone.
     """
     joints = colouring.joints
-    inner = [i for i in range(len(x)) if float(hessian[i, i]) > 0 and 1 - abs(float(x[i])) > _AT_BOUND]
+    least = NO_INFLUENCE * float(hessian.diagonal().max())
+    inner = [i for i in range(len(x)) if float(hessian[i, i]) > least and 1 - abs(float(x[i])) > _AT_BOUND]
     result = torch.eye(len(x), dtype=torch.float64)
     trees = {joints[i] for i in inner}
     shared = [i for i in inner if any(set(tree) < set(joints[i]) for tree in trees)]

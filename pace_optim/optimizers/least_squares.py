@@ -1,8 +1,10 @@
 """Levenberg–Marquardt on rollout residuals of a whole robot, inside the bounds.
 
-An iteration looks around x, which gives H = JᵀJ, g = Jᵀr and the simulation's noise (``derivatives``), and then tries
-steps at several dampings (``levenberg_marquardt``). H, g and x are all that it goes on from: a descent that is resumed
-is the one that was interrupted, bit for bit.
+An iteration looks around x, which gives J, H = JᵀJ, g = Jᵀr and the simulation's noise (``derivatives``), and tries
+steps at several dampings (``levenberg_marquardt``). A look costs as many simulations as a tree has parameters, a step a
+few: so the iteration goes on with the same J, and g = Jᵀr of its best trial, as long as that pays (Shamanskii's method;
+Ortega and Rheinboldt, 1970, 10.2). H, g and x are all that the next one needs: a descent that is resumed is the one
+that was interrupted, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,12 +18,14 @@ import numpy as np
 import torch
 
 from pace_actuators.files import checked
-from pace_optim.optimizers.derivatives import Colouring, stencil
+from pace_optim.optimizers.derivatives import NOISE_ROWS, Colouring, Jacobian, stencil
 from pace_optim.optimizers.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
 from pace_optim.problem.evaluator import Evaluator
 
 _CREEPING = 3
 _REFUSED = 2
+_AS_EXPECTED = 0.5
+"""Part of the expected gain that a step must bring for J to serve for another."""
 
 
 @dataclass(kw_only=True)
@@ -120,10 +124,10 @@ class Descent(DescentState):
 
     def look(
         self, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """H and g at x; where they are not known, they and the noise are taken."""
+    ) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
+        """H and g at x; where they are not known, they, the noise and J are taken."""
         if self.hessian is not None and self.gradient is not None:
-            return self.hessian, self.gradient
+            return self.hessian, self.gradient, None
         around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
         residuals = evaluator.residuals(evaluator.space.to_physical(vectors), where)
@@ -131,8 +135,9 @@ class Descent(DescentState):
         if not self.scores and math.isfinite(score := float(residuals.score[0])):
             self.scores = [score]
         self.noise = around.noise(residuals)
-        self.hessian, self.gradient = around.jacobian(residuals).normal_equations()
-        return self.hessian, self.gradient
+        jacobian = around.jacobian(residuals)
+        self.hessian, self.gradient = jacobian.normal_equations()
+        return self.hessian, self.gradient, jacobian
 
 
 def checkpoint_of(descents: Sequence[Descent]) -> dict[str, np.ndarray]:
@@ -187,7 +192,7 @@ def _iterate(
 ) -> None:
     """Look around if x has moved, try steps, take the best, and say when it is time to stop."""
     blind = descent.hessian is None
-    hessian, gradient = descent.look(evaluator, colouring, where)
+    hessian, gradient, jacobian = descent.look(evaluator, colouring, where)
     if not descent.scores:
         descent.stop_reason = "diverged at its start"
         return
@@ -195,27 +200,51 @@ def _iterate(
         descent.stop_reason = f"score below {cfg.target_score:g}"
         return
     descent.iteration += 1
-    model = LinearModel(hessian, gradient)
-    trials = model.trials(descent.x, descent.damping)
-    left, allowed = model.expected_gain(trials[0] - descent.x), cfg.tolerance(descent.score) * descent.score
-    scores = evaluator.residuals(evaluator.space.to_physical(trials), where).score
-    descent.simulations += len(trials)
-    best = int(scores.argmin())
-    if float(scores[best]) < descent.score:
-        descent.x = trials[best].clone()
-        descent.damping, descent.gradient, descent.refused = next_damping(descent.damping, best), None, 0
+    descent.scores.append(descent.score)
+    step = _Step(descent, hessian, gradient)
+    left, allowed = step.expected, cfg.tolerance(descent.score) * descent.score
+    steps = 1 if jacobian is None else 1 + (len(colouring.colours) + 1 + NOISE_ROWS) // len(step.trials)
+    for _ in range(steps):
+        gain, error = step.take(evaluator, where)
+        if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
+            break
+        step = _Step(descent, hessian, jacobian.transposed_times(error))
+    if descent.scores[-1] < descent.scores[-2]:
+        descent.gradient, descent.refused = None, 0
     else:
         descent.refused += 1
-        descent.damping = next_damping(descent.damping, None)
         if blind:  # the derivatives were those of a first look
             descent.gradient = None
-    descent.scores.append(min(descent.score, float(scores[best])))
     if descent.score <= cfg.target_score:
         descent.stop_reason = f"score below {cfg.target_score:g}"
     elif not blind and (left <= allowed or descent.refused >= _REFUSED or _creeps(descent.scores, cfg)):
         descent.stop_reason = "converged"
     elif descent.iteration >= cfg.max_iteration:
         descent.stop_reason = f"max_iteration {cfg.max_iteration}"
+
+
+class _Step:
+    """Trials of one step of a descent, at several dampings."""
+
+    def __init__(self, descent: Descent, hessian: torch.Tensor, gradient: torch.Tensor):
+        model = LinearModel(hessian, gradient)
+        self.descent = descent
+        self.trials = model.trials(descent.x, descent.damping)
+        self.expected = model.expected_gain(self.trials[0] - descent.x)
+        """What the first of them gains where J is right [rad²]."""
+
+    def take(self, evaluator: Evaluator, where: torch.Tensor | None) -> tuple[float, torch.Tensor]:
+        """Simulate them and go to the best; returns what was gained [rad²] and the best's error, (K, R, n)."""
+        descent = self.descent
+        residuals = evaluator.residuals(evaluator.space.to_physical(self.trials), where)
+        descent.simulations += len(self.trials)
+        scores = residuals.score
+        best = int(scores.argmin())
+        gain = descent.score - float(scores[best])
+        if gain > 0:
+            descent.x, descent.scores[-1] = self.trials[best].clone(), float(scores[best])
+        descent.damping = next_damping(descent.damping, best if gain > 0 else None)
+        return gain, residuals.error[best]
 
 
 def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:

@@ -21,6 +21,8 @@ DAMPING_TRIALS = (1.0, 30.0, 1e3, 1e5)
 _REFUSED = 1e3
 """The next damping's multiple where none was better."""
 _SMALLEST_DAMPING = 1e-9
+NO_INFLUENCE = 1e-12
+"""Part of the largest diagonal entry of H below which an entry has no influence: rounding is all that is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,7 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
         min_d  ½ dᵀ (H + μ diag H) d + gᵀ d   with  -1 ≤ x + d ≤ 1
 
     solved with MuJoCo's box-constrained quadratic program, so that entries at their bounds leave the active set.
+    Entries without influence stay.
 
     Args:
         x: Present vector, (size,).
@@ -78,13 +81,15 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
     """
     # scaled to a unit diagonal: entries of very different influence then weigh the same
     diagonal = hessian.diagonal()
-    scale = diagonal.clamp(min=1e-14 * float(diagonal.max()) + 1e-300).rsqrt()
+    least = NO_INFLUENCE * float(diagonal.max()) + 1e-300
+    unit = diagonal.clamp(min=least).rsqrt()
+    scale = torch.where(diagonal > least, unit, 0.0)
     n = len(x)
     matrix = (hessian * scale[:, None] * scale[None, :]).numpy() + (damping + 1e-12) * np.eye(n)
     slope = gradient * scale
     size = max(float(slope.norm()), 1e-300)  # of the problem; the solver's tolerances are absolute
-    lower = ((-1 - x) / scale / size).clamp(max=0.0).numpy()
-    upper = ((1 - x) / scale / size).clamp(min=0.0).numpy()
+    lower = ((-1 - x) / unit / size).clamp(max=0.0).numpy()
+    upper = ((1 - x) / unit / size).clamp(min=0.0).numpy()
     result, factor = np.zeros(n), np.zeros((n, n + 7))
     free = mujoco.mju_boxQP(result, factor, None, np.ascontiguousarray(matrix), (slope / size).numpy(), lower, upper)
     if free < 0:

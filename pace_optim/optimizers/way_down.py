@@ -2,9 +2,10 @@
 
 1. Descend on pieces: windows of two seconds, a share of each recording, at the longest stable physics step. Over a
    short time the error bends less, and has fewer valleys.
-2. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
+2. Go on at the fit's own step, where that is finer: what a long step leaves is no wrong valley.
+3. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
    simulate a stated multiple of what the descents took. Descend again from its best.
-3. Descend on the whole recordings from the end that is best there.
+4. Descend on the whole recordings from the end that is best there.
 
 A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
 physics is missing, the fit ends early.
@@ -21,8 +22,8 @@ from pace_optim.optimizers.derivatives import Colouring
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
 
-PIECES, WHOLE = "pieces", "whole"
-"""What a descent's stage ends with."""
+PIECES, FINE, WHOLE = "pieces", "fine pieces", "whole"
+"""The stages of descents, in this order; their names may begin with more."""
 
 
 @dataclass(kw_only=True)
@@ -33,7 +34,7 @@ class WayDownCfg:
     """Share of each recording that the pieces make."""
 
     on_pieces: LeastSquaresCfg = field(
-        default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-12)
+        default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-10)
     )
     """Descents on pieces."""
 
@@ -56,6 +57,7 @@ class WayDown:
         colouring: Colouring,
         *,
         pieces: Evaluator | None = None,
+        fine: Evaluator | None = None,
         noise_score: float = 0.0,
         cfg: WayDownCfg | None = None,
         on_iteration: Callable[[Sequence[Descent]], None] | None = None,
@@ -67,6 +69,7 @@ class WayDown:
             evaluator: Simulates the whole recordings.
             colouring: Which entries are perturbed together.
             pieces: Simulates the pieces; ``None``: the whole recordings are the pieces.
+            fine: Simulates the pieces at the step of the whole recordings; ``None``: ``pieces`` does.
             noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
             cfg: Numbers of the stages.
             on_iteration: Called with the stage's descents after each iteration.
@@ -75,11 +78,12 @@ class WayDown:
         self.cfg = cfg or WayDownCfg()
         self.evaluator = evaluator
         self.pieces = pieces or evaluator
+        self.fine = fine
         self.colouring = colouring
         self.noise_score = noise_score
         self.descents: list[Descent] = []
         """All so far, in the order in which they began."""
-        self.stages = f"{name}{PIECES}", f"{name}{WHOLE}"
+        self.stages = f"{name}{PIECES}", f"{name}{FINE}", f"{name}{WHOLE}"
         self._on_iteration = on_iteration or (lambda _: None)
 
     def run(self, starts: Sequence[torch.Tensor], search: Callable[[int], torch.Tensor] | None = None) -> Descent:
@@ -89,48 +93,66 @@ class WayDown:
             starts: Normalised vectors, (size,).
             search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
         """
-        pieces, whole = self.stages
-        if not any(d.stage == whole for d in self.descents):
+        whole = self.stages[-1]
+        if not self._of(whole):
             starts = list(starts)
-            self._descend(pieces, starts)
-            best = min(self.descents, key=lambda d: d.score)
+            best = self._on_pieces(starts, 1)
             if search is not None and self.is_far(best.score):
-                spent = sum(d.simulations for d in self.descents)
+                spent = sum(d.simulations for d in self._of(self.stages[0])[: len(starts)])
                 starts.append(search(round(self.cfg.search_budget * spent)))
-                self._descend(pieces, starts)
+                self._on_pieces(starts, 2)
             self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])
 
     def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
         """Descend on the whole recordings from a vector that is known to be near the best."""
         if not self.descents:
-            self.descents = [Descent(x=x, stage=self.stages[1])]
-        return self._descend(self.stages[1], [], cfg)
+            self.descents = [Descent(x=x, stage=self.stages[-1])]
+        return self._descend(self.stages[-1], [], cfg)
 
     def is_far(self, score: float) -> bool:
         """Whether a score is above the noise by more than what a wrong valley may leave."""
         return score > self.cfg.far**2 * self.noise_score and score > self.cfg.on_pieces.target_score
 
-    def _descend(self, stage: str, starts: Sequence[torch.Tensor], cfg: LeastSquaresCfg | None = None) -> Descent:
-        """Let a stage's descents end, the new ones among its starts too; returns the best."""
-        own = [d for d in self.descents if d.stage == stage]
-        added = [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=stage) for x in starts[len(own) :]]
+    def _of(self, stage: str) -> list[Descent]:
+        """A stage's descents so far."""
+        return [d for d in self.descents if d.stage == stage]
+
+    def _on_pieces(self, starts: Sequence[torch.Tensor], rounds: int) -> Descent:
+        """Descend on pieces, and from the best end at the finer step; returns the best end at the finest step.
+
+        Args:
+            starts: Of all rounds so far.
+            rounds: How many these are; each has one descent at the finer step.
+        """
+        pieces, fine, _ = self.stages
+        self._descend(pieces, [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=pieces) for x in starts])
+        best = min(self._of(pieces)[: len(starts)], key=lambda d: d.score)
+        if self.fine is None:
+            return best
+        self._descend(fine, [*self._of(fine)[: rounds - 1], Descent(x=best.x.clone(), stage=fine)])
+        return min(self._of(fine)[:rounds], key=lambda d: d.score)
+
+    def _descend(self, stage: str, starts: Sequence[Descent], cfg: LeastSquaresCfg | None = None) -> Descent:
+        """Let a stage's descents end, those of its starts that are new among them; returns the best."""
+        own = self._of(stage)
+        added = starts[len(own) :]
         own, self.descents = [*own, *added], [*self.descents, *added]
-        on_pieces = stage == self.stages[0]
-        cfg = cfg or (self.cfg.on_pieces if on_pieces else self.cfg.on_whole)
-        evaluator = self.pieces if on_pieces else self.evaluator
+        on_whole = stage == self.stages[-1]
+        cfg = cfg or (self.cfg.on_whole if on_whole else self.cfg.on_pieces)
+        evaluators = dict(zip(self.stages, (self.pieces, self.fine or self.pieces, self.evaluator), strict=True))
         cfg = replace(cfg, noise_score=self.noise_score)
-        return least_squares(evaluator, self.colouring, own, cfg, self._on_iteration)[0]
+        return least_squares(evaluators[stage], self.colouring, own, cfg, self._on_iteration)[0]
 
     def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
         """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""
-        ends = [d for d in self.descents if d.stage == self.stages[0]]
+        ends = [d for stage in self.stages[:2] for d in self._of(stage)]
         vectors = torch.stack([*(d.x for d in ends), *starts])
         scores = self.evaluator.residuals(self.evaluator.space.to_physical(vectors)).score
         best = int(scores.argmin())
         hessian = ends[best].hessian if best < len(ends) else None
         known = [float(scores[best])] if bool(scores[best].isfinite()) else []
-        return Descent(x=vectors[best].clone(), stage=self.stages[1], hessian=hessian, damping=_DAMPING, scores=known)
+        return Descent(x=vectors[best].clone(), stage=self.stages[-1], hessian=hessian, damping=_DAMPING, scores=known)
 
 
 _DAMPING = 1e-5
