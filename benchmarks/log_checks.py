@@ -269,13 +269,13 @@ def judged(made: Input, found: list[Finding]) -> str:
     return "hit" if right and set(made.joints) <= named else "miss" if not right else "part"
 
 
-def run(kinds: list[str], seeds: int) -> None:
+def run(kinds: list[str], seeds: range) -> None:
     """Make the inputs, check them, print the table."""
     print("| kind | named right | named in part | missed | named wrong | time [s] |\n|---|---|---|---|---|---|")
     for kind in kinds:
         counts: dict[str, int] = {}
         spent, said = 0.0, []
-        for seed in range(seeds):
+        for seed in seeds:
             made = make(kind, seed)
             with tempfile.TemporaryDirectory() as folder:
                 try:
@@ -293,7 +293,7 @@ def run(kinds: list[str], seeds: int) -> None:
                 said.append(f"{seed} {verdict} ({', '.join(made.joints)}): {[(f.check, f.joints) for f in found]}")
         right = counts.get("hit", 0) + counts.get("silent", 0)
         cells = [right, counts.get("part", 0), counts.get("miss", 0) + counts.get("refused", 0), counts.get("wrong", 0)]
-        print(f"| {kind} | {' | '.join(map(str, cells))} | {spent / seeds:.1f} |", flush=True)
+        print(f"| {kind} | {' | '.join(map(str, cells))} | {spent / len(seeds):.1f} |", flush=True)
         for line in said:
             print(f"    {line}", flush=True)
 
@@ -343,10 +343,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seeds", type=int, default=10, help="inputs of each kind")
+    parser.add_argument("--first_seed", type=int, default=0, help="seed of the first input")
     parser.add_argument("--clean", nargs="+", type=Path, metavar="FOLDER", help="count alarms on clean recordings")
     args = parser.parse_args()
     if args.clean is None:
-        run(args.kinds, args.seeds)
+        run(args.kinds, range(args.first_seed, args.first_seed + args.seeds))
     else:
         run_clean(args.clean)
 

@@ -142,5 +142,11 @@ def test_chi_squared_counts_in_the_noise_along_the_difference():
     rng = np.random.default_rng(0)
     noise, apart = 1e-3 * rng.standard_normal(5000), 2e-4 * rng.standard_normal(5000)
     errors = torch.as_tensor(np.stack([noise, noise + apart]))[:, :, None, None]
-    found = _against(errors, np.eye(2), torch.ones(5000, 1, dtype=torch.bool))
+    where = torch.ones(5000, 1, dtype=torch.bool)
+    squares = [float(each.square().sum()) for each in errors]
+    found = _against(errors, np.eye(2), where, squares[0])
     assert found[0] == 0.0 and found[1] == pytest.approx(200.0, rel=0.3)
+    # half of what is left is no noise: the second one is worse by a twentieth of that
+    found = _against(errors, np.eye(2), where, 0.5 * squares[0])
+    worse = (squares[1] - squares[0]) / (0.25 * squares[0])
+    assert found[0] == 0.0 and found[1] == pytest.approx((2 * worse) ** 2) and found[1] < 1.0

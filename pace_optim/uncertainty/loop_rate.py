@@ -18,12 +18,15 @@ from pace_optim.optimizers.derivatives import Jacobian
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
+from pace_optim.uncertainty.honest_end import noise_score
 from pace_optim.uncertainty.uncertainty import SURE, autocovariance, filtered, inverse_of
 
 _RATES = (1e3, 2e3, 4e3, 8e3)
 """Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
 _SIMULATED = (1e-3, 5e-4)
 """Periods that are simulated beside the assumed one and a continuous loop [s]; shorter ones follow by a polynomial."""
+_FINER = 2
+"""All are simulated with a physics step that is this part of the finest of them: the step's error looks like a rate."""
 _COARSE = 2.0 + 1e-6
 """Times the finest of them: a longer physics step may be one that made the recordings."""
 _CHORD_STEPS = 4
@@ -32,6 +35,8 @@ _NOTHING_LEFT = 1e-5
 """They end where the next is expected to lower the score by less than this part of it."""
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
+_UNEXPLAINED = 0.5
+"""Part of what no candidate explains. One that is worse than the best by it is two standard deviations away."""
 _NAMED = 2
 """Values that a sentence shows."""
 
@@ -132,7 +137,9 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
-    is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2).
+    is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2). What the
+    best candidate leaves above the noise, M, is no noise: roughness, or physics that is missing. So χ² is at most
+    (2 (r·r - r'·r') / (M / 2))².
 
     Args:
         problem: What was fitted, with loops of an assumed rate.
@@ -151,10 +158,10 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     slower = [logged] if logged > (1 + _APART) * control else []
     continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
     periods = sorted({control, fitted, *(p for p in _SIMULATED if p < control), *slower, *continuous}, reverse=True)
-    finest = min(*_SIMULATED, control)
+    finest = min(*_SIMULATED, control) / _FINER
     found = {p: end for p in periods if (end := _refitted(problem.with_loop(p, finest), x, there, known)) is not None}
     least = min((end.score for end in found.values()), default=math.inf)
-    coarser = problem.physics_dt > _COARSE * finest
+    coarser = problem.physics_dt > _COARSE * _FINER * finest
     if fitted not in found or (coarser and float(there.residuals.score[0]) <= least):
         return None
     nodes = tuple(found)[-3:]
@@ -167,7 +174,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         else:
             row[-len(nodes) :] = _lagrange(nodes, period)
     values, errors = (np.stack([end.values for end in found.values()]), torch.stack([e.error for e in found.values()]))
-    chi2 = _against(errors, weights, found[fitted].where)
+    where = found[fitted].where
+    chi2 = _against(errors, weights, where, noise_score(problem) * int(where.sum()))
     likelihood = np.exp(-0.5 * chi2)
     return LoopRates(
         periods=candidates,
@@ -226,13 +234,14 @@ def _lagrange(nodes: Sequence[float], at: float) -> np.ndarray:
     return np.array([math.prod((at - b) / (a - b) for b in nodes if b != a) for a in nodes])
 
 
-def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor) -> np.ndarray:
+def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor, noise: float) -> np.ndarray:
     """χ² of each candidate against the best.
 
     Args:
         errors: Residuals at the simulated periods, (m, K, R, n).
         weights: Of these in each candidate's, (candidates, m).
         where: Which samples there are, (K, R) bool.
+        noise: Sum of squares that the noise alone leaves [rad²].
     """
     series = [
         errors[:, where[:, r], r, joint].numpy() for r in range(where.shape[1]) for joint in range(errors.shape[-1])
@@ -240,6 +249,7 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor) -> 
     gram = sum(each @ each.T for each in series)
     squares = np.einsum("cm,mn,cn->c", weights, gram, weights)
     best = int(squares.argmin())
+    unexplained = max(squares[best] - noise, 1e-6 * squares[best])
     result = np.zeros(len(weights))
     for c in range(len(weights)):
         apart = weights[c] - weights[best]
@@ -248,5 +258,7 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor) -> 
             d = (apart @ each)[None]
             variance += float((d * filtered(d, autocovariance(weights[best] @ each))).sum())
         if variance > 0:
-            result[c] = (squares[c] - squares[best]) * float(apart @ gram @ apart) / variance
+            worse = squares[c] - squares[best]
+            at_most = (SURE * worse / (_UNEXPLAINED * unexplained)) ** 2
+            result[c] = min(worse * float(apart @ gram @ apart) / variance, at_most)
     return result
