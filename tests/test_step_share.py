@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 import torch
-from problems import CALM, chirp, env_cfg, make_problem, record
+from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 from test_uncertainty import linear
 
 from pace_envs import set_physics_dt
+from pace_optim.fit import fit
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.recording import save_recording
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.progress import ProgressLine
 from pace_optim.uncertainty.assessment import assess
 from pace_optim.uncertainty.step_share import change_without_step, step_share
 
@@ -77,3 +81,18 @@ def test_error_bars_with_the_step_hold_the_truth_where_those_of_noise_do_not():
 def test_a_simulation_with_this_very_step_is_known_as_one():
     share, off, std = fitted(0.0025)
     assert not share.any() and (np.abs(off) < 4 * std).all()
+
+
+@pytest.mark.parametrize(("stated", "finest"), [(None, 0.00125), (0.0025, 0.0025)])
+def test_a_step_that_shows_in_the_error_is_halved_unless_it_is_stated(tmp_path, stated, finest):
+    recorded = env_cfg()
+    set_physics_dt(recorded, 0.0003125)
+    log = tmp_path / "log.npz"
+    save_recording(log, record(chirp(2.0, high=10.0), CALM, cfg=recorded, noise=1e-4))
+    settings = FitSettings(
+        task=BENCH, data=[str(log)], optimizer="least_squares", log_dir=str(tmp_path), physics_dt=stated
+    )
+    result, _ = fit(settings, ProgressLine())
+    assert result.physics_dt <= finest and (stated is None or result.physics_dt == stated)
+    share = result.rmse["train"]["all"] / 1e-4
+    assert (share < 2.0) == (stated is None)

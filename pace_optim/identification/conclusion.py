@@ -33,6 +33,12 @@ _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which a fit with an assumed loop rate tries another."""
+_STEP_IN_DOUBT = 1.3
+"""Times the noise above which a fit may go on at half its physics step ..."""
+_OF_THE_STEP = 0.25
+"""... where the step makes this part of what is above the noise, ..."""
+_HALVINGS = 2
+"""... so many times."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -233,10 +239,32 @@ def _told_of_rate(run: Optimization, end: _End) -> _End:
 
 
 def _told_of_step(run: Optimization, end: _End) -> _End:
-    """What of each value comes from the physics step."""
+    """What of each value comes from the physics step; where it is much of the error, half the step is taken."""
+    for _ in range(_HALVINGS):
+        end = _with_step_share(run, end)
+        if run.settings.physics_dt is not None or not _shows_its_step(end):
+            return end
+        score = float(end.jacobian.residuals.score[0])
+        outcome = run.at_half_the_step(end.problem, end.x, score)
+        if outcome is None:
+            return end
+        end = replace(_reached(run, outcome), rates=end.rates)
+    return _with_step_share(run, end)
+
+
+def _with_step_share(run: Optimization, end: _End) -> _End:
     run.progress.say("simulating with a finer step, to tell what comes from the step")
     physical = end.problem.space.to_physical(end.x)
     return replace(end, without_step=change_without_step(end.problem, physical, end.jacobian.residuals))
+
+
+def _shows_its_step(end: _End) -> bool:
+    """Whether the physics step is a good part of what is above the noise."""
+    if end.times is None or end.is_far or end.times < _STEP_IN_DOUBT or end.without_step is None:
+        return False
+    there = end.jacobian.residuals
+    of_step = float(end.without_step.square().sum() / there.where.sum())
+    return of_step > _OF_THE_STEP * (float(there.score[0]) - noise_score(end.problem))
 
 
 def _with_prior(run: Optimization, end: _End) -> _End:

@@ -30,8 +30,8 @@ NEAR = LeastSquaresCfg(score_tolerance=0.02)
 _INTERRUPTED = "interrupted"
 _USUAL_LOOP = 1e-3
 """Period of the loops that are tried where those of the fit are continuous, the usual one of servo drives [s]."""
-OTHER_LOOP = "other loop, "
-"""What the stages' names begin with on the way of the other loop."""
+OTHER_LOOP, FINER_STEP = "other loop, ", "step of {:g} s, "
+"""What the stages' names begin with on the way of the other loop, and at a finer step."""
 _FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
@@ -163,6 +163,26 @@ class Optimization:
         ended, other = self.ended, self._course(self.problem.with_loop(period), OTHER_LOOP)
         end = other.way.run([x])
         if ended is not None and not end.score < ended.score:
+            return None
+        self._use(other)
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
+    def at_half_the_step(self, problem: Problem, x: torch.Tensor, score: float) -> Outcome | None:
+        """Go on from the end of a fit, at half its physics step.
+
+        Args:
+            problem: Of that end.
+            x: That end, normalised (size,).
+            score: Its score [rad²].
+
+        Returns:
+            The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
+        """
+        finer = problem.with_physics_dt(problem.physics_dt / 2)
+        self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
+        other = self._course(finer, FINER_STEP.format(finer.physics_dt))
+        end = other.way.near(x, NEAR)
+        if not end.score < score:
             return None
         self._use(other)
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
