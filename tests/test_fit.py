@@ -279,7 +279,7 @@ def same_result(resumed, whole):
         ("cmaes", "_after_generation", 13),
         ("hybrid", "_after_generation", 3),
         ("hybrid", "_after_iteration", 1),
-        ("hybrid", "_after_iteration", 8),
+        ("hybrid", "_after_iteration", 5),
         ("least_squares", "_after_iteration", 4),
     ],
 )
