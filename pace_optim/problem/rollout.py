@@ -249,16 +249,15 @@ class Rollout:
         return result
 
     def samples(
-        self, at_steps: bool = False, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
+        self, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
     ) -> Iterator[tuple[int, torch.Tensor]]:
         """Step and sensed positions at every control step, as late as the effects on the recording have them.
 
         Args:
-            at_steps: Whether at the steps themselves, not at the instants of samples that were taken beside them.
             simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
         """
         simulated = simulated or self.simulated
-        steps, offset = self.duration_steps, None if at_steps else self.dataset.sample_offset
+        steps, offset = self.duration_steps, self.dataset.sample_offset
         lag = self.observation_lag(steps)
         if lag is None and offset is None:
             yield from enumerate(simulated(steps))
@@ -335,11 +334,6 @@ class Rollout:
     def look_at(self, where: torch.Tensor) -> None:
         """Say which samples count, (T, R) bool."""
         self._where = where.to(self.env.device)
-
-    def positions_at_every_step(self) -> Iterator[torch.Tensor]:
-        """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
-        for _, sim_dof_pos in self.samples(at_steps=True):
-            yield sim_dof_pos
 
     def begin(self, offset: torch.Tensor | float = 0.0) -> None:
         """Put every environment at its recording's first sample, with the parameters that it has.
