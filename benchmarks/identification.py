@@ -27,7 +27,7 @@ import numpy as np
 from solver_trace import machine, table, write_json
 
 from pace_envs.simulation import Simulation
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
 from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import Problem, load_problem

@@ -17,7 +17,7 @@ from problems import ANYMAL, BENCH, env_cfg, record
 from pace_actuators import IdentifiedDrives
 from pace_envs.tasks.pace import Parameter, test_bench
 from pace_optim.comparison import compare
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
 from pace_optim.run.open import Run

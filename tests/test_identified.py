@@ -21,7 +21,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.commands.train import _task_for
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
 from pace_optim.run.result import drive_in_force
 from pace_optim.run.settings import FitSettings

@@ -30,7 +30,6 @@ FLOORS = {
         ["comparison"],
         ["log_checks"],
         ["identification"],
-        ["fit"],
         ["diagnosis"],
         ["commands"],
     ),
@@ -86,7 +85,7 @@ def files_of(*folders: str) -> list[str]:
         ("import torch.nn as nn, pace_optim", {"torch", "pace_optim"}),
         ("from pace_envs.mdp import joint_pos_rel", {"pace_envs"}),
         ("def f():\n    from pace_optim import fit", {"pace_optim"}),
-        ("import importlib\nimportlib.import_module('pace_optim.fit')", {"importlib", "pace_optim"}),
+        ("import importlib\nimportlib.import_module('pace_optim.identification.fit')", {"importlib", "pace_optim"}),
         ("from . import effects\nfrom .effects import base", set()),
     ],
 )

@@ -18,7 +18,7 @@ from problems import BENCH, TRUTH, chirp, env_cfg, make_problem, pendulums_cfg, 
 from pace_envs import TerrainCfg
 from pace_envs.contact_sensor import ContactSensorCfg
 from pace_optim import CMAESOptimizer
-from pace_optim.fit import fit, resume
+from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.own_objective import error_bars
 from pace_optim.optimizers.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
 from pace_optim.optimizers.derivatives import colour

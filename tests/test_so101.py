@@ -8,7 +8,7 @@ from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_envs import load_env_cfg
 from pace_envs.robots import SO101_JOINTS
 from pace_envs.robots.so101 import so101_drive_cfg
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
 

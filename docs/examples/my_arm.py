@@ -6,8 +6,16 @@ Importing this module registers ``Pace-MyArm-v0``; the scripts import it with ``
 from pathlib import Path
 
 from pace_actuators import PaceDCMotorCfg
-from pace_envs import ArticulationCfg, InitialStateCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, make_bounds
+from pace_envs import (
+    ArticulationCfg,
+    ExcitationCfg,
+    InitialStateCfg,
+    PaceCfg,
+    PaceSim2realEnvCfg,
+    PaceSim2realSceneCfg,
+    make_bounds,
+    register_task,
+)
 
 HERE = Path(__file__).parent
 MY_ARM_JOINTS = ("shoulder", "elbow")

@@ -25,8 +25,16 @@ from pathlib import Path
 import torch
 
 from pace_actuators import PaceDCMotorCfg
-from pace_envs import ArticulationCfg, InitialStateCfg, SimulationCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
+from pace_envs import (
+    ArticulationCfg,
+    ExcitationCfg,
+    InitialStateCfg,
+    PaceCfg,
+    PaceSim2realEnvCfg,
+    PaceSim2realSceneCfg,
+    SimulationCfg,
+    register_task,
+)
 
 HERE = Path(__file__).parent
 
