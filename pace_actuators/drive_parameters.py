@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from pace_actuators.base_parameters import CARRIED
 from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
@@ -13,9 +14,7 @@ _NOT_NEGATIVE = (lambda x: (x >= 0) & x.isfinite(), "a finite number >= 0")
 _DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
     "stiffness": _NOT_NEGATIVE,
     "damping": _NOT_NEGATIVE,
-    "armature": _NOT_NEGATIVE,
-    "friction": _NOT_NEGATIVE,
-    "viscous_friction": _NOT_NEGATIVE,
+    **dict.fromkeys(CARRIED, _NOT_NEGATIVE),
     "saturation_effort": (
         lambda x: (x >= 0) & x.isfinite(),
         "a finite number >= 0, or None for no torque-speed curve",

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pace_actuators.drive_result import ALL, BASE_FIELDS, CURE, DriveResult, result_path
+from pace_actuators.base_parameters import PER_JOINT
+from pace_actuators.drive_result import ALL, CURE, DriveResult, result_path
 from pace_actuators.effects import EffectCfg, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
@@ -172,7 +173,7 @@ class IdentifiedDrives:
             "identified": self.at,
             "effects": tuple(self._effects_of(joints, on_the_rig)),
         }
-        for name in BASE_FIELDS:
+        for name in PER_JOINT:
             if self.determined(name, joints):  # where none is, the drive keeps its own
                 fields[name] = _by_pattern(self.values(name, joints))
         for name in DRIVE_FIELDS:

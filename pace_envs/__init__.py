@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         PaceSim2realEnvCfg,
         PaceSim2realSceneCfg,
         Parameter,
-        make_bounds,
     )
     from pace_envs.tasks.reach.reach_env_cfg import ReachEnvCfg, reach_env_cfg
     from pace_envs.tasks.velocity.options import set_drives
@@ -62,7 +61,6 @@ __all__ = [
     "configclass",
     "go2_cfg",
     "load_env_cfg",
-    "make_bounds",
     "managers",
     "mdp",
     "reach_env_cfg",

@@ -99,7 +99,7 @@ def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
         )
     if drives.at_bound:
         found.append(
-            f"{_named(drives.at_bound)} ended at a bound of the fit, so the value is the bound's. Widen bounds_params "
+            f"{_named(drives.at_bound)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
             "and fit again."
         )
     if drives.undetermined:

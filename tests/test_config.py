@@ -169,10 +169,11 @@ def test_a_configuration_in_paces_form_builds_its_environment():
 def test_instances_share_no_default_that_can_change():
     first, second = BenchEnvCfg(), BenchEnvCfg()
     first.sim2real.bounds_params[0, 1] = 9.0
+    second.prepare()
     first.sim2real.joint_order.append("more")
     first.scene.robot.actuators["drive"].max_delay = 3
-    assert float(second.sim2real.bounds_params[0, 1]) == 1.0 and second.sim2real.joint_order == ["servo"]
-    assert second.scene.robot.actuators["drive"].max_delay is None
+    assert float(second.sim2real.bounds["armature"][0, 1]) == 1.0 and second.sim2real.joint_order == ("servo",)
+    assert second.scene.robot.actuators["drive"].max_delay == 20.0
 
 
 def test_bounds_of_other_joints_are_refused_at_use_whatever_post_init_does():

@@ -171,7 +171,8 @@ def test_candidates_do_not_influence_each_other():
 
 
 def test_a_diverging_candidate_leaves_the_others_as_they_were():
-    cfg = env_cfg(bounds_params=env_cfg().sim2real.bounds_params.index_fill(0, torch.tensor([3]), 0.0))
+    cfg = env_cfg()
+    cfg.sim2real.set_bounds("encoder_bias", 0.0, 0.0)
     problem = make_problem(record(truth={**TRUTH, "encoder_bias": 0.0}), cfg=cfg)
     evaluator = problem.evaluator()
     good = physical(problem, {**TRUTH, "encoder_bias": 0.0})

@@ -13,7 +13,6 @@ from pace_envs import (
     PaceCfg,
     PaceSim2realEnvCfg,
     PaceSim2realSceneCfg,
-    make_bounds,
     register_task,
 )
 
@@ -64,14 +63,13 @@ def my_arm_env_cfg() -> PaceSim2realEnvCfg:
             robot_name="my_arm",
             data_dir="data/my_arm/chirp.npz",
             joint_order=MY_ARM_JOINTS,
-            bounds_params=make_bounds(
-                MY_ARM_JOINTS,
-                armature=(1e-5, 0.1),
-                viscous_friction=(0.0, 1.0),
-                friction=(0.0, 0.5),
-                encoder_bias=(-0.1, 0.1),
-                delay=(0.0, 10.0),
-            ),
+            bounds={
+                "armature": (1e-5, 0.1),
+                "viscous_friction": (0.0, 1.0),
+                "friction": (0.0, 0.5),
+                "encoder_bias": (-0.1, 0.1),
+                "delay": (0.0, 10.0),
+            },
             excitation=ExcitationCfg(bias=(0.6, 1.0), direction=(1.0, 1.0), scale=(0.5, 0.7)),
             sample_params={
                 "armature": {"shoulder": 0.012, "elbow": 0.008},

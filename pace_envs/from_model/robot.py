@@ -11,9 +11,9 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import torch
 
 from pace_actuators import PaceDCMotorCfg, resolve_joint_values
+from pace_actuators.base_parameters import PER_JOINT
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
@@ -34,7 +34,6 @@ from pace_envs.model_file import ModelFile, compile_model, read_model_file
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 
 _UNNAMED = {"", "mujoco model", "robot", "model", "scene"}
 _NARROW = 0.2
@@ -127,11 +126,11 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
     )
-    rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
+    bounds = {name: [base_bounds(joint)[name] for joint in joints] for name in PER_JOINT}
     moves = [motion(joint) for joint in joints]
     starts = [start_values(joint) for joint in joints]
-    samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
-    return PaceSim2realEnvCfg(
+    samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PER_JOINT}
+    cfg = PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
         sim=SimulationCfg(
             dt=control_dt,
@@ -142,7 +141,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",
             joint_order=names,
-            bounds_params=torch.tensor([*rows, (0.0, longest_delay)], dtype=torch.float64),
+            bounds={**bounds, "delay": (0.0, longest_delay)},
             excitation=ExcitationCfg(
                 bias=tuple(centre / amplitude for centre, amplitude in moves),
                 direction=(1.0,) * len(joints),
@@ -159,6 +158,8 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             notes=robot.notes,
         ),
     )
+    cfg.sim2real.prepare()
+    return cfg
 
 
 def robot_cfg_from_model(

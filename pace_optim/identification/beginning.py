@@ -76,7 +76,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Pro
             f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
         )
     if not bool((problem.space.upper > problem.space.lower).any()):
-        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
+        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds.")
     try_out(problem)
     if own is not None and Objective(own, problem).joins_joints:
         problem.env_cfg.sim2real.cmaes.per_tree = False

@@ -154,7 +154,7 @@ def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
 def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     """Of the configuration, or the largest that may be identified, (n,) [kg m²]."""
     own = of_joints(env, "armature")
-    bounds = env.cfg.sim2real.bounds_params[: len(own)].numpy()  # type: ignore[attr-defined]
+    bounds = env.cfg.sim2real.bounds["armature"].numpy()  # type: ignore[attr-defined]
     return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
 
 

@@ -33,7 +33,7 @@ def refuse_open_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -
     cfg = cast(PaceSim2realEnvCfg, env.cfg).sim2real
     n = robot.num_joints
     slack = np.full(env.sim.model.nv, np.inf)
-    slack[robot.dof_columns.numpy()] = cfg.bounds_params[3 * n : 4 * n].abs().max(dim=1).values.numpy()
+    slack[robot.dof_columns.numpy()] = cfg.bounds["encoder_bias"].abs().max(dim=1).values.numpy()
     for recording in recordings:
         robot.write_joint_state_to_sim(torch.as_tensor(recording.dof_pos[0])[None], torch.zeros(1, n))
         posture = env.sim.qpos[0].numpy()

@@ -12,13 +12,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
 from pace_optim.problem.drive_steps import (
@@ -133,14 +133,15 @@ class Problem:
         Args:
             bounds: Lower and upper bound by label, ``<parameter>/<joint>``; of this problem's parameters alone.
         """
-        labels = [f"{group}/{joint}" for group in PARAMETER_GROUPS for joint in self.joint_names] + [f"delay/{GLOBAL}"]
         plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
         for each in (plain, cfg):
-            own = each.sim2real.bounds_params.clone()
-            for row, label in enumerate(labels):
-                low, high = bounds.get(label, own[row].tolist())
-                own[row] = own.new_tensor([min(low, float(own[row, 0])), max(high, float(own[row, 1]))])
-            each.sim2real.bounds_params = own
+            for name, own in each.sim2real.bounds.items():
+                keys = (GLOBAL,) if BASE_PARAMETERS[name].shared else self.joint_names
+                other = own.new_tensor(
+                    [bounds.get(f"{name}/{key}", pair) for key, pair in zip(keys, own.tolist(), strict=True)]
+                )
+                low, high = torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1]
+                each.sim2real.set_bounds(name, low, high)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
     def with_physics_dt(self, physics_dt: float) -> Problem:
@@ -238,7 +239,7 @@ def load_problem(
     set_control_step(cfg)
     for drive in cfg.scene.robot.actuators.values():
         drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
-        longest = float(cfg.sim2real.bounds_params[-1, 1])
+        longest = float(cfg.sim2real.bounds["delay"][0, 1])
         if drive.largest_delay < longest:
             raise ValueError(
                 f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
@@ -362,7 +363,7 @@ def _read_torques(
     state. Gains that are read are refined.
     """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
-    low, high = sim2real.bounds_params[-1].tolist()
+    low, high = sim2real.bounds["delay"][0].tolist()
 
     def read(facts: Sequence[str]) -> MeasuredDrives:
         return read_drives(
@@ -397,17 +398,13 @@ def _ranges(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str
 def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:
     """Seek the delay where the recordings' torques have it."""
     if measured.delay_bounds is not None:
-        bounds = cfg.sim2real.bounds_params.clone()
-        bounds[-1] = bounds.new_tensor(measured.delay_bounds)
-        cfg.sim2real.bounds_params = bounds
+        cfg.sim2real.set_bounds("delay", *measured.delay_bounds)
 
 
 def _raise_armature(cfg: PaceSim2realEnvCfg, least: np.ndarray) -> None:
     """Seek the armature where the drives' loops are stable, and keep a width to seek in."""
-    bounds = cfg.sim2real.bounds_params.clone()
-    low, high = bounds[: len(least)].unbind(dim=1)
-    bounds[: len(least), 0] = torch.maximum(low, torch.minimum(torch.as_tensor(least), 0.5 * (low + high)))
-    cfg.sim2real.bounds_params = bounds
+    low, high = cfg.sim2real.bounds["armature"].unbind(dim=1)
+    cfg.sim2real.set_bounds("armature", torch.maximum(low, torch.minimum(torch.as_tensor(least), 0.5 * (low + high))))
 
 
 def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:

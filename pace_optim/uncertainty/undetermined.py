@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
-from pace_actuators.drive_result import NOT_NEGATIVE
+from pace_actuators.base_parameters import CARRIED, PER_JOINT
 from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace import GLOBAL
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -67,11 +66,7 @@ def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) 
     space, value = problem.space, problem.space.to_physical(x).numpy()
     apart = np.maximum(value, np.abs(value - _within_bounds(problem).numpy()))
     unsure = apart < SURE * uncertainty.std  # not where there is none
-    return {
-        label
-        for label, yes in zip(space.labels, unsure, strict=True)
-        if yes and label != DELAY and label.split("/")[0] in NOT_NEGATIVE
-    }
+    return {label for label, yes in zip(space.labels, unsure, strict=True) if yes and label.split("/")[0] in CARRIED}
 
 
 def _of_unknown(problem: Problem) -> set[str]:
@@ -178,7 +173,7 @@ def prior(problem: Problem) -> torch.Tensor:
     result = torch.zeros(space.size, dtype=torch.float64)
     for drive in problem.env_cfg.scene.robot.actuators.values():
         own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]
-        for name in PARAMETER_GROUPS:
+        for name in PER_JOINT:
             if (value := getattr(drive, name)) is not None and name in space.slices:
                 values = resolve_joint_values(value, own, field=name).to(torch.float64)
                 result[space[name]][[joints.index(joint) for joint in own]] = values
