@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolv
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
+from pace_actuators.text import listed
 from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -99,13 +99,13 @@ def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
         )
     if drives.at_bound:
         found.append(
-            f"{_named(drives.at_bound)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
+            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
             "and fit again."
         )
     if drives.undetermined:
         found.append(
-            f"{_named(sorted(drives.undetermined))} was not determined by the recordings and keeps its prior. Record a "
-            "motion that shows it, or train with --randomize_identified 1."
+            f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
+            "Record a motion that shows it, or train with --randomize_identified 1."
         )
     return found + _other_drives(cfg.scene.robot, drives)
 
@@ -179,16 +179,10 @@ def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]
                     differs.setdefault((float(recorded), value), []).append(joint)
         for (recorded, value), joints in differs.items():
             found.append(
-                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({_named(joints)}). Set the "
-                "task's to what the robot will run, the recordings' where you do not know."
+                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({listed(joints, _MOST)}). "
+                "Set the task's to what the robot will run, the recordings' where you do not know."
             )
     return found
-
-
-def _named(labels: Sequence[str]) -> str:
-    """Some labels, the rest by number."""
-    more = len(labels) - _MOST
-    return ", ".join(labels[:_MOST]) + (f" and {more} more" if more > 0 else "")
 
 
 def _identified_groups(

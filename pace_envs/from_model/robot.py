@@ -14,6 +14,7 @@ import numpy as np
 
 from pace_actuators import PaceDCMotorCfg, resolve_joint_values
 from pace_actuators.base_parameters import PER_JOINT
+from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
@@ -269,7 +270,7 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:
-        notes.append(f"effort limit: none ({_listed(without)})")
+        notes.append(f"effort limit: none ({listed(without, 3)})")
     if not any(np.isfinite(joint.velocity_limit) for joint in joints):
         notes.append("speed limit: none")
     notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
@@ -286,12 +287,12 @@ def _beside_drives(model: mujoco.MjModel, driven: Sequence[str]) -> list[str]:
     loose = [model.joint(j).name for j in joints if j not in follow and model.joint(j).name not in driven]
     if loose:
         notes.append(
-            f"no drive: {_listed(loose)} (no actuator, transmission or ros2_control command): free to move. Name the "
+            f"no drive: {listed(loose, 3)} (no actuator, transmission or ros2_control command): free to move. Name the "
             "joint there if it is driven"
         )
     springs = {model.joint(j).name: float(np.ravel(model.jnt_stiffness[j])[0]) for j in joints}
     if sprung := [f"{name} {value:g}" for name, value in springs.items() if value]:
-        notes.append(f"springs of the file act beside the drives: stiffness {_listed(sprung)}")
+        notes.append(f"springs of the file act beside the drives: stiffness {listed(sprung, 3)}")
     option = model.opt
     medium = {"density": option.density, "viscosity": option.viscosity}
     acting = [f"{name} {value:g}" for name, value in medium.items() if value]
@@ -322,7 +323,3 @@ def _folder_name(file: ModelFile) -> str:
     stated = file.spec.modelname
     name = stated if stated.lower() not in _UNNAMED else file.path.stem
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "robot"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -10,7 +10,7 @@ import numpy as np
 
 from pace_actuators.joint_units import JointType
 from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
-from pace_optim.report.trajectory_errors import rms
+from pace_optim.run.tensors import rms
 
 from .dimensions import Dimension, dimensions_of
 from .frequency import band_edges, band_power, narrowest_band, response

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
 from pace_optim.recording.commands import acting_loops
-from pace_optim.recording.keys import listed
 
 _STATE = (
     "state them beside the log (NAME.json: stiffness, damping), in its column map, or in a configuration of your own "

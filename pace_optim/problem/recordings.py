@@ -12,11 +12,11 @@ import numpy as np
 
 from pace_actuators import match_names
 from pace_actuators.joint_units import units_for
+from pace_actuators.text import listed
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.conform import with_columns
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.keys import listed
 from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:

@@ -283,7 +283,7 @@ class Rollout:
                 shown, at = seen[k % length].clone(), k - (first + rate * k)
                 if offset is not None:
                     at = at + self._rows(offset[k, :, None])
-                shown[late] = _interpolated(seen[:, late], at)
+                shown[late] = between_steps(seen[:, late], at[None], ring=True)[0]
                 yield k, shown
 
     def observation_lag(self, steps: int) -> torch.Tensor | None:
@@ -394,18 +394,24 @@ def _changes(enable: torch.Tensor | None) -> frozenset[int]:
     return frozenset(((enable[1:] != enable[:-1]).any(dim=1).nonzero()[:, 0] + 1).tolist())
 
 
-def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-    """A ring of samples (length, m, n) at real-valued steps (m, n), by the cubic through four samples (Lagrange)."""
+def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -> torch.Tensor:
+    """Samples (length, m, n) at real-valued steps (K, m, n), by the cubic through four samples (Lagrange).
+
+    Args:
+        seen: One sample per step.
+        at: The steps.
+        ring: Whether the samples are those of the last steps, each at its step modulo the length.
+    """
     whole = at.floor()
-    f = (at - whole)[None]
-    index = whole.long()[None] + torch.arange(-1, 3, device=at.device)[:, None, None]
-    samples = seen.gather(0, index % len(seen))
-    weights = torch.cat(
-        [
-            -f * (f - 1) * (f - 2) / 6,
-            (f + 1) * (f - 1) * (f - 2) / 2,
-            -(f + 1) * f * (f - 2) / 2,
-            (f + 1) * f * (f - 1) / 6,
-        ]
+    f, index = at - whole, whole.long()
+    weights = (
+        -f * (f - 1) * (f - 2) / 6,
+        (f + 1) * (f - 1) * (f - 2) / 2,
+        -(f + 1) * f * (f - 2) / 2,
+        (f + 1) * f * (f - 1) / 6,
     )
-    return (weights * samples).sum(dim=0)
+    result = torch.zeros_like(at)
+    for i, weight in enumerate(weights, start=-1):
+        rows = (index + i) % len(seen) if ring else (index + i).clamp(0, len(seen) - 1)
+        result += weight * seen.gather(0, rows)
+    return result
