@@ -13,9 +13,15 @@ _MOST_DECIMALS = 6
 
 
 def listed(names: Iterable[object], most: int = 40) -> str:
-    """Names in a sentence: "a, b and c"; more than ``most`` are counted: "a, b, c and 2 more"."""
+    """Names of a message: "a, b, c"; more than ``most`` are counted: "a, b, c and 2 more"."""
     texts = [str(name) for name in names]
-    *first, last = [*texts[:most], f"{len(texts) - most} more"] if len(texts) > most else texts or ["none"]
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more or "none"
+
+
+def conjoined(names: Iterable[object]) -> str:
+    """Names in a sentence: "a, b and c"."""
+    *first, last = [str(name) for name in names]
     return f"{', '.join(first)} and {last}" if first else last
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import listed, size_text
+from pace_actuators.text import conjoined, size_text
 from pace_optim.diagnosis.telling.result import Diagnosis
 
 _EFFECTS = 8
@@ -20,7 +20,7 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
     stuck = dict.fromkeys(f"{size['effect']} ({size['joint']})" for size in diagnosis.sizes if size["at_bound"])
     if stuck:
         lines.append(f"At its bound: {', '.join(stuck)}.")
-    lines += [f"{effect} cannot be told from {listed(likes)}." for effect, likes in diagnosis.likes.items()]
+    lines += [f"{effect} cannot be told from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in diagnosis.advice]
     names = list(diagnosis.joints)
     for entry in diagnosis.ranking[:_EFFECTS]:
