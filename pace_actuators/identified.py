@@ -96,6 +96,11 @@ class IdentifiedDrives:
     """Where the environment of the identification comes from: its code and files, by digest."""
 
     @classmethod
+    def of(cls, source: IdentifiedDrives | str | Path) -> IdentifiedDrives:
+        """Identified drives that have been read, or those of a file."""
+        return source if isinstance(source, IdentifiedDrives) else cls.load(source)
+
+    @classmethod
     def load(cls, path: str | Path) -> IdentifiedDrives:
         """Read ``result.json``, or that of a run's folder.
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pace_envs.scene import InteractiveScene, InteractiveSceneCfg, TerrainCfg
     from pace_envs.simulation import Simulation, SimulationCfg
     from pace_envs.tasks.pace import (
-        CMAESOptimizerCfg,
         ExcitationCfg,
         PaceCfg,
         PaceSim2realEnvCfg,
@@ -37,7 +36,6 @@ __all__ = [
     "ASSETS_DIR",
     "Articulation",
     "ArticulationCfg",
-    "CMAESOptimizerCfg",
     "ExcitationCfg",
     "InitialStateCfg",
     "InteractiveScene",

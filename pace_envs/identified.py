@@ -33,7 +33,7 @@ _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 def use_identified(
     cfg: ManagerBasedEnvCfg,
-    path: str | Path,
+    identified: IdentifiedDrives | str | Path,
     *,
     randomize_std: float | None = None,
     gains: bool = False,
@@ -49,7 +49,7 @@ def use_identified(
 
     Args:
         cfg: The environment; it is changed.
-        path: ``result.json``, or the run's folder.
+        identified: ``result.json``, the run's folder, or what has been read of it.
         randomize_std: Draw every environment's drives with this many standard deviations around the identified values;
             ``None`` does not.
         gains: Also take over the gains and limits of the recordings, as far as the result says them.
@@ -62,7 +62,7 @@ def use_identified(
     Raises:
         ValueError: If the result is unusable, or its joints are not the robot's.
     """
-    drives = IdentifiedDrives.load(path)
+    drives = IdentifiedDrives.of(identified)
     notes = check_representable(drives, HERE)
     cfg.scene.robot.actuators = groups = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
@@ -84,14 +84,14 @@ def use_identified(
     return notes
 
 
-def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
+def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -> list[str]:
     """Why an environment may not want the drives that a fit identified, in sentences; none if all is well.
 
     Args:
         cfg: The environment, with its own gains and limits.
-        path: ``result.json``, or the run's folder.
+        identified: As for :func:`use_identified`.
     """
-    drives, found = IdentifiedDrives.load(path), []
+    drives, found = IdentifiedDrives.of(identified), []
     if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
         found.append(
             f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values make up for what "
@@ -143,17 +143,17 @@ def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
     cfg.sim.dt, cfg.decimation = dt, decimation
 
 
-def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None:
+def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -> str | None:
     """Let physics and drives run at the control step of an identification: its values hold the errors of that step.
 
     Args:
         cfg: The environment; it is changed, unless its step is as fine already, or no multiple of that step.
-        path: ``result.json``, or the run's folder.
+        identified: ``result.json``, the run's folder, or what has been read of it.
 
     Returns:
         What was changed, in words.
     """
-    drives, before = IdentifiedDrives.load(path), cfg.sim.dt
+    drives, before = IdentifiedDrives.of(identified), cfg.sim.dt
     dt = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
     whole = cfg.sim.dt * cfg.decimation / dt
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:

@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 from pace_actuators.public_names import public_names
 
 if TYPE_CHECKING:
-    from pace_envs.tasks.pace import CMAESOptimizerCfg
     from pace_optim.comparison import compare, comparison_lines
     from pace_optim.data_collection import CollectionCfg, collect
     from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
     from pace_optim.excitation import Motion, Trajectory, make_excitation, register_excitation
     from pace_optim.identification.fit import fit, resume
-    from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+    from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
     from pace_optim.optimizers.convergence import (
         Criterion,
         EarlyStopping,

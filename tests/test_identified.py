@@ -14,6 +14,7 @@ from problems import BENCH, chirp, make_problem, record
 from torque_sequence import DT, GAINS, JOINTS, write_result
 
 from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators.drive_result import DriveResult
 from pace_actuators.effects import get_effect
 from pace_actuators.identified_draws import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
@@ -455,3 +456,12 @@ def test_what_a_result_is_doubted_for_is_told_before_training(result, changes, s
     assert len(found) == 1 and re.search(said, found[0])
     load_cfg(RunSettings(task=WALK, identified=str(result)))
     assert f"warning: identified drives: {found[0]}" in capsys.readouterr().err
+
+
+def test_a_training_reads_its_result_once(result, monkeypatch, capsys):
+    read, load = [], DriveResult.load.__func__
+    monkeypatch.setattr(DriveResult, "load", classmethod(lambda cls, path: read.append(path) or load(cls, path)))
+    cfg = load_cfg(RunSettings(task=WALK, identified=str(result), randomize_identified=1.0))
+    assert len(read) == 1 and "identified_drives" in cfg.events
+    drives = IdentifiedDrives.load(result)
+    assert use_identified(cfg, drives) == use_identified(cfg, result)

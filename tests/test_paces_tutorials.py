@@ -15,9 +15,9 @@ import torch
 
 from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_envs import load_env_cfg
-from pace_envs.tasks.pace import CMAESOptimizerCfg
 from pace_optim import CMAESOptimizer
 from pace_optim.excitation import make_excitation
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import ScoreSpread, SearchState
 from pace_optim.problem.parameter_space import ParameterSpace
 

@@ -17,34 +17,6 @@ from pace_actuators.joint_values import resolve_joint_values
 
 
 @dataclass(kw_only=True)
-class CMAESOptimizerCfg(Config):
-    """Settings of the search."""
-
-    per_tree: bool = True
-    """Whether parts of the robot that do not move each other (legs on a fixed base) are searched apart."""
-
-    max_iteration: int = 200
-    """Largest number of generations."""
-
-    epsilon: float | None = 1e-2
-    """Stop when (max - min) / min of a generation's scores falls below this; ``None`` switches it off."""
-
-    stop: Sequence[Any] = ()
-    """Further rules that end the search, beside ``epsilon`` and ``max_iteration``: ``"plateau"``, ``"window"``,
-    ``"gradient"``, ``"early_stopping"``, ``"parameters"`` or ``"target"``, with numbers as in
-    ``"plateau:generations=30,improvement=0.01"``; or a rule of your own (``pace_optim.optimizers.convergence``)."""
-
-    sigma: float = 0.5
-    """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
-
-    save_interval: int = 10
-    """Generations between two saved means and checkpoints."""
-
-    save_optimization_process: bool = False
-    """Whether every generation's parameters and scores are kept in ``progress.pt``."""
-
-
-@dataclass(kw_only=True)
 class ExcitationCfg(Config):
     """How the robot is moved for a recording: target = (signal + bias) * direction * scale, per joint."""
 
@@ -60,7 +32,7 @@ class ExcitationCfg(Config):
 
 @dataclass(kw_only=True)
 class PaceCfg(Config):
-    """Names, bounds and search settings of a robot's identification."""
+    """Names, bounds and motion of a robot's identification."""
 
     robot_name: str
     """Name of the robot; runs are kept under it."""
@@ -81,8 +53,8 @@ class PaceCfg(Config):
     """The same as PACE writes it, (4n+1, 2): armature, viscous friction, friction and bias of every joint, then the
     delay. It becomes ``bounds`` and is ``None`` once prepared."""
 
-    cmaes: CMAESOptimizerCfg = field(default_factory=CMAESOptimizerCfg)
-    """Settings of the search."""
+    cmaes: Any = None
+    """Settings of the search, as PACE has them here: a ``pace_optim.CMAESOptimizerCfg``; ``None``: its defaults."""
 
     excitation: ExcitationCfg | None = None
     """How the robot is moved for a recording; ``None`` if it is only fitted to given ones."""
