@@ -298,6 +298,8 @@ def test_bounds_are_a_pair_for_all_one_by_expression_or_paces_tensor():
     pace = prepared(bounds_params=rows)
     assert pace.bounds_params is None
     assert all(torch.equal(pace.bounds[name], own) for name, own in by_name.bounds.items())
+    pace.set_bounds("delay", 0.1, 0.3)
+    assert pace.bounds["delay"].tolist() == [[0.1, 0.3]]  # to the last digit
     pace.set_bounds("friction", upper=[3.0, 4.0])
     assert pace.bounds["friction"].tolist() == [[0.0, 3.0], [0.0, 4.0]]
 

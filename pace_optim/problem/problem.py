@@ -20,7 +20,6 @@ from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
 from pace_optim.measured_effort import MeasuredDrives, read_drives
-from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -31,11 +30,15 @@ from pace_optim.problem.drive_steps import (
 )
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
-from pace_optim.problem.loop_check import refuse_open_loops
+from pace_optim.problem.log_and_robot import (
+    contradicted_limits,
+    refuse_open_loops,
+    told_of_gains,
+    without_loops_of_torques,
+)
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques, widen_bounds
-from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset

@@ -144,8 +144,8 @@ class PaceCfg(Config):
             upper: The same.
         """
         low, high = self.bounds[name].unbind(dim=1)
-        ends = [old if new is None else torch.as_tensor(new).to(old).expand_as(old)
-                for old, new in ((low, lower), (high, upper))]  # fmt: skip
+        given = ((low, lower), (high, upper))
+        ends = [old if new is None else torch.as_tensor(new, dtype=old.dtype).expand_as(old) for old, new in given]
         self.bounds = {**self.bounds, name: torch.stack(ends, dim=1)}
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
