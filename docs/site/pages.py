@@ -92,7 +92,7 @@ def reference() -> str:
     """The public names: what the ``__init__`` of each public package exports."""
     text = ["# Reference\n\nWhat the packages export, from the docstrings.\n"]
     for init in (ROOT / name / "__init__.py" for name in PUBLIC):
-        names = _exported(init)
+        names = [name for name in _exported(init) if f"{init.parent.name}/{name}" not in PUBLIC]
         package = init.parent.relative_to(ROOT).as_posix().replace("/", ".")
         if names:
             members = "".join(f"        - {name}\n" for name in names)
