@@ -68,8 +68,8 @@ def drive_problem(steps: int = 8000) -> DriveProblem:
     sim2real = cfg.sim2real
     for drive in cfg.scene.robot.actuators.values():
         drive.saturation_effort = None
-    n = len(sim2real.joint_order)
-    sim2real.bounds_params[3 * n :] = 0.0
+    for name in ("encoder_bias", "delay"):
+        sim2real.set_bounds(name, 0.0, 0.0)
     space = ParameterSpace.of(sim2real)
     truth = space.from_dict({**sim2real.sample_params, "encoder_bias": 0.0, "delay": 0.0})
     cfg.scene.num_envs = 1

@@ -27,8 +27,8 @@ import numpy as np
 from solver_trace import machine, table, write_json
 
 from pace_envs.simulation import Simulation
-from pace_optim.fit import fit
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.identification.fit import fit
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.problem.rollout import Rollout
@@ -151,7 +151,7 @@ class SearchRun:
 
 def joint_search(problem: Problem, seconds: float, population: int, seed: int = 0) -> SearchRun:
     """Search from the centre of the bounds for that long; the generation under way is finished."""
-    cfg = replace(problem.env_cfg.sim2real.cmaes, per_tree=False, max_iteration=10**9, epsilon=None)
+    cfg = replace(CMAESOptimizerCfg.of(problem.env_cfg.sim2real), per_tree=False, max_iteration=10**9, epsilon=None)
     run = SearchRun(population=population, seconds=[], best=[])
     start = time.perf_counter()
     evaluator = problem.evaluator()

@@ -276,7 +276,8 @@ def main() -> int:
     torch.set_num_threads(1)
     for name in NEEDED:
         import_module(f"pace_optim.commands.{name}")
-    import_module("pace_optim.fit"), import_module("pace_optim.diagnosis"), import_module("pace_envs.rl.training")
+    for name in ("pace_optim.identification.fit", "pace_optim.diagnosis", "pace_envs.rl.training"):
+        import_module(name)
     lines = args.output.read_text().splitlines() if args.output and args.output.exists() else []
     done = {(trial["command"], trial["number"]): trial for trial in map(json.loads, lines)}
     with tempfile.TemporaryDirectory() as place:

@@ -20,7 +20,7 @@ from static_sag import sag_table, static_sag
 
 from pace_envs import load_env_cfg
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.report import write_report
 from pace_optim.report.plots import plot_trajectories
 from pace_optim.run.find import find_run

@@ -9,17 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.files import checked, file_at, read_json, refuse
 
 VERSION = 1
 ALL = "all"
 """Key of a value that all joints share."""
-
-BASE_FIELDS = ("armature", "viscous_friction", "friction", "encoder_bias")
-"""Parameters of the base model per joint, named as in ``PaceDCMotorCfg``."""
-
-NOT_NEGATIVE = ("armature", "viscous_friction", "friction", "delay")
-"""Parameters of which no value is below 0."""
 
 _ABOVE_ZERO = ("saturation_effort", "velocity_limit")
 """Limits that make a torque-speed line, which has a slope."""
@@ -87,13 +82,12 @@ class DriveResult:
         """
         if not self.joint_names or len(set(self.joint_names)) < len(self.joint_names):
             refuse(source, "joint_names must be a list of different names", CURE)
-        for name in BASE_FIELDS:
-            self._expect(name, self.joint_names, source)
-        self._expect("delay", [ALL], source)
-        for name in NOT_NEGATIVE:
+        for name, parameter in BASE_PARAMETERS.items():
+            self._expect(name, [ALL] if parameter.shared else self.joint_names, source)
+        for name, parameter in BASE_PARAMETERS.items():
             for key, value in self.parameters[name].items():
-                if value < 0:
-                    refuse(source, f"{name} of {key} is {value:g}, expected at least 0", CURE)
+                if parameter.least is not None and value < parameter.least:
+                    refuse(source, f"{name} of {key} is {value:g}, expected at least {parameter.least:g}", CURE)
         for name, values in self.drive.items():
             for key, value in values.items():
                 if value < 0 or (value == 0 and name in _ABOVE_ZERO):

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pace_actuators.drive_result import ALL, BASE_FIELDS, CURE, DriveResult, result_path
+from pace_actuators.base_parameters import PER_JOINT
+from pace_actuators.drive_result import ALL, CURE, DriveResult, result_path
 from pace_actuators.effects import EffectCfg, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
@@ -95,6 +96,11 @@ class IdentifiedDrives:
     """Where the environment of the identification comes from: its code and files, by digest."""
 
     @classmethod
+    def of(cls, source: IdentifiedDrives | str | Path) -> IdentifiedDrives:
+        """Identified drives that have been read, or those of a file."""
+        return source if isinstance(source, IdentifiedDrives) else cls.load(source)
+
+    @classmethod
     def load(cls, path: str | Path) -> IdentifiedDrives:
         """Read ``result.json``, or that of a run's folder.
 
@@ -172,7 +178,7 @@ class IdentifiedDrives:
             "identified": self.at,
             "effects": tuple(self._effects_of(joints, on_the_rig)),
         }
-        for name in BASE_FIELDS:
+        for name in PER_JOINT:
             if self.determined(name, joints):  # where none is, the drive keeps its own
                 fields[name] = _by_pattern(self.values(name, joints))
         for name in DRIVE_FIELDS:

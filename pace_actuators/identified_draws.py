@@ -6,9 +6,9 @@ import math
 
 import torch
 
-from pace_actuators.drive_result import NOT_NEGATIVE
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import get_effect
-from pace_actuators.identified import BASE_FIELDS, IdentifiedDrives
+from pace_actuators.identified import IdentifiedDrives
 
 _FARTHEST = 3.0
 """Standard deviations at which draws end."""
@@ -16,7 +16,7 @@ _FARTHEST = 3.0
 
 def labels_with_std(drives: IdentifiedDrives) -> list[tuple[str, str]]:
     """Parameters and joints (or ``"all"``) that have an error bar, in order."""
-    names = {*BASE_FIELDS, "delay"}
+    names = set(BASE_PARAMETERS)
     names |= {f"{cfg.effect_class.name}.{p.name}" for cfg in drives.effects for p in cfg.effect_class.parameters}
     return [
         (name, key)
@@ -67,7 +67,8 @@ def _range(name: str) -> tuple[float, float]:
     if dot:
         declared = next(p for p in get_effect(effect).parameters if p.name == parameter)
         return declared.lower, declared.upper
-    return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf
+    least = BASE_PARAMETERS[name].least
+    return (-math.inf if least is None else least), math.inf
 
 
 def _correlation(drives: IdentifiedDrives, labels: list[tuple[str, str]]) -> torch.Tensor:

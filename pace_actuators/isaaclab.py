@@ -34,6 +34,7 @@ import torch
 from isaaclab.actuators import ActuatorBase, ActuatorBaseCfg
 from isaaclab.utils import configclass
 
+from pace_actuators.base_parameters import CARRIED
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
@@ -43,7 +44,7 @@ from pace_actuators.representable import ISAACLAB, check_representable, refuse_i
 OF_CONFIGURATION = hasattr(ActuatorBaseCfg(), "actuator_effort_limit")
 """Whether this is Isaac Lab 3.0, which takes the joints' parameters from the configuration."""
 
-_JOINT_PARAMETERS = ("armature", "friction", "dynamic_friction", "viscous_friction")
+_JOINT_PARAMETERS = (*CARRIED, "dynamic_friction")
 _LIMITS = ("effort_limit", "velocity_limit", "actuator_effort_limit", "actuator_velocity_limit")
 _NO_LIMIT = 1e9
 """What Isaac Lab 2.3 sets as the solver's effort limit of an explicit actuator [N m]."""
@@ -191,8 +192,7 @@ def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:
         ValueError: If values are one per joint, or an effect changes the inertia, and the joints are not named.
     """
     names = _literal_names(motor.joint_names_expr)
-    fields = {"armature": "armature", "friction": "friction", "viscous_friction": "viscous_friction"}
-    known = {name: value for name in fields if (value := getattr(motor, name)) is not None}
+    known = {name: value for name in CARRIED if (value := getattr(motor, name)) is not None}
     if names is not None:
         alone = dataclasses.replace(motor, identified=None, physics_dt=motor.physics_dt or 1.0, delay=0.0, delay_s=None)
         drive = (motor.class_type or PaceDCMotor)(alone, names, slice(None), 1)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from pace_actuators import ActuatorActions, PaceDCMotor
+from pace_actuators.base_parameters import BASE_PARAMETERS, CARRIED
 from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, indices, pick
@@ -54,7 +55,7 @@ class Articulation(RobotState):
         self, armature: torch.Tensor | float, joint_ids: JointIds = None, env_ids: EnvIds = None
     ) -> None:
         """Write armature [kg m^2], (len(env_ids), len(joint_ids)) or broadcastable."""
-        self._write_parameter("armature", "dof_armature", armature, joint_ids, env_ids)
+        self._write_carried("armature", armature, joint_ids, env_ids)
 
     def write_joint_viscous_friction_coefficient_to_sim(
         self,
@@ -63,13 +64,40 @@ class Articulation(RobotState):
         env_ids: EnvIds = None,
     ) -> None:
         """Write viscous friction [N m s/rad], (len(env_ids), len(joint_ids)) or broadcastable."""
-        self._write_parameter("viscous_friction", "dof_damping", joint_viscous_friction_coeff, joint_ids, env_ids)
+        self._write_carried("viscous_friction", joint_viscous_friction_coeff, joint_ids, env_ids)
 
     def write_joint_friction_coefficient_to_sim(
         self, joint_friction_coeff: torch.Tensor | float, joint_ids: JointIds = None, env_ids: EnvIds = None
     ) -> None:
         """Write Coulomb friction [N m], (len(env_ids), len(joint_ids)) or broadcastable."""
-        self._write_parameter("friction", "dof_frictionloss", joint_friction_coeff, joint_ids, env_ids)
+        self._write_carried("friction", joint_friction_coeff, joint_ids, env_ids)
+
+    def write_base_parameter_to_sim(
+        self, name: str, values: torch.Tensor, joint_ids: Sequence[int] | None = None
+    ) -> None:
+        """Write a base parameter of a fit: to the model where the joint carries it, else to the drives.
+
+        Args:
+            name: One of :data:`~pace_actuators.base_parameters.BASE_PARAMETERS`.
+            values: In its unit, (num_envs, len(joint_ids)), or (num_envs, 1) for one delay of all those joints.
+            joint_ids: The joints; ``None`` for all.
+        """
+        if BASE_PARAMETERS[name].mujoco is not None:
+            self._write_carried(name, values, joint_ids, None)
+            return
+        wanted = list(range(self.num_joints)) if joint_ids is None else list(joint_ids)
+        values = self._sim.tensor(values)
+        for actuator in self.actuators.values():
+            pairs = [(k, wanted.index(j)) for k, j in enumerate(self.joints_of(actuator)) if j in wanted]
+            if not pairs:
+                continue
+            local, chosen = (list(each) for each in zip(*pairs, strict=True))
+            if name == "delay":
+                actuator.update_time_lags(values if values.shape[1] == 1 else values[:, chosen])
+            else:
+                bias = actuator.encoder_bias.clone()
+                bias[:, local] = values[:, chosen]
+                actuator.update_encoder_bias(bias)
 
     def add_body_mass(self, name_keys: str | Sequence[str], mass: float, env_ids: EnvIds = None) -> None:
         """Add a known mass to bodies, at their centres of mass [kg]; effects on the model do not scale it."""
@@ -163,7 +191,7 @@ class Articulation(RobotState):
                 continue
             found = True
             here = actuator.effects.find(effect)
-            own = self._joint_list(actuator)
+            own = self.joints_of(actuator)
             pairs = [(own.index(j), k) for k, j in enumerate(wanted) if j in own]
             if pairs:
                 local, chosen = zip(*pairs, strict=True)
@@ -189,7 +217,8 @@ class Articulation(RobotState):
         if effect.overrides("write_model"):
             self._write_model(actuator, effect)
 
-    def _joint_list(self, actuator: PaceDCMotor) -> list[int]:
+    def joints_of(self, actuator: PaceDCMotor) -> list[int]:
+        """The joints that a drive moves, by index."""
         ids = actuator.joint_indices
         return list(range(self.num_joints)) if isinstance(ids, slice) else torch.as_tensor(ids).tolist()
 
@@ -213,7 +242,7 @@ class Articulation(RobotState):
     def _write_model(self, actuator: PaceDCMotor, effect: Effect) -> None:
         """Write an effect on the rigid bodies; loads have been written before."""
         self._link_model = self._link_model or LinkModel(self._sim, self.joint_names, self._added_mass)
-        for local, joint in enumerate(self._joint_list(actuator)):
+        for local, joint in enumerate(self.joints_of(actuator)):
             effect.write_model(self._link_model.of(effect.rows, joint), local)
         self._sim.note_model_effect(effect, self._columns_of(actuator))
         self._sim.constants_changed()
@@ -235,14 +264,8 @@ class Articulation(RobotState):
 
     def _build_actuators(self) -> None:
         n = self.num_joints
-        columns = {
-            "armature": "dof_armature",
-            "viscous_friction": "dof_damping",
-            "friction": "dof_frictionloss",
-        }
         model_values = {
-            key: self._sim.tensor(getattr(self._sim.model, field))[self._layout.dof_columns]
-            for key, field in columns.items()
+            name: self._sim.tensor(getattr(self._sim.model, _field(name)))[self._layout.dof_columns] for name in CARRIED
         }
         self.actuators: dict[str, PaceDCMotor] = {}
         owner: dict[str, str] = {}
@@ -271,17 +294,16 @@ class Articulation(RobotState):
             holds_line = actuator.cfg.control_decimation > 1 or trapezoidal
             actuator.take_over_simulator(is_trapezoidal=trapezoidal, holds_line=holds_line)
             driven = actuator.joint_indices
-            self.write_joint_armature_to_sim(actuator.armature, driven)
-            self.write_joint_viscous_friction_coefficient_to_sim(actuator.viscous_friction, driven)
-            self.write_joint_friction_coefficient_to_sim(actuator.friction, driven)
+            for name in CARRIED:
+                self._write_carried(name, getattr(actuator, name), driven, None)
             configured = {cfg.effect_class.name for cfg in effect_cfgs(actuator.cfg.effects) if cfg.values}
             for effect in [] if actuator.effects is None else actuator.effects.effects:
                 if effect.name in configured and effect.overrides("write_model"):
                     self._write_model(actuator, effect)
 
-    def _write_parameter(
-        self, name: str, field: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds
-    ) -> None:
+    def _write_carried(self, name: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds) -> None:
+        """Write a parameter that the model's joints carry, and tell drives whose torque law depends on it."""
+        field = _field(name)
         value = value if isinstance(value, torch.Tensor) else checked_values(value, self._shape, name)
         tensor = self._sim.tensor(value)
         bad = ~((tensor >= 0) & tensor.isfinite())
@@ -298,3 +320,8 @@ class Articulation(RobotState):
                 self._write(written, self._layout.dof_columns, True, joint_ids, env_ids)
                 setattr(actuator, name, torch.where(written[:, columns], whole[:, columns], own))
                 self._write_passive(actuator)
+
+
+def _field(name: str) -> str:
+    """The model's field of a parameter that its joints carry."""
+    return f"dof_{BASE_PARAMETERS[name].mujoco}"

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 try:
-    from pace_assets import ASSETS_DIR
+    from pace_assets import ASSETS_DIR as _ASSETS
 except ModuleNotFoundError:  # a checkout on the path that was not installed
-    ASSETS_DIR = Path(__file__).parents[1] / "assets"
+    _ASSETS = Path(__file__).parents[1] / "assets"
 
-__all__ = ["ASSETS_DIR"]
+ASSETS_DIR = _ASSETS
+"""Folder of the shipped robots: ``ASSETS_DIR / "go2" / "go2.xml"``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolv
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
+from pace_actuators.text import listed
 from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -33,7 +33,7 @@ _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 def use_identified(
     cfg: ManagerBasedEnvCfg,
-    path: str | Path,
+    identified: IdentifiedDrives | str | Path,
     *,
     randomize_std: float | None = None,
     gains: bool = False,
@@ -49,7 +49,7 @@ def use_identified(
 
     Args:
         cfg: The environment; it is changed.
-        path: ``result.json``, or the run's folder.
+        identified: ``result.json``, the run's folder, or what has been read of it.
         randomize_std: Draw every environment's drives with this many standard deviations around the identified values;
             ``None`` does not.
         gains: Also take over the gains and limits of the recordings, as far as the result says them.
@@ -62,7 +62,7 @@ def use_identified(
     Raises:
         ValueError: If the result is unusable, or its joints are not the robot's.
     """
-    drives = IdentifiedDrives.load(path)
+    drives = IdentifiedDrives.of(identified)
     notes = check_representable(drives, HERE)
     cfg.scene.robot.actuators = groups = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
@@ -84,14 +84,14 @@ def use_identified(
     return notes
 
 
-def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
+def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -> list[str]:
     """Why an environment may not want the drives that a fit identified, in sentences; none if all is well.
 
     Args:
         cfg: The environment, with its own gains and limits.
-        path: ``result.json``, or the run's folder.
+        identified: As for :func:`use_identified`.
     """
-    drives, found = IdentifiedDrives.load(path), []
+    drives, found = IdentifiedDrives.of(identified), []
     if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
         found.append(
             f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values make up for what "
@@ -99,13 +99,13 @@ def doubts(cfg: ManagerBasedEnvCfg, path: str | Path) -> list[str]:
         )
     if drives.at_bound:
         found.append(
-            f"{_named(drives.at_bound)} ended at a bound of the fit, so the value is the bound's. Widen bounds_params "
+            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
             "and fit again."
         )
     if drives.undetermined:
         found.append(
-            f"{_named(sorted(drives.undetermined))} was not determined by the recordings and keeps its prior. Record a "
-            "motion that shows it, or train with --randomize_identified 1."
+            f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
+            "Record a motion that shows it, or train with --randomize_identified 1."
         )
     return found + _other_drives(cfg.scene.robot, drives)
 
@@ -143,17 +143,17 @@ def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
     cfg.sim.dt, cfg.decimation = dt, decimation
 
 
-def set_identified_step(cfg: ManagerBasedEnvCfg, path: str | Path) -> str | None:
+def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -> str | None:
     """Let physics and drives run at the control step of an identification: its values hold the errors of that step.
 
     Args:
         cfg: The environment; it is changed, unless its step is as fine already, or no multiple of that step.
-        path: ``result.json``, or the run's folder.
+        identified: ``result.json``, the run's folder, or what has been read of it.
 
     Returns:
         What was changed, in words.
     """
-    drives, before = IdentifiedDrives.load(path), cfg.sim.dt
+    drives, before = IdentifiedDrives.of(identified), cfg.sim.dt
     dt = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
     whole = cfg.sim.dt * cfg.decimation / dt
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
@@ -179,16 +179,10 @@ def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]
                     differs.setdefault((float(recorded), value), []).append(joint)
         for (recorded, value), joints in differs.items():
             found.append(
-                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({_named(joints)}). Set the "
-                "task's to what the robot will run, the recordings' where you do not know."
+                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({listed(joints, _MOST)}). "
+                "Set the task's to what the robot will run, the recordings' where you do not know."
             )
     return found
-
-
-def _named(labels: Sequence[str]) -> str:
-    """Some labels, the rest by number."""
-    more = len(labels) - _MOST
-    return ", ".join(labels[:_MOST]) + (f" and {more} more" if more > 0 else "")
 
 
 def _identified_groups(

@@ -42,7 +42,7 @@ import torch
 from pace_actuators import PaceDCMotorCfg
 from pace_actuators.effects import Effect, EffectParameter
 from pace_envs import ArticulationCfg, InitialStateCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, make_bounds
+from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 
 JOINTS = ("shoulder", "elbow")
 
@@ -56,12 +56,12 @@ def cfg():
         mjcf_path=Path(__file__).parent / "arm.xml", init_state=InitialStateCfg(joint_pos={".*": 0.2}),
         actuators={"all": drive}, joint_order=JOINTS,
     )
-    bounds = make_bounds(
-        JOINTS, armature=(1e-5, 0.1), viscous_friction=(0.0, 1.0), friction=(0.0, 0.5), encoder_bias=(-0.1, 0.1),
+    bounds = dict(
+        armature=(1e-5, 0.1), viscous_friction=(0.0, 1.0), friction=(0.0, 0.5), encoder_bias=(-0.1, 0.1),
         delay=(0.0, 10.0),
     )
     sim2real = PaceCfg(
-        robot_name="arm", data_dir="a.npz", joint_order=JOINTS, bounds_params=bounds,
+        robot_name="arm", data_dir="a.npz", joint_order=JOINTS, bounds=bounds,
         excitation=ExcitationCfg(bias=(0.2, 0.2), direction=(1.0, 1.0), scale=(0.3, 0.3)),
         sample_params={
             "armature": 0.01, "viscous_friction": 0.05, "friction": 0.08, "encoder_bias": 0.02, "delay": 1.5

@@ -13,7 +13,7 @@ TASK = """
 from pathlib import Path
 from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, make_bounds
+from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from swing_limits import DELAY, KD, KP
 
 def swing_cfg():
@@ -21,10 +21,10 @@ def swing_cfg():
         velocity_limit=20.0, max_delay=DELAY)
     robot = ArticulationCfg(mjcf_path=Path(__file__).parent / "swing.xml", actuators={{"drive": drive}},
         joint_order=({joint!r},))
-    bounds = make_bounds(({joint!r},), armature=(1e-4, 0.05), viscous_friction=(0.0, 0.5), friction=(0.0, 0.3),
+    bounds = dict(armature=(1e-4, 0.05), viscous_friction=(0.0, 0.5), friction=(0.0, 0.3),
         encoder_bias=(-0.1, 0.1), delay=(0.0, DELAY))
     return PaceSim2realEnvCfg(scene=PaceSim2realSceneCfg(robot=robot), sim2real=PaceCfg(robot_name="swing",
-        data_dir="data/swing.csv", joint_order=({joint!r},), bounds_params=bounds,
+        data_dir="data/swing.csv", joint_order=({joint!r},), bounds=bounds,
         excitation=ExcitationCfg(bias=(0.2,), direction=(1.0,), scale=(0.8,))))
 
 register_task("Pace-Swing-v0", swing_cfg)

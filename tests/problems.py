@@ -13,8 +13,8 @@ import torch
 
 from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_env_cfg
-from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.pace_cfg import make_bounds
+from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -223,14 +223,13 @@ def pendulums_cfg(folder: Path, more: str = "", **cmaes: Any) -> PaceSim2realEnv
             robot_name="pendulums",
             data_dir=folder / "missing.npz",
             joint_order=joints,
-            bounds_params=make_bounds(
-                joints,
-                armature=(1e-5, 0.5),
-                viscous_friction=(0.0, 6.0),
-                friction=(0.0, 1.0),
-                encoder_bias=(-0.1, 0.1),
-                delay=(0.0, 8.0),
-            ),
+            bounds={
+                "armature": (1e-5, 0.5),
+                "viscous_friction": (0.0, 6.0),
+                "friction": (0.0, 1.0),
+                "encoder_bias": (-0.1, 0.1),
+                "delay": (0.0, 8.0),
+            },
             cmaes=CMAESOptimizerCfg(**cmaes),
         ),
     )

@@ -5,7 +5,7 @@ import sys
 
 import torch
 
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.processes import Processes, join
@@ -26,7 +26,7 @@ def searched(task: str, processes: Processes) -> list:
     problem = load_problem(task).on_pieces(0.1)
     evaluator = problem.training_evaluator()
     optimizer = CMAESOptimizer(
-        problem.space, 9, problem.env_cfg.sim2real.cmaes, trees=problem.trees, processes=processes
+        problem.space, 9, CMAESOptimizerCfg.of(problem.env_cfg.sim2real), trees=problem.trees, processes=processes
     )
 
     def after_generation(_: CMAESOptimizer) -> None:

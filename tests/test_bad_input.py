@@ -17,7 +17,7 @@ from problems import ANYMAL, BENCH, env_cfg, record
 from pace_actuators import IdentifiedDrives
 from pace_envs.tasks.pace import Parameter, test_bench
 from pace_optim.comparison import compare
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.history import History
 from pace_optim.run.open import Run
@@ -349,9 +349,8 @@ def test_a_robots_sample_that_is_missing_is_named(fails, monkeypatch):
 
 
 def test_bounds_that_leave_nothing_to_identify_are_told(fails, monkeypatch):
-    bounds = env_cfg(BENCH).sim2real.bounds_params.clone()
-    bounds[:, 1] = bounds[:, 0]
-    cfg = env_cfg(BENCH, bounds_params=bounds)
+    bounds = env_cfg(BENCH).sim2real.bounds
+    cfg = env_cfg(BENCH, bounds={name: own[:, [0, 0]] for name, own in bounds.items()})
     monkeypatch.setattr(test_bench, "test_bench_pace_env_cfg", lambda: cfg)
     assert "there is nothing to identify" in fails("--task", BENCH, "--data", "GOOD")
 

@@ -20,9 +20,8 @@ from pace_actuators.memory import available_memory, check_memory
 from pace_optim.identification.beginning import search_population
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
-from pace_optim.terminal.cli import make_parser, run_cli
+from pace_optim.terminal.cli import make_parser, one_line, readable, run_cli, safe_streams
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.terminal.screen import one_line, readable, safe_streams
 
 ROOT = Path(__file__).parents[1]
 

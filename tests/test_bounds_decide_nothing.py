@@ -45,7 +45,7 @@ def test_a_strong_drive_s_torques_are_sought_as_far_as_its_friction_says():
     assert effort.widest(1.0) == (0.0, 16.0) and effort.widest(30.0) == (0.0, 120.0)
     assert velocity.widest(30.0) == velocity.widest()
     cfg = load_env_cfg("Pace-AnymalD-v0").sim2real
-    cfg.bounds_params[2 * 12 + 3, 1] = 30.0
+    cfg.bounds["friction"][3, 1] = 30.0
     cfg.effects = ["stribeck_friction@wide"]
     (strong, _) = effect_parameters(cfg)
     assert strong.upper[3] == 120.0 and max(strong.upper[:3]) == 16.0

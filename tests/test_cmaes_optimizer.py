@@ -16,8 +16,7 @@ from problems import (
     record,
 )
 
-from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import TargetScore
 from pace_optim.optimizers.search import search
 from pace_optim.optimizers.tree_strategy import DIVERGED_SCORE

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bench_recordings import CONTROL_DT, Bench, chirp, record
 
-from pace_optim.fit import fit
-from pace_optim.problem.stated_limits import contradicted_limits
+from pace_optim.identification.fit import fit
+from pace_optim.problem.log_and_robot import contradicted_limits
 from pace_optim.recording import Recording
 from pace_optim.run.settings import FitSettings
 

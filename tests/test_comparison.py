@@ -7,14 +7,12 @@ import pytest
 from problems import BENCH, env_cfg, make_problem, record
 
 from pace_optim.comparison.frequency import band_edges, band_power, narrowest_band, response
-from pace_optim.comparison.hysteresis import hysteresis
-from pace_optim.comparison.joint import compare_joint, share_above
+from pace_optim.comparison.joint import compare_joint, hysteresis, share_above, whiteness
 from pace_optim.comparison.load_torque import load_torques
 from pace_optim.comparison.motion import motion_of
 from pace_optim.comparison.places import worst_places
 from pace_optim.comparison.regions import best_region, evidence, lay_out
 from pace_optim.comparison.tracks import Track
-from pace_optim.comparison.whiteness import whiteness
 from pace_optim.recording import Load
 from pace_optim.recording.noise import NoiseFloor, lattice_step, noise_floor, with_repetitions
 

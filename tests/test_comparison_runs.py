@@ -12,10 +12,10 @@ from command_lines import run_script
 from problems import BENCH, record
 from run_folders import JOINTS, make_result, make_trajectory, write_run
 
-import pace_optim.fit as fit_module
+import pace_optim.identification.fit as fit_module
 from pace_actuators.files import write_tensors
 from pace_optim.comparison import compare, comparison_lines
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import Load, load_recording, save_recording
 from pace_optim.report import write_report
 from pace_optim.report.sections.failure import _worst_place

@@ -10,8 +10,9 @@ from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg, configc
 from pace_envs import ArticulationCfg, InitialStateCfg, ManagerBasedRLEnv, load_env_cfg
 from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import anymal_d_cfg, go2_cfg
-from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, base_parameters
+from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, base_parameters
 from pace_envs.tasks.velocity import set_drives
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
 
 GAINS = {"stiffness": 10.0, "damping": 0.0}
 
@@ -169,10 +170,11 @@ def test_a_configuration_in_paces_form_builds_its_environment():
 def test_instances_share_no_default_that_can_change():
     first, second = BenchEnvCfg(), BenchEnvCfg()
     first.sim2real.bounds_params[0, 1] = 9.0
+    second.prepare()
     first.sim2real.joint_order.append("more")
     first.scene.robot.actuators["drive"].max_delay = 3
-    assert float(second.sim2real.bounds_params[0, 1]) == 1.0 and second.sim2real.joint_order == ["servo"]
-    assert second.scene.robot.actuators["drive"].max_delay is None
+    assert float(second.sim2real.bounds["armature"][0, 1]) == 1.0 and second.sim2real.joint_order == ("servo",)
+    assert second.scene.robot.actuators["drive"].max_delay == 20.0
 
 
 def test_bounds_of_other_joints_are_refused_at_use_whatever_post_init_does():

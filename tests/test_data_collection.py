@@ -56,7 +56,7 @@ def replay_score(recording, task: str, *, parameters=None, physics_dt=None, dela
     )
     rollout = Rollout(env, make_dataset([conformed], train_fraction=1), space)
     rollout.start(truth[None])
-    score = torch.zeros(1, cfg.bounds_params.shape[0] // 4, dtype=torch.float64)
+    score = torch.zeros(1, len(cfg.joint_order), dtype=torch.float64)
     for sim_dof_pos, real_dof_pos in rollout:
         score += rollout.weight * (sim_dof_pos - truth[space["encoder_bias"]] - real_dof_pos) ** 2
     env.close()

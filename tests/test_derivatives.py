@@ -120,9 +120,8 @@ def test_steps_at_the_bounds_point_inwards(pendulums):
 
 
 def test_an_entry_whose_bounds_are_equal_has_no_derivative():
-    bounds = env_cfg().sim2real.bounds_params.clone()
-    bounds[2] = 0.3
-    cfg = env_cfg(bounds_params=bounds)
+    cfg = env_cfg()
+    cfg.sim2real.set_bounds("friction", 0.3, 0.3)
     problem = make_problem(record(truth=TRUTH, cfg=cfg), cfg=cfg)
     columns = differentiate(problem, somewhere(problem), coloured(problem))
     assert not columns.column(2).any() and columns.column(1).any()

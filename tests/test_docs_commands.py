@@ -85,7 +85,7 @@ def test_a_fit_goes_on_to_the_diagnosis_of_its_run(interrupted, diagnosed, run, 
     ended = SimpleNamespace(stop_reasons=["interrupted" if interrupted else "converged"])
     asked = []
     monkeypatch.setattr("pace_optim.run.summary.summary", lambda _: [])
-    monkeypatch.setattr("pace_optim.fit.fit_with_torques", lambda settings, **_: (ended, run))
+    monkeypatch.setattr("pace_optim.identification.fit.fit_with_torques", lambda settings, **_: (ended, run))
     monkeypatch.setattr("pace_optim.commands.diagnose.run_and_tell", asked.append)
     words = ("--task", run.parents[3] / "swing.xml", "--data", run.parents[3] / "data" / "swing.csv", "--diagnose")
     done = run_script("fit", *words, cwd=tmp_path)

@@ -12,7 +12,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg, register_task
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_envs.tasks.pace.parameters import effect_parameters
 from pace_optim.diagnosis import candidate_effects
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings

@@ -14,10 +14,10 @@ from effect_envs import rms
 from problems import ANYMAL, BENCH, CALM, DT, chirp, env_cfg, legs_chirp, make_problem, record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import pace_optim.fit as fit_module
+import pace_optim.identification.fit as fit_module
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.single_joint_model import reference_path, twin_problem

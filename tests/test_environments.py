@@ -12,9 +12,11 @@ from gymnasium.wrappers.vector import NumpyToTorch, RecordEpisodeStatistics
 
 import pace_envs
 from pace_actuators import PaceDCMotorCfg
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_envs import ArticulationCfg, InitialStateCfg, ManagerBasedRLEnv, load_env_cfg
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
 
+BOUNDS = {**dict.fromkeys(BASE_PARAMETERS, (0.0, 1.0)), "delay": (0.0, 10.0)}
 TASKS = {"Pace-AnymalD-v0": 12, "Pace-Go2-v0": 12, "Pace-SO101-v0": 6, "Pace-TestBench-v0": 1}
 
 
@@ -236,10 +238,9 @@ def arm_task(tmp_path):
                 )
             },
         )
-        bounds = torch.tensor([[0.0, 1.0]] * 8 + [[0.0, 10.0]])
         return PaceSim2realEnvCfg(
             scene=PaceSim2realSceneCfg(robot=robot),
-            sim2real=PaceCfg(robot_name="arm", data_dir=tmp_path, joint_order=joints, bounds_params=bounds),
+            sim2real=PaceCfg(robot_name="arm", data_dir=tmp_path, joint_order=joints, bounds=BOUNDS),
         )
 
     pace_envs.register_task("Pace-RegisteredArm-v0", arm_env_cfg)
@@ -266,15 +267,41 @@ def test_a_name_can_be_registered_only_once(arm_task):
 
 
 @pytest.mark.parametrize(
-    ("bounds", "message"),
+    ("fields", "message"),
     [
-        (torch.zeros(8, 2), r"shape \(8, 2\), expected \(5, 2\)"),
-        (torch.tensor([[0.0, 1.0]] * 4 + [[5.0, 1.0]]), r"row 4 is \(5, 1\), expected lower <= upper"),
+        ({"bounds_params": torch.zeros(8, 2)}, r"shape \(8, 2\), expected \(5, 2\)"),
+        (
+            {"bounds_params": torch.tensor([[0.0, 1.0]] * 4 + [[5.0, 1.0]])},
+            r"delay on all are \(5, 1\), expected lower <= upper",
+        ),
+        ({"bounds": {"friction": (0.0, 1.0)}}, r"bounds has friction, expected a pair .* for each of armature"),
+        ({"bounds": {**BOUNDS, "friction": (2.0, 1.0)}}, r"friction on servo are \(2, 1\), expected lower <= upper"),
+        ({"bounds": {**BOUNDS, "friction": (0.0, 1.0, 2.0)}}, r"friction have shape \(3,\), expected one pair"),
+        ({"bounds": {**BOUNDS, "friction": {"elbow": (0.0, 1.0)}}}, r"'elbow' matches no joint"),
     ],
 )
-def test_bounds_that_do_not_fit_the_joints_are_refused(bounds, message):
+def test_bounds_that_do_not_fit_the_joints_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
-        PaceCfg(robot_name="x", data_dir=".", joint_order=("servo",), bounds_params=bounds).prepare()
+        PaceCfg(robot_name="x", data_dir=".", joint_order=("servo",), **fields).prepare()
+
+
+def test_bounds_are_a_pair_for_all_one_by_expression_or_paces_tensor():
+    def prepared(**fields):
+        cfg = PaceCfg(robot_name="x", data_dir=".", joint_order=("hip", "knee"), **fields)
+        cfg.prepare()
+        return cfg
+
+    by_name = prepared(bounds={**BOUNDS, "friction": {"hip": (0.0, 1.0), "kn.*": (0.0, 2.0)}})
+    assert by_name.bounds["friction"].tolist() == [[0.0, 1.0], [0.0, 2.0]]
+    assert by_name.bounds["armature"].tolist() == [[0.0, 1.0]] * 2 and by_name.bounds["delay"].tolist() == [[0.0, 10.0]]
+    rows = torch.cat([by_name.bounds[name] for name in BASE_PARAMETERS])
+    pace = prepared(bounds_params=rows)
+    assert pace.bounds_params is None
+    assert all(torch.equal(pace.bounds[name], own) for name, own in by_name.bounds.items())
+    pace.set_bounds("delay", 0.1, 0.3)
+    assert pace.bounds["delay"].tolist() == [[0.1, 0.3]]  # to the last digit
+    pace.set_bounds("friction", upper=[3.0, 4.0])
+    assert pace.bounds["friction"].tolist() == [[0.0, 3.0], [0.0, 4.0]]
 
 
 # ---- pictures

@@ -7,7 +7,6 @@ import pytest
 
 from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg
-from pace_envs.tasks.pace.pace_cfg import make_bounds
 from pace_optim.excitation import Trajectory, excitations, make_excitation, register_excitation, write_command_csv
 from pace_optim.experiment_design.motion_check import (
     MotionLimits,
@@ -29,7 +28,7 @@ def robot(bias=(0.0, 0.4), direction=(1.0, -1.0), scale=(0.25, 0.5)) -> PaceCfg:
         robot_name="two_joints",
         data_dir="none.npz",
         joint_order=joints,
-        bounds_params=make_bounds(joints, **pairs),
+        bounds=pairs,
         excitation=ExcitationCfg(bias=bias, direction=direction, scale=scale),
     )
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 from problems import BENCH, TRUTH, chirp, record
 
-import pace_optim.fit as fit_module
+import pace_optim.identification.fit as fit_module
 from pace_envs import load_env_cfg
-from pace_optim.fit import fit, resume
 from pace_optim.identification import conclusion
 from pace_optim.identification.beginning import load_for_fit
+from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.optimization import Optimization
 from pace_optim.optimizers.way_down import WayDown
 from pace_optim.recording import Drive, Load, load_recording, save_recording

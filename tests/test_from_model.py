@@ -11,6 +11,7 @@ import mujoco
 import pytest
 import torch
 
+from pace_actuators.base_parameters import CARRIED
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
 from pace_envs.from_model.robot import read_robot
@@ -105,16 +106,16 @@ def test_gravity_home_and_the_pose_of_the_base_are_the_files(tmp_path):
 
 def test_bounds_scale_with_each_joints_drive(tmp_path):
     cfg = cfg_of(tmp_path, ARM)
-    upper = cfg.sim2real.bounds_params[:-1, 1].reshape(4, 3)
-    assert upper[0, 0] >= 10 * 0.05 > upper[0, 1] and upper[2, 0] > 5 * upper[2, 1]
-    assert upper[3].tolist() == pytest.approx([0.1, 0.1, 0.01])
+    upper = {name: own[:, 1].tolist() for name, own in cfg.sim2real.bounds.items()}
+    assert upper["armature"][0] >= 10 * 0.05 > upper["armature"][1] and upper["friction"][0] > 5 * upper["friction"][1]
+    assert upper["encoder_bias"] == pytest.approx([0.1, 0.1, 0.01])
 
 
 def test_placeholders_for_limits_leave_room_for_a_small_drive_and_for_its_friction(tmp_path):
     urdf = URDF.replace('effort="23.7" velocity="30.1"', 'effort="1000" velocity="1000"')
-    bounds = cfg_of(tmp_path, urdf, "leg.urdf").sim2real.bounds_params
-    assert 0 < bounds[0, 0] < 1e-4  # 1e-3 of what the hip moves; 1e-5 of 1000 N m / (25 rad/s²) is 4e-4
-    assert bounds[2, 1] == pytest.approx(1000 / 10)  # at 10 rad/s, not at 1000
+    bounds = cfg_of(tmp_path, urdf, "leg.urdf").sim2real.bounds
+    assert 0 < bounds["armature"][0, 0] < 1e-4  # 1e-3 of what the hip moves; 1e-5 of 1000 N m / (25 rad/s²) is 4e-4
+    assert bounds["viscous_friction"][0, 1] == pytest.approx(1000 / 10)  # at 10 rad/s, not at 1000
 
 
 def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
@@ -122,13 +123,13 @@ def test_a_fit_begins_at_a_small_part_of_the_bounds(tmp_path):
     its motion: either leads a descent astray."""
     sim2real = cfg_of(tmp_path, ARM).sim2real
     n, space = len(sim2real.joint_order), ParameterSpace.of(sim2real)
-    expected = 0.1 * sim2real.bounds_params[: 3 * n, 1]
+    expected = 0.1 * torch.cat([sim2real.bounds[name][:, 1] for name in CARRIED])
     start = space.to_physical(space.start)
     assert start[: 3 * n].tolist() == pytest.approx(expected.tolist())
-    assert float(start[-1]) == pytest.approx(0.1 * float(sim2real.bounds_params[-1, 1]))
-    sim2real.bounds_params[0, 0] = 0.5 * sim2real.bounds_params[0, 1]  # such as where the loop is stable
+    assert float(start[-1]) == pytest.approx(0.1 * float(sim2real.bounds["delay"][0, 1]))
+    sim2real.bounds["armature"][0, 0] = 0.5 * sim2real.bounds["armature"][0, 1]  # such as where the loop is stable
     raised = ParameterSpace.of(sim2real)
-    assert float(raised.to_physical(raised.start)[0]) == pytest.approx(float(sim2real.bounds_params[0, 0]))
+    assert float(raised.to_physical(raised.start)[0]) == pytest.approx(float(sim2real.bounds["armature"][0, 0]))
     with pytest.raises(ValueError, match="start_params names mass"):
         dataclasses.replace(sim2real, start_params={"mass": 1.0}).prepare()
 
@@ -340,7 +341,7 @@ def test_commands_come_at_the_rate_that_is_asked_for(tmp_path):
     usual, fast = load_env_cfg(task), load_env_cfg(task, 0.001)
     assert (usual.sim.dt, usual.decimation) == (0.0025, 1) and (fast.sim.dt, fast.decimation) == (0.001, 1)
     for cfg in (usual, fast):  # [control steps]
-        assert float(cfg.sim2real.bounds_params[-1, 1]) * cfg.sim.dt == pytest.approx(0.05)
+        assert float(cfg.sim2real.bounds["delay"][0, 1]) * cfg.sim.dt == pytest.approx(0.05)
         assert drive_of(cfg).max_delay * cfg.sim.dt == pytest.approx(0.05)
     assert "control rate: 1000 Hz" in " ".join(fast.sim2real.notes)
     record = EnvironmentRecord.read(json.loads(json.dumps(EnvironmentRecord.of(task, fast).to_dict())), task)
@@ -364,7 +365,7 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
     written, own = load_env_cfg(task), cfg_from_model(tmp_path / "robot.xml", 0.002)
     assert written.sim2real.joint_order == own.sim2real.joint_order
     assert written.sim2real.assumed_gains == own.sim2real.assumed_gains == ("rail",)
-    torch.testing.assert_close(written.sim2real.bounds_params, own.sim2real.bounds_params, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(written.sim2real.bounds, own.sim2real.bounds, rtol=1e-4, atol=1e-9)
     starts = [ParameterSpace.of(sim2real).start for sim2real in (written.sim2real, own.sim2real)]
     torch.testing.assert_close(*starts, rtol=1e-4, atol=1e-9)
     for field in ("stiffness", "damping", "effort_limit", "implicit", "control_decimation"):

@@ -12,7 +12,7 @@ from test_masked_resets import NUM_ENVS, without_chance
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.comparison import compare
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 

@@ -14,7 +14,7 @@ from pace_envs import load_env_cfg
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.result import drive_in_force
-from pace_optim.uncertainty.whole_delay import whole_delay
+from pace_optim.uncertainty.undetermined import whole_delay
 
 URDF = """<robot name="pendulum"><link name="base"/>
   <link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/>

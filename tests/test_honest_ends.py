@@ -13,7 +13,7 @@ from run_folders import make_result
 from pace_actuators import IdentifiedDrives
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.export import FORMATS
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.optimizers.least_squares import LeastSquaresCfg
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive, save_recording

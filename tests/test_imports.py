@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -18,43 +19,8 @@ DOWNSTREAM = {
 }
 """Folder -> what none of its files may import."""
 
-FLOORS = {
-    "pace_optim": (
-        ["terminal", "recording", "excitation"],
-        ["robot_logs", "plant", "export", "measured_effort", "one_kernel"],
-        ["problem"],
-        ["optimizers", "single_joint_model"],
-        ["uncertainty"],
-        ["run", "experiment_design", "single_joint_fits"],
-        ["report", "data_collection"],
-        ["comparison"],
-        ["log_checks"],
-        ["identification"],
-        ["fit"],
-        ["diagnosis"],
-        ["commands"],
-    ),
-    "pace_optim/diagnosis": (
-        ["diagnosis_cfg"],
-        ["settings"],
-        ["candidates"],
-        ["judging"],
-        ["beginning", "search"],
-        ["verdict"],
-        ["telling"],
-        ["method"],
-        ["diagnose"],
-    ),
-    "pace_optim/diagnosis/search": (
-        ["state"],
-        ["one_round", "pooling", "replace_effect"],
-        ["carried_links"],
-        ["grow"],
-        ["look_ahead"],
-        ["search"],
-    ),
-}
-"""Package -> its rooms, from the ground up: a room imports from below and from beside, never from above."""
+CIRCLES = {"pace_actuators", "pace_envs", "pace_envs/fused"}
+"""Packages whose files import each other in a circle; no other may."""
 
 ACTUATORS_MAY_IMPORT = {*sys.stdlib_module_names, "torch", "pace_actuators"}
 ADAPTERS = {"pace_actuators/mjlab.py": "mjlab", "pace_actuators/isaaclab.py": "isaaclab"}
@@ -86,7 +52,7 @@ def files_of(*folders: str) -> list[str]:
         ("import torch.nn as nn, pace_optim", {"torch", "pace_optim"}),
         ("from pace_envs.mdp import joint_pos_rel", {"pace_envs"}),
         ("def f():\n    from pace_optim import fit", {"pace_optim"}),
-        ("import importlib\nimportlib.import_module('pace_optim.fit')", {"importlib", "pace_optim"}),
+        ("import importlib\nimportlib.import_module('pace_optim.identification.fit')", {"importlib", "pace_optim"}),
         ("from . import effects\nfrom .effects import base", set()),
     ],
 )
@@ -102,35 +68,50 @@ def test_no_file_imports_what_lies_downstream(path):
     )
 
 
-def imported_modules(source: str) -> set[str]:
-    """Full names of what a file imports absolutely, of modules and of what it takes from them."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
+def imported_modules(path: str) -> set[str]:
+    """Full names of what a file imports, of modules and of what it takes from them."""
+    found, folder = set(), Path(path).parent.parts
+    for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = folder[: len(folder) - node.level + 1] if node.level else ()
+            module = ".".join([*above, *filter(None, [node.module])])
+            found |= {f"{module}.{alias.name}" for alias in node.names}
     return found
 
 
-@pytest.mark.parametrize("package", FLOORS)
-def test_every_room_has_its_floor(package):
-    rooms = {path.stem for path in (ROOT / package).iterdir() if path.is_dir() or path.suffix == ".py"}
-    assert rooms - {"__init__", "__pycache__", "py"} == {room for floor in FLOORS[package] for room in floor}
+def rooms_of(package: str) -> dict[str, set[str]]:
+    """What each room of a package (a folder or a file in it) imports of the other rooms."""
+    prefix, rooms = package.replace("/", ".") + ".", {}
+    for path in files_of(package):
+        own = Path(path).relative_to(package).parts[0].removesuffix(".py")
+        if own != "__init__":  # which is there for those outside
+            taken = {m.removeprefix(prefix).split(".")[0] for m in imported_modules(path) if m.startswith(prefix)}
+            rooms.setdefault(own, set()).update(taken - {own})
+    return {room: taken & set(rooms) for room, taken in rooms.items()}
 
 
-@pytest.mark.parametrize(
-    ("package", "path"), [(package, path) for package in FLOORS for path in files_of(package)], ids=str
-)
-def test_no_room_imports_from_a_floor_above(package, path):
-    height = {room: i for i, floor in enumerate(FLOORS[package]) for room in floor}
-    own = Path(path).relative_to(package).parts[0].removesuffix(".py")
-    if own == "__init__":
-        return
-    prefix = package.replace("/", ".") + "."
-    for module in imported_modules((ROOT / path).read_text(encoding="utf-8")):
-        room = module.removeprefix(prefix).split(".")[0] if module.startswith(prefix) else own
-        assert height.get(room, 0) <= height[own], f"{path} imports {module}, from a floor above its own"
+PACKAGES = sorted({str(Path(path).parent) for path in files_of("pace_actuators", "pace_envs", "pace_optim")})
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_rooms_of_a_package_have_an_order(package):
+    """No arrow up: there is an order in which each room imports from rooms before it alone."""
+    try:
+        list(TopologicalSorter(rooms_of(package)).static_order())
+        circle = None
+    except CycleError as error:
+        circle = " -> ".join(error.args[1])
+    assert (circle is not None) == (package in CIRCLES), f"{package} imports in a circle: {circle}"
+
+
+def test_a_room_that_imports_upwards_is_seen(tmp_path, monkeypatch):
+    for name, text in {"low": "from ..house import high", "high": "import house.low.part"}.items():
+        (tmp_path / "house" / name).mkdir(parents=True)
+        (tmp_path / "house" / name / "part.py").write_text(text.replace("..house", ".."))
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    assert rooms_of("house") == {"low": {"high"}, "high": {"low"}}
 
 
 @pytest.mark.parametrize("path", files_of("pace_actuators"))

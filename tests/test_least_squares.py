@@ -108,10 +108,8 @@ def test_no_descent_ends_on_derivatives_of_elsewhere(bend, start):
 
 
 def bench_with_bounds(name, low, high, truth=TRUTH):
-    bounds = env_cfg().sim2real.bounds_params.clone()
-    row = ["armature", "viscous_friction", "friction", "encoder_bias", "delay"].index(name)
-    bounds[row] = torch.tensor([low, high])
-    cfg = env_cfg(bounds_params=bounds)
+    cfg = env_cfg()
+    cfg.sim2real.set_bounds(name, low, high)
     return make_problem(record(truth=truth), cfg=cfg)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from test_assumed_gains import HEAD, KD, KP, MOTORS
 
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import Drive, Recording, save_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.run.open import open_problem

@@ -10,8 +10,8 @@ import pytest
 from problems import TRUTH, chirp, record
 from scipy.signal import savgol_filter
 
-import pace_optim.fit as fit_module
-from pace_optim.fit import fit_with_torques
+import pace_optim.identification.fit as fit_module
+from pace_optim.identification.fit import fit_with_torques
 from pace_optim.measured_effort import read_drives, read_law
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive, Recording, conform_recording, save_recording

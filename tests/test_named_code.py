@@ -14,7 +14,7 @@ from problems import BENCH, record
 from pace_actuators.effects import get_effect
 from pace_actuators.own_code import code_of, digest_of, import_named, import_recorded
 from pace_envs.rl.runner import read_checkpoint
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 

@@ -12,7 +12,7 @@ from pace_optim.comparison.motion import motion_of
 from pace_optim.comparison.regions import Region
 from pace_optim.comparison.words import place_text
 from pace_optim.diagnosis import candidate_effects
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.run.settings import FitSettings
 
 BENCH = "Pace-TestBench-v0"

@@ -18,8 +18,9 @@ from problems import BENCH, TRUTH, chirp, env_cfg, make_problem, pendulums_cfg, 
 from pace_envs import TerrainCfg
 from pace_envs.contact_sensor import ContactSensorCfg
 from pace_optim import CMAESOptimizer
-from pace_optim.fit import fit, resume
+from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.own_objective import error_bars
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
@@ -69,7 +70,7 @@ def file(recording, tmp_path_factory):
 
 def one_generation(kind, problem, trees=None) -> CMAESOptimizer:
     """After the first generation."""
-    optimizer = kind(problem.space, 8, problem.env_cfg.sim2real.cmaes, trees=trees, seed=3)
+    optimizer = kind(problem.space, 8, CMAESOptimizerCfg.of(problem.env_cfg.sim2real), trees=trees, seed=3)
     rollout = problem.evaluator().rollout(8)
     optimizer.ask()
     optimizer.update_simulator(rollout)
@@ -152,7 +153,7 @@ def test_a_fit_takes_a_class_and_writes_all_that_a_fit_writes(file, tmp_path):
 
 def test_positions_and_velocities_find_the_truth_that_positions_find(recording):
     problem = make_problem(record(chirp(1.0)))
-    optimizer = PositionAndVelocity(problem.space, 32, problem.env_cfg.sim2real.cmaes, seed=0)
+    optimizer = PositionAndVelocity(problem.space, 32, CMAESOptimizerCfg.of(problem.env_cfg.sim2real), seed=0)
     rollout = problem.evaluator().rollout(32)
     while not optimizer.finished():
         optimizer.ask()

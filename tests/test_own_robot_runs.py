@@ -14,7 +14,7 @@ from command_lines import ROOT, run_script
 from own_robot import write_robot
 
 from pace_envs.task_source import use_task
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.run.open import Run, open_problem
 
 FIT = ("--optimizer", "least_squares", "--no_consistency")

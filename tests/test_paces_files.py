@@ -8,7 +8,7 @@ from command_lines import run_script
 from problems import BENCH, chirp, record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.identification.optimization import Optimization
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings

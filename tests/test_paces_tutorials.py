@@ -15,9 +15,9 @@ import torch
 
 from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_envs import load_env_cfg
-from pace_envs.tasks.pace import CMAESOptimizerCfg
 from pace_optim import CMAESOptimizer
 from pace_optim.excitation import make_excitation
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import ScoreSpread, SearchState
 from pace_optim.problem.parameter_space import ParameterSpace
 
@@ -51,7 +51,7 @@ def test_basics_the_configuration_holds_what_the_tutorial_sets(cfg):
     drive = cfg.scene.robot.actuators["legs"]
     assert (drive.saturation_effort, drive.effort_limit, drive.velocity_limit, drive.max_delay) == (140, 89, 8.5, 10)
     assert cfg.sim2real.robot_name == "anymal_d_sim" and len(cfg.sim2real.joint_order) == N
-    bounds = cfg.sim2real.bounds_params
+    bounds = torch.cat([*cfg.sim2real.bounds.values()])
     assert bounds.shape == (49, 2)
     assert bounds[:12].tolist() == [[pytest.approx(1e-5), 1.0]] * 12 and bounds[12:24].tolist() == [[0.0, 7.0]] * 12
     assert bounds[24:36].tolist() == [[0.0, 0.5]] * 12 and bounds[48].tolist() == [0.0, 10.0]
@@ -86,7 +86,7 @@ def test_basics_the_controller_sees_the_position_less_its_bias(cfg):
 
 
 def test_advanced_parameters_are_normalised_to_minus_one_and_one(optimizer, cfg):
-    params, (low, high) = torch.rand(5, 49, dtype=torch.float64) * 2 - 1, cfg.sim2real.bounds_params.T
+    params, (low, high) = torch.rand(5, 49, dtype=torch.float64) * 2 - 1, torch.cat([*cfg.sim2real.bounds.values()]).T
     expected = low + (params + 1) / 2 * (high - low)
     assert torch.allclose(optimizer.space.to_physical(params), expected)
 

@@ -37,7 +37,7 @@ def test_the_base_vector_is_armature_viscous_friction_coulomb_friction_bias_of_e
         slice(36, 48),
         slice(48, 49),
     ]
-    assert torch.equal(torch.stack([space.lower, space.upper], dim=1), cfg.bounds_params)
+    assert torch.equal(torch.stack([space.lower, space.upper], dim=1), torch.cat([*cfg.bounds.values()]))
 
 
 def test_own_parameters_follow_the_base_ones():

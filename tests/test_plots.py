@@ -6,10 +6,10 @@ import torch
 from matplotlib.figure import Figure
 from run_folders import JOINTS, make_history, make_trajectory
 
-from pace_optim.report.number_text import position_text, position_unit, three_figures
+from pace_actuators.text import position_text, position_unit, three_figures
 from pace_optim.report.plots import plot_scores, plot_trajectories
-from pace_optim.report.trajectory_errors import held_out_spans
 from pace_optim.run.history import History
+from pace_optim.run.tensors import held_out_spans
 
 
 @pytest.fixture(scope="module")

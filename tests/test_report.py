@@ -11,12 +11,12 @@ from browser import CHROMIUM, Browser
 from run_folders import JOINTS, LABELS, make_result, make_trajectory, write_run
 
 from pace_actuators.files import write_json, write_tensors
+from pace_actuators.text import duration, value_and_error
 from pace_optim.report import write_report
 from pace_optim.report.sections import SECTIONS
 from pace_optim.report.sections.correlation import strong_pairs
 from pace_optim.report.sections.parameters import nice_ticks
 from pace_optim.report.sections.trajectories import samples_to_draw
-from pace_optim.report.wording import duration, value_and_error
 
 NASTY = "</script><script>alert(1)</script> & <img src=x onerror=alert(2)>"
 

@@ -22,8 +22,7 @@ from problems import (
 from problems import PENDULUMS_TRUTH as TWO
 
 from pace_envs import set_physics_dt
-from pace_envs.tasks.pace import CMAESOptimizerCfg
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Load
 from pace_optim.recording.resample import interpolate_smooth
@@ -171,7 +170,8 @@ def test_candidates_do_not_influence_each_other():
 
 
 def test_a_diverging_candidate_leaves_the_others_as_they_were():
-    cfg = env_cfg(bounds_params=env_cfg().sim2real.bounds_params.index_fill(0, torch.tensor([3]), 0.0))
+    cfg = env_cfg()
+    cfg.sim2real.set_bounds("encoder_bias", 0.0, 0.0)
     problem = make_problem(record(truth={**TRUTH, "encoder_bias": 0.0}), cfg=cfg)
     evaluator = problem.evaluator()
     good = physical(problem, {**TRUTH, "encoder_bias": 0.0})

@@ -30,8 +30,8 @@ from pace_envs.rl import (
     resume,
     train,
 )
+from pace_envs.rl.playing import write_video
 from pace_envs.rl.training import load_cfg
-from pace_envs.rl.video import write_video
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command, play_cfg
 

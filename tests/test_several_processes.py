@@ -15,7 +15,7 @@ import torch
 from problems import ANYMAL, BENCH, record
 from sharing import searched
 
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.problem.processes import Processes
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings

@@ -8,7 +8,7 @@ from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_envs import load_env_cfg
 from pace_envs.robots import SO101_JOINTS
 from pace_envs.robots.so101 import so101_drive_cfg
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
 
@@ -30,17 +30,17 @@ def test_the_drive_is_the_servo_that_turns_an_error_into_a_duty_cycle():
 def test_delay_and_friction_of_hobby_servos_lie_within_the_bounds():
     cfg = load_env_cfg(TASK)
     step = cfg.sim.dt * cfg.decimation
-    bounds, n = cfg.sim2real.bounds_params, len(SO101_JOINTS)
-    assert bounds[-1, 1] * step >= 0.15
+    bounds = cfg.sim2real.bounds
+    assert bounds["delay"][0, 1] * step >= 0.15
     (drive,) = cfg.scene.robot.actuators.values()
-    assert drive.max_delay >= bounds[-1, 1]
-    assert float(bounds[2 * n : 3 * n, 1].min()) >= 0.05 * drive.stiffness
+    assert drive.max_delay >= bounds["delay"][0, 1]
+    assert float(bounds["friction"][:, 1].min()) >= 0.05 * drive.stiffness
 
 
 def test_the_smallest_armature_is_stable_at_the_smallest_inertia():
     cfg = load_env_cfg(TASK)
     (drive,) = cfg.scene.robot.actuators.values()
-    smallest = float(cfg.sim2real.bounds_params[:6, 0].min())
+    smallest = float(cfg.sim2real.bounds["armature"][:, 0].min())
     assert drive.damping * cfg.sim.dt / smallest < 1  # explicit back-EMF: no overshoot within a step
 
 

@@ -85,11 +85,11 @@ def test_they_move_as_they_do_among_all(legs, training):
 
 def test_their_bounds_are_their_own():
     cfg = legs_cfg().sim2real
-    cfg.bounds_params = torch.arange(2.0 * (4 * N + 1)).view(-1, 2)
+    cfg.bounds_params = rows = torch.arange(2.0 * (4 * N + 1)).view(-1, 2)
     part = cfg.on_joints([cfg.joint_order[8], cfg.joint_order[1]])
     assert part.joint_order == (cfg.joint_order[1], cfg.joint_order[8])
-    rows = [group * N + joint for group in range(4) for joint in (1, 8)]
-    assert torch.equal(part.bounds_params, cfg.bounds_params[[*rows, 4 * N]])
+    assert part.bounds["friction"].tolist() == rows[[2 * N + 1, 2 * N + 8]].tolist()
+    assert part.bounds["delay"].tolist() == rows[[-1]].tolist()
 
 
 def test_all_joints_are_the_problem_itself(legs):

@@ -8,9 +8,8 @@ import torch
 from run_folders import JOINTS, make_result
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pace_envs.tasks.pace import CMAESOptimizerCfg, PaceCfg, base_parameters
-from pace_envs.tasks.pace.pace_cfg import make_bounds
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_envs.tasks.pace import PaceCfg, base_parameters
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.tensorboard_log import TensorBoardLog
 
@@ -26,10 +25,14 @@ def evolve(optimizer: CMAESOptimizer) -> None:
 
 @pytest.fixture(scope="module")
 def optimizer() -> CMAESOptimizer:
-    bounds = make_bounds(
-        JOINTS, armature=(1e-5, 1), viscous_friction=(0, 7), friction=(0, 1), encoder_bias=(-0.1, 0.1), delay=(0, 10)
-    )
-    cfg = PaceCfg(robot_name="r", data_dir="none", joint_order=JOINTS, bounds_params=bounds)
+    bounds = {
+        "armature": (1e-5, 1),
+        "viscous_friction": (0, 7),
+        "friction": (0, 1),
+        "encoder_bias": (-0.1, 0.1),
+        "delay": (0, 10),
+    }
+    cfg = PaceCfg(robot_name="r", data_dir="none", joint_order=JOINTS, bounds=bounds)
     return CMAESOptimizer(ParameterSpace(base_parameters(cfg)), 16, CMAESOptimizerCfg(epsilon=None))
 
 

@@ -5,8 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from pace_optim.optimizers.tree_strategy import TreeStrategy
-from pace_optim.optimizers.unit_box import into_unit_box
+from pace_optim.optimizers.tree_strategy import TreeStrategy, into_unit_box
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

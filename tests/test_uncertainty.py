@@ -282,9 +282,8 @@ def test_a_slow_move_in_one_direction_cannot_tell_bias_from_friction():
 
 
 def test_a_parameter_held_fixed_by_its_bounds_is_neither_at_a_bound_nor_without_influence():
-    bounds = env_cfg().sim2real.bounds_params.clone()
-    bounds[2] = 0.3
-    cfg = env_cfg(bounds_params=bounds)
+    cfg = env_cfg()
+    cfg.sim2real.set_bounds("friction", 0.3, 0.3)
     problem = make_problem(record(noise=1e-4, cfg=cfg), cfg=cfg)
     uncertainty = assessed(problem, normalised(problem)).uncertainty
     assert np.isnan(uncertainty.std).tolist() == [False, False, True, False, False]

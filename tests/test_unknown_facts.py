@@ -9,7 +9,7 @@ from bench_recordings import Bench, chirp, record
 
 from pace_actuators import PaceDCMotorCfg
 from pace_optim.diagnosis.diagnose import _as_found
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.unknown_facts import identified_gains, started_from, with_identified
 from pace_optim.run.open import open_problem

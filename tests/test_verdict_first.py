@@ -12,13 +12,13 @@ from test_report import page_of
 
 from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
+from pace_actuators.text import size_text
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.telling.findings import percent_text
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
-from pace_optim.report.sizes import size_text
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.model import JointModel
 from pace_optim.uncertainty.uncertainty import sandwich

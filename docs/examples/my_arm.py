@@ -6,8 +6,15 @@ Importing this module registers ``Pace-MyArm-v0``; the scripts import it with ``
 from pathlib import Path
 
 from pace_actuators import PaceDCMotorCfg
-from pace_envs import ArticulationCfg, InitialStateCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, make_bounds
+from pace_envs import (
+    ArticulationCfg,
+    ExcitationCfg,
+    InitialStateCfg,
+    PaceCfg,
+    PaceSim2realEnvCfg,
+    PaceSim2realSceneCfg,
+    register_task,
+)
 
 HERE = Path(__file__).parent
 MY_ARM_JOINTS = ("shoulder", "elbow")
@@ -56,14 +63,13 @@ def my_arm_env_cfg() -> PaceSim2realEnvCfg:
             robot_name="my_arm",
             data_dir="data/my_arm/chirp.npz",
             joint_order=MY_ARM_JOINTS,
-            bounds_params=make_bounds(
-                MY_ARM_JOINTS,
-                armature=(1e-5, 0.1),
-                viscous_friction=(0.0, 1.0),
-                friction=(0.0, 0.5),
-                encoder_bias=(-0.1, 0.1),
-                delay=(0.0, 10.0),
-            ),
+            bounds={
+                "armature": (1e-5, 0.1),
+                "viscous_friction": (0.0, 1.0),
+                "friction": (0.0, 0.5),
+                "encoder_bias": (-0.1, 0.1),
+                "delay": (0.0, 10.0),
+            },
             excitation=ExcitationCfg(bias=(0.6, 1.0), direction=(1.0, 1.0), scale=(0.5, 0.7)),
             sample_params={
                 "armature": {"shoulder": 0.012, "elbow": 0.008},

@@ -21,6 +21,8 @@ from pace_actuators.effects.pages import effect_page
 ROOT = Path(__file__).parents[2]
 ELSEWHERE = {"README.md": "index.md"}
 """Pages outside docs/, and where the site has them; others keep their path."""
+PUBLIC = ("pace_optim", "pace_envs", "pace_envs/managers", "pace_envs/mdp", "pace_actuators", "pace_actuators/effects")
+"""Folders whose exports the reference shows."""
 _LINK = re.compile(r"(!?)\[([^\]\[]*(?:\[[^\]]*\][^\]\[]*)*)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -87,10 +89,10 @@ def _card(effect: type[Effect]) -> str:
 
 
 def reference() -> str:
-    """The public names of the three packages: what their ``__init__`` exports."""
+    """The public names: what the ``__init__`` of each public package exports."""
     text = ["# Reference\n\nWhat the packages export, from the docstrings.\n"]
-    for init in sorted(ROOT.glob("pace_*/**/__init__.py")):
-        names = _exported(init)
+    for init in (ROOT / name / "__init__.py" for name in PUBLIC):
+        names = [name for name in _exported(init) if f"{init.parent.name}/{name}" not in PUBLIC]
         package = init.parent.relative_to(ROOT).as_posix().replace("/", ".")
         if names:
             members = "".join(f"        - {name}\n" for name in names)

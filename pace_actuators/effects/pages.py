@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.text import capitalised
 
 
 def effect_page(effect: type[Effect], picture: str | None = None) -> str:
@@ -38,4 +39,4 @@ def _row(p: EffectParameter) -> str:
 
 
 def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}." if text else ""
+    return f"{capitalised(text)}." if text else ""

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import torch
 
 from pace_actuators import PaceDCMotorCfg, resolve_joint_values
+from pace_actuators.base_parameters import PER_JOINT
+from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import read_drives
@@ -34,7 +35,6 @@ from pace_envs.model_file import ModelFile, compile_model, read_model_file
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 
 _UNNAMED = {"", "mujoco model", "robot", "model", "scene"}
 _NARROW = 0.2
@@ -127,11 +127,11 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
     )
-    rows = [base_bounds(joint)[group] for group in PARAMETER_GROUPS for joint in joints]
+    bounds = {name: [base_bounds(joint)[name] for joint in joints] for name in PER_JOINT}
     moves = [motion(joint) for joint in joints]
     starts = [start_values(joint) for joint in joints]
-    samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PARAMETER_GROUPS}
-    return PaceSim2realEnvCfg(
+    samples = {group: {joint.name: sample_values(joint)[group] for joint in joints} for group in PER_JOINT}
+    cfg = PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=articulation),
         sim=SimulationCfg(
             dt=control_dt,
@@ -142,7 +142,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             robot_name=robot.name,
             data_dir=Path("data") / robot.name / "chirp.npz",
             joint_order=names,
-            bounds_params=torch.tensor([*rows, (0.0, longest_delay)], dtype=torch.float64),
+            bounds={**bounds, "delay": (0.0, longest_delay)},
             excitation=ExcitationCfg(
                 bias=tuple(centre / amplitude for centre, amplitude in moves),
                 direction=(1.0,) * len(joints),
@@ -159,6 +159,8 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             notes=robot.notes,
         ),
     )
+    cfg.sim2real.prepare()
+    return cfg
 
 
 def robot_cfg_from_model(
@@ -268,7 +270,7 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:
-        notes.append(f"effort limit: none ({_listed(without)})")
+        notes.append(f"effort limit: none ({listed(without, 3)})")
     if not any(np.isfinite(joint.velocity_limit) for joint in joints):
         notes.append("speed limit: none")
     notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
@@ -285,12 +287,12 @@ def _beside_drives(model: mujoco.MjModel, driven: Sequence[str]) -> list[str]:
     loose = [model.joint(j).name for j in joints if j not in follow and model.joint(j).name not in driven]
     if loose:
         notes.append(
-            f"no drive: {_listed(loose)} (no actuator, transmission or ros2_control command): free to move. Name the "
+            f"no drive: {listed(loose, 3)} (no actuator, transmission or ros2_control command): free to move. Name the "
             "joint there if it is driven"
         )
     springs = {model.joint(j).name: float(np.ravel(model.jnt_stiffness[j])[0]) for j in joints}
     if sprung := [f"{name} {value:g}" for name, value in springs.items() if value]:
-        notes.append(f"springs of the file act beside the drives: stiffness {_listed(sprung)}")
+        notes.append(f"springs of the file act beside the drives: stiffness {listed(sprung, 3)}")
     option = model.opt
     medium = {"density": option.density, "viscosity": option.viscosity}
     acting = [f"{name} {value:g}" for name, value in medium.items() if value]
@@ -321,7 +323,3 @@ def _folder_name(file: ModelFile) -> str:
     stated = file.spec.modelname
     name = stated if stated.lower() not in _UNNAMED else file.path.stem
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "robot"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

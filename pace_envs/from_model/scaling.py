@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from pace_actuators.base_parameters import CARRIED
 from pace_envs.from_model import defaults
 from pace_envs.from_model.joints import JointFacts
 
@@ -109,7 +110,7 @@ def _least_armature(joint: JointFacts, most: float) -> float:
 def start_values(joint: JointFacts) -> dict[str, float]:
     """Where a fit begins: the bounds are what a drive may have at most, and most have a small part of it."""
     bounds = base_bounds(joint)
-    return {group: OF_BOUNDS * bounds[group][1] for group in ("armature", "viscous_friction", "friction")}
+    return {group: OF_BOUNDS * bounds[group][1] for group in CARRIED}
 
 
 def motion(joint: JointFacts) -> tuple[float, float]:
@@ -146,9 +147,7 @@ def sample_values(joint: JointFacts) -> dict[str, float]:
     """True parameters of a simulated recording: the file's, or small parts of the bounds."""
     bounds = base_bounds(joint)
     return {
-        "armature": joint.armature or 0.05 * bounds["armature"][1],
-        "viscous_friction": joint.viscous_friction or 0.05 * bounds["viscous_friction"][1],
-        "friction": joint.friction or 0.05 * bounds["friction"][1],
+        **{name: getattr(joint, name) or 0.05 * bounds[name][1] for name in CARRIED},
         "encoder_bias": 0.2 * bounds["encoder_bias"][1],
     }
 

@@ -10,6 +10,7 @@ from typing import cast
 
 import torch
 
+from pace_actuators.base_parameters import PER_JOINT
 from pace_envs.from_model.defaults import CONTROL_DT
 from pace_envs.from_model.robot import cfg_from_model
 from pace_envs.generated_python import Word, python_page
@@ -22,11 +23,17 @@ import math
 import re
 from pathlib import Path
 
-import torch
-
 from pace_actuators import PaceDCMotorCfg
-from pace_envs import ArticulationCfg, InitialStateCfg, SimulationCfg, register_task
-from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
+from pace_envs import (
+    ArticulationCfg,
+    ExcitationCfg,
+    InitialStateCfg,
+    PaceCfg,
+    PaceSim2realEnvCfg,
+    PaceSim2realSceneCfg,
+    SimulationCfg,
+    register_task,
+)
 
 HERE = Path(__file__).parent
 
@@ -65,8 +72,13 @@ def env_cfg() -> PaceSim2realEnvCfg:
         actuators={"drives": drives},
         joint_order=names,
     )
-    bounds = [(1e-5 * a, a) for a in column(6)] + [(0.0, v) for v in (*column(7), *column(8))]
-    bounds += [(-b, b) for b in column(9)] + [(0.0, LONGEST_DELAY)]
+    bounds = {
+        "armature": [(1e-5 * a, a) for a in column(6)],
+        "viscous_friction": [(0.0, v) for v in column(7)],
+        "friction": [(0.0, v) for v in column(8)],
+        "encoder_bias": [(-b, b) for b in column(9)],
+        "delay": (0.0, LONGEST_DELAY),
+    }
     return PaceSim2realEnvCfg(
         scene=PaceSim2realSceneCfg(robot=robot),
         sim=SimulationCfg(dt=_STEP_, integrator=_INTEGRATOR_, gravity=_GRAVITY_),
@@ -74,7 +86,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
             robot_name=_ROBOT_,
             data_dir=_DATA_,
             joint_order=names,
-            bounds_params=torch.tensor(bounds, dtype=torch.float64),
+            bounds=bounds,
             excitation=ExcitationCfg(
                 bias=tuple(centre / size for centre, size in zip(column(4), column(5), strict=True)),
                 direction=(1.0,) * len(names),
@@ -117,8 +129,8 @@ def configuration_text(
     cfg = cfg_from_model(model, CONTROL_DT if control_dt is None else control_dt)
     sim2real, robot = cfg.sim2real, cfg.scene.robot
     drive = robot.actuators["drives"]
-    n, names = len(sim2real.joint_order), sim2real.joint_order
-    upper = sim2real.bounds_params[:-1, 1].reshape(4, n)
+    names = sim2real.joint_order
+    upper = torch.stack([sim2real.bounds[name][:, 1] for name in PER_JOINT])
     excitation = cast(ExcitationCfg, sim2real.excitation)
     rows = {}
     for i, name in enumerate(names):
@@ -141,7 +153,7 @@ def configuration_text(
             "_ABOUT_": "\n".join(about),
             "_JOINTS_": rows,
             "_HOME_": {_plain(name): _number(value) for name, value in home.items()},
-            "_DELAY_": _number(float(sim2real.bounds_params[-1, 1])),
+            "_DELAY_": _number(float(sim2real.bounds["delay"][0, 1])),
             "_IMPLICIT_": drive.implicit,
             "_MODEL_": os.path.relpath(Path(model).resolve(), Path(output).resolve().parent),
             "_POSITION_": tuple(robot.init_state.pos),

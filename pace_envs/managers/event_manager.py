@@ -46,11 +46,6 @@ class EventManager:
             self._terms[term_cfg.mode].append(Term(name, term_cfg, env, num_args=2))
 
     @property
-    def available_modes(self) -> list[str]:
-        """Modes that have events."""
-        return [mode for mode, terms in self._terms.items() if terms]
-
-    @property
     def active_terms(self) -> dict[str, list[str]]:
         """Names of the events by mode."""
         return {mode: [term.name for term in terms] for mode, terms in self._terms.items() if terms}

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from pace_actuators import IdentifiedDrives
-from pace_actuators.identified import ALL, BASE_FIELDS, delay_in_steps
+from pace_actuators.base_parameters import BASE_PARAMETERS
+from pace_actuators.identified import ALL, delay_in_steps
 from pace_actuators.identified_draws import draw, in_control_steps, labels_with_std
 from pace_envs.managers import SceneEntityCfg
 
@@ -46,14 +47,10 @@ def randomize_identified_drives(
         joints = _joints_of(drives, name) if ALL in entries else list(entries)
         ids = [column[joint] for joint in joints]
         values = torch.stack([entries[ALL if ALL in entries else joint] for joint in joints], dim=1)
-        if name == "armature":
-            robot.write_joint_armature_to_sim(values, ids)
-        elif name == "friction":
-            robot.write_joint_friction_coefficient_to_sim(values, ids)
-        elif name == "viscous_friction":
-            robot.write_joint_viscous_friction_coefficient_to_sim(values, ids)
-        elif name in (*BASE_FIELDS, "delay"):
-            _write_to_drives(env, robot, name, values, ids, drives)
+        if name == "delay":
+            _write_delay(env, robot, values[:, :1], ids, drives)
+        elif name in BASE_PARAMETERS:
+            robot.write_base_parameter_to_sim(name, values, ids)
         else:
             effect, _, parameter = name.partition(".")
             if effect not in robot.effects:  # left out: it is of the rig
@@ -69,18 +66,13 @@ def _joints_of(drives: IdentifiedDrives, name: str) -> list[str]:
     return list(drives.joint_names)
 
 
-def _write_to_drives(
-    env: ManagerBasedEnv, robot: Articulation, name: str, values: torch.Tensor, ids: list[int], drives: IdentifiedDrives
+def _write_delay(
+    env: ManagerBasedEnv, robot: Articulation, values: torch.Tensor, ids: list[int], drives: IdentifiedDrives
 ) -> None:
-    whole = torch.full((env.num_envs, robot.num_joints), torch.nan, dtype=env.dtype, device=env.device)
-    whole[:, ids] = values
+    """Write delays of (num_envs, 1) control steps of the identification, as those of each drive."""
     for actuator in robot.actuators.values():
-        own = whole[:, actuator.joint_indices]
-        if bool(own.isnan().all()):
-            continue
-        if name == "encoder_bias":
-            actuator.update_encoder_bias(torch.where(own.isnan(), actuator.encoder_bias, own))
-        else:
+        own = [i for i in robot.joints_of(actuator) if i in ids]
+        if own:
             dt = env.cfg.sim.dt
-            steps = in_control_steps(drives, own[:, :1], dt * actuator.cfg.control_decimation)
-            actuator.update_time_lags(steps.clamp(max=delay_in_steps(actuator.cfg, dt)[1]))
+            steps = in_control_steps(drives, values, dt * actuator.cfg.control_decimation)
+            robot.write_base_parameter_to_sim("delay", steps.clamp(max=delay_in_steps(actuator.cfg, dt)[1]), own)

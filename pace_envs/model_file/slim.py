@@ -6,6 +6,8 @@ from pathlib import Path
 
 import mujoco
 
+from pace_actuators.text import listed
+
 _FROM_GEOMS = 1
 """``compiler/inertiafromgeom="true"``: stated inertias are not used."""
 
@@ -53,7 +55,7 @@ def leave_out_meshes(spec: mujoco.MjSpec, path: Path, *, touches: bool = False) 
         notes.append(f"{len(missing)} mesh files are missing ({first}{', …' if len(missing) > 2 else ''}): left out.")
     fixed = [name for name in dict.fromkeys(massless) if name != "world"]
     if fixed:
-        notes.append(f"The mass of {_listed(fixed)} was to come from a missing mesh and is taken as 0.")
+        notes.append(f"The mass of {listed(fixed, 3)} was to come from a missing mesh and is taken as 0.")
     return notes
 
 
@@ -108,7 +110,3 @@ def _delete_references(spec: mujoco.MjSpec, geoms: set[str]) -> None:
     for pair in list(spec.pairs):
         if pair.geomname1 in geoms or pair.geomname2 in geoms:
             spec.delete(pair)
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

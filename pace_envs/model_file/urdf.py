@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
+from pace_actuators.text import listed
+
 MOVING = ("revolute", "continuous", "prismatic")
+
 _SMALLEST_MASS = 1e-6
 """Of a moving link where the file gives it, and what is fixed to it, none [kg]."""
 _SMALLEST_INERTIA, _SMALLEST_AREA = 1e-9, 1e-6
@@ -85,7 +88,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
     if meshes and touches:
         notes.append(
-            f"Nothing touches its collision meshes {_listed(meshes)}, which are not there or none of "
+            f"Nothing touches its collision meshes {listed(meshes, 3)}, which are not there or none of "
             f"{', '.join(_READABLE)}: convert them, or put them where the file looks for them."
         )
     elif meshes:
@@ -117,7 +120,7 @@ def _hold_what_floats(root: ElementTree.Element) -> list[str]:
     floating = [joint for joint in root.findall("joint") if joint.get("type") == "floating"]
     for joint in floating:
         joint.set("type", "fixed")
-    names = _listed([joint.get("name", "") for joint in floating])
+    names = listed([joint.get("name", "") for joint in floating], 3)
     return [f"Taken as fixed, not as floating: {names}."] if floating else []
 
 
@@ -156,13 +159,13 @@ def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
     told = {name: change for name, change in changed.items() if change > _TOLD and name in carried}
     notes = []
     if massless:
-        notes.append(f"No mass is stated for {_listed(massless)}, which a joint moves: {1e6 * _SMALLEST_MASS:g} mg.")
+        notes.append(f"No mass is stated for {listed(massless, 3)}, which a joint moves: {1e6 * _SMALLEST_MASS:g} mg.")
     if zero := [name for name, change in told.items() if math.isinf(change)]:
-        notes.append(f"The inertia of {_listed(zero)} is zero: taken as a point's.")
+        notes.append(f"The inertia of {listed(zero, 3)} is zero: taken as a point's.")
     if impossible := [name for name, change in told.items() if math.isfinite(change)]:
         most = max(told[name] for name in impossible)
         notes.append(
-            f"No body can have the inertia that is stated for {_listed(impossible)} (a principal moment is not "
+            f"No body can have the inertia that is stated for {listed(impossible, 3)} (a principal moment is not "
             f"positive, or above the sum of the other two): the nearest possible one is taken, changed by "
             f"{100 * most:.1f} % at most."
         )
@@ -230,10 +233,6 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 def _number_of(element: ElementTree.Element | None, key: str) -> float:
     """A number of an element; 0 where there is none."""
     return 0.0 if element is None else float(element.get(key, 0.0))
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _without_meshes(root: ElementTree.Element, path: Path | None) -> list[str]:

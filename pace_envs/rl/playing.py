@@ -4,25 +4,119 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
+import torch
 
-from pace_actuators.files import refuse_taken
+from pace_actuators.files import refuse_taken, replacing
 from pace_actuators.memory import check_memory
-from pace_envs.rendering import OffscreenRenderer
-from pace_envs.rl.evaluation import Evaluation, ReachEvaluation, evaluate, evaluate_reach
+from pace_envs.rendering import OffscreenRenderer, drawn
+from pace_envs.rl.evaluation import Evaluation, Policy, ReachEvaluation, evaluate, evaluate_reach
 from pace_envs.rl.export import EXPORTED, export_policy, exported_files
 from pace_envs.rl.run_folder import SETTINGS_FILE, RunSettings, find_checkpoint
 from pace_envs.rl.runner import PaceOnPolicyRunner
 from pace_envs.rl.training import EditCfg, load_cfg, make_env
-from pace_envs.rl.video import check_video_path, write_video
-from pace_envs.rl.viewer import watch
 from pace_envs.rsl_rl_cfg import play_cfg
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.reach import ReachEnvCfg
 from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command
+
+
+@torch.inference_mode()
+def watch(env: RslRlVecEnvWrapper, policy: Policy) -> None:
+    """Let a policy walk in environment 0 of a window, in real time, until the window is closed.
+
+    Raises:
+        ValueError: If there is no screen.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ValueError("There is no screen to open a window on. Write a film with --video.")
+    from mujoco import viewer
+
+    base = env.unwrapped
+    model = drawn(base.sim.model_of(0))
+    data = mujoco.MjData(model)
+    obs, _ = env.reset()
+    with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
+        window.cam.type, window.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
+        while window.is_running():
+            start = time.perf_counter()
+            obs, *_ = env.step(policy(obs))
+            with window.lock():
+                base.sim.read_data(0, data)
+                mujoco.mj_forward(model, data)
+            window.sync()
+            time.sleep(max(0.0, base.step_dt - (time.perf_counter() - start)))
+
+
+_ENCODE = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart")
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Write a film: ``.mp4`` with ffmpeg, ``.gif`` with Pillow.
+
+    Args:
+        path: The file.
+        frames: Pictures (height, width, 3) uint8.
+        fps: Pictures per second.
+
+    Raises:
+        ValueError: If the ending is another, there are no frames, or no encoder.
+    """
+    path = Path(path)
+    check_video_path(path)
+    if not frames:
+        raise ValueError(f"There are no pictures to write to {path}.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write = _write_gif if path.suffix == ".gif" else _write_mp4
+    with replacing(path) as part:
+        write(part, frames, fps)
+
+
+def check_video_path(path: str | Path) -> None:
+    """Refuse, before anything is drawn, what :func:`write_video` could not write."""
+    suffix = Path(path).suffix
+    if suffix not in (".mp4", ".gif"):
+        raise ValueError(f"The video {path} ends with {suffix!r}, expected .mp4 or .gif.")
+    if suffix == ".mp4" and _ffmpeg() is None:
+        raise ValueError(
+            f"{path} needs ffmpeg, which was not found. Install it, or `pip install imageio-ffmpeg` "
+            "(extra: video), or write a .gif."
+        )
+
+
+def _ffmpeg() -> str | None:
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError:
+        return shutil.which("ffmpeg")
+    return get_ffmpeg_exe()
+
+
+def _write_gif(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame).quantize(128) for frame in frames]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0)
+
+
+def _write_mp4(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    height, width = frames[0].shape[:2]
+    raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-")
+    command = [str(_ffmpeg()), "-y", "-loglevel", "error", *raw, *_ENCODE, str(path)]
+    done = subprocess.run(command, input=b"".join(f.tobytes() for f in frames), capture_output=True, check=False)
+    if done.returncode:
+        raise ValueError(f"ffmpeg could not write {path}: {done.stderr.decode(errors='replace').strip()}")
+
 
 _FRAME_EVERY = 2  # environment steps: 25 pictures per second at 50 Hz
 _SIZE = (640, 360)

@@ -16,6 +16,7 @@ import torch
 import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.drive_result import result_path
 from pace_envs.devices import find_device
 from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
@@ -92,12 +93,13 @@ def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
         if settings.physics_dt is not None:
             set_step(cfg, settings.physics_dt)
         return
-    for doubt in doubts(cfg, settings.identified):
+    drives = IdentifiedDrives.load(settings.identified)
+    for doubt in doubts(cfg, drives):
         print(f"warning: identified drives: {doubt}", file=sys.stderr)
-    notes = [set_identified_step(cfg, settings.identified)]
+    notes = [set_identified_step(cfg, drives)]
     more = use_identified(
         cfg,
-        settings.identified,
+        drives,
         randomize_std=settings.randomize_identified,
         own_step=settings.physics_dt is not None,
     )
@@ -133,7 +135,7 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
         folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
         settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
         if settings.identified is not None:
-            shutil.copyfile(IdentifiedDrives.load(settings.identified).path, folder / IDENTIFIED_FILE)
+            shutil.copyfile(result_path(settings.identified), folder / IDENTIFIED_FILE)
         return folder
 
     return _learn(cfg, begin, start)

@@ -10,7 +10,7 @@ from pace_actuators.files import refuse_taken
 from pace_optim.comparison import compare, comparison_lines
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.report import write_report
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary

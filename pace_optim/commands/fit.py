@@ -114,7 +114,7 @@ def main() -> None:
         print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while, and so do the imports
     import torch
 
-    from pace_optim.fit import fit_with_torques, help_fit, resume
+    from pace_optim.identification.fit import fit_with_torques, help_fit, resume
     from pace_optim.problem.processes import join
     from pace_optim.run.settings import FitSettings
     from pace_optim.run.summary import summary

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import write_together
-from pace_optim.recording.keys import listed
+from pace_actuators.text import listed, position_unit
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
-from pace_optim.report.number_text import position_unit
-from pace_optim.report.trajectory_errors import held_out_spans
 from pace_optim.run.open import run_folder
+from pace_optim.run.tensors import held_out_spans
 
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder

@@ -7,20 +7,107 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from pace_actuators.joint_units import JointType
 from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
-from pace_optim.report.trajectory_errors import rms
+from pace_optim.run.tensors import rms
 
 from .dimensions import Dimension, dimensions_of
 from .frequency import band_edges, band_power, narrowest_band, response
-from .hysteresis import hysteresis
-from .motion import motion_of
+from .motion import Motion, motion_of
 from .places import Place, joint_sentence, places_of
 from .regions import lay_out
 from .tracks import Track
-from .whiteness import whiteness
 from .words import band_text
+
+_LAGS = 20
+_DRAWN = 40
+
+
+def whiteness(error: np.ndarray, dt: float) -> dict[str, Any]:
+    """Autocorrelation of an error, and what follows from it.
+
+        ρ_l = Σ e_k e_{k+l} / Σ e_k²
+        Q = K (K + 2) Σ_l ρ_l² / (K − l), l = 1 … 20   (Ljung and Box 1978)
+
+    With tens of thousands of samples Q refuses even what is white for every purpose, so that sizes are given beside it:
+    ``predictable`` is ρ₁², the share of the variance that the sample before explains, and ``correlation_time`` is
+    dt (1 + 2 Σ ρ_l), up to the first ρ_l below zero: dt for white noise.
+
+    Args:
+        error: (K,) [rad].
+        dt: Sample time [s].
+    """
+    rho = autocorrelation(error)
+    lags = min(_LAGS, len(rho) - 1)
+    l = np.arange(1, lags + 1)
+    q = len(error) * (len(error) + 2) * float(np.sum(rho[1 : lags + 1] ** 2 / (len(error) - l)))
+    below = np.flatnonzero(rho < 0)
+    end = int(below[0]) if len(below) else len(rho)
+    drawn = np.unique(np.round(np.geomspace(1, len(rho), _DRAWN)).astype(int) - 1)
+    return {
+        "lag_1": float(rho[1]),
+        "predictable": float(rho[1] ** 2),
+        "correlation_time": dt * (1 + 2 * float(rho[1:end].sum())),
+        "ljung_box": {"q": q, "lags": lags, "p": float(stats.chi2.sf(q, lags))},
+        "lag": drawn * dt,
+        "autocorrelation": rho[drawn],
+    }
+
+
+def autocorrelation(error: np.ndarray) -> np.ndarray:
+    """ρ_l for lags up to half of the samples, the mean taken away; 1, 0, 0, … of a constant."""
+    rest = error - error.mean()
+    size = 1 << (2 * len(rest) - 1).bit_length()
+    product = np.fft.irfft(np.abs(np.fft.rfft(rest, size)) ** 2, size)[: max(2, len(rest) // 2)]
+    if product[0] <= 0:
+        return np.eye(1, len(product))[0]
+    return product / product[0]
+
+
+_BINS = 24
+_FEWEST = 8
+
+
+def hysteresis(motion: Motion, offset: np.ndarray, error: np.ndarray) -> dict[str, Any]:
+    """Means by position, on the way up and on the way down.
+
+    Of a proportional controller, the offset q* − q of target and position is its torque by the gain: friction opens
+    its loop. Where the loops of measurement and model differ in width, friction differs; where they lean another way,
+    gravity, a spring or a gain does.
+
+    Args:
+        motion: Of the joint; samples where it stands are left out.
+        offset: Measured q* − q, (K,) [rad].
+        error: Simulated less measured, (K,) [rad].
+    """
+    moving = np.abs(motion.speed) > motion.standstill
+    if moving.sum() < 2 * _BINS:
+        return {}
+    low, high = np.quantile(motion.position[moving], (0.005, 0.995))
+    if not high > low:
+        return {}
+    edges = np.linspace(low, high, _BINS + 1)
+    bins = np.searchsorted(edges[1:-1], motion.position, side="right")
+    within = moving & (motion.position >= low) & (motion.position <= high)
+    result: dict[str, Any] = {"position": (edges[1:] + edges[:-1]) / 2}
+    for name, values in (("measured", offset), ("model", offset - error), ("error", error)):
+        ways = {
+            way: _means(values, bins, within & (motion.direction == sign)) for way, sign in (("up", 1), ("down", -1))
+        }
+        half = (ways["up"] - ways["down"]) / 2
+        width = float(np.sqrt(np.nanmean(half**2))) if np.isfinite(half).any() else None
+        result[name] = {**ways, "half_width": width}
+    return result
+
+
+def _means(values: np.ndarray, bins: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Mean in each bin; NaN where there is too little."""
+    count = np.bincount(bins[where], minlength=_BINS)
+    total = np.bincount(bins[where], weights=values[where], minlength=_BINS)
+    return np.where(count >= _FEWEST, total / np.maximum(count, 1), np.nan)
+
 
 _STRETCHES = 240
 _EXCITED = 0.01

@@ -9,8 +9,8 @@ import numpy as np
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType
-from pace_optim.report.number_text import position_unit, three_figures
-from pace_optim.report.trajectory_errors import rms
+from pace_actuators.text import position_unit, three_figures
+from pace_optim.run.tensors import rms
 
 from .joint import noise_floors, rmse_by_part
 from .tracks import RunTracks, Track

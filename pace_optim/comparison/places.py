@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pace_actuators.joint_units import JointType
-from pace_optim.report.number_text import position_text, position_unit
+from pace_actuators.text import position_text, position_unit
 
 from .dimensions import Dimension
 from .regions import Layout, Region, best_region, evidence, inside, refine

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import joint_label, units_for
-from pace_optim.report.number_text import position_unit
+from pace_actuators.text import position_unit
 
 from .ladder import ladder_table
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pace_optim.report.number_text import short_duration
+from pace_actuators.text import short_duration
 
 from .dimensions import Dimension
 from .regions import Region

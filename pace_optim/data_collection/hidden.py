@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
+from pace_actuators.base_parameters import BASE_PARAMETERS, PER_JOINT
 from pace_optim.excitation import Trajectory, make_excitation
 from pace_optim.plant import (
     BaseTruth,
@@ -77,8 +77,8 @@ def simulate_hidden(
         raise ValueError(f"--effect names an effect twice: {', '.join(cfg.effects)}. Name each once.")
     robot = plant_robot(cfg.task, cfg.control_dt)
     joints = joints_of(robot, cfg.effect_joints)
-    values = {key: truth[space[key]].tolist() for key in (*PARAMETER_GROUPS, "delay")}
-    base = {key: dict(zip(robot.joint_names, values[key], strict=True)) for key in PARAMETER_GROUPS}
+    values = {key: truth[space[key]].tolist() for key in BASE_PARAMETERS}
+    base = {key: dict(zip(robot.joint_names, values[key], strict=True)) for key in PER_JOINT}
     start = Truth(base=BaseTruth(**base, delay=values["delay"][0] * robot.control_dt), delay_mode=delay_mode)
     runs = session_of(trajectories, cfg.drive(robot.num_joints), cfg.load)
     plant = PlantCfg(

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.excitation import Trajectory
 from pace_optim.problem.drive_steps import of_joints
-from pace_optim.recording.keys import listed
 
 from .cfg import CollectionCfg
 

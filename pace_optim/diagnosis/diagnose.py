@@ -16,7 +16,7 @@ from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.telling.findings import Findings, told
 from pace_optim.diagnosis.telling.result import FILE, Diagnosis
-from pace_optim.fit import fit
+from pace_optim.identification.fit import fit
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import started_from, with_identified
 from pace_optim.report import check_folder, report_text

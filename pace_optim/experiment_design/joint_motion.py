@@ -216,11 +216,7 @@ def _alone(
     excitation: str, cfg: PaceCfg, j: int, motion: JointMotion, control_dt: float, duration: float | None
 ) -> Trajectory:
     """The excitation of a robot that has only this joint."""
-    n = len(cfg.joint_order)
-    one = replace(
-        cfg,
-        joint_order=cfg.joint_order[j : j + 1],
-        bounds_params=cfg.bounds_params[[j, n + j, 2 * n + j, 3 * n + j, 4 * n]],
+    one = cfg.on_joints(cfg.joint_order[j : j + 1]).replace(
         excitation=ExcitationCfg(bias=(motion.centre / motion.amplitude,), direction=(1.0,), scale=(motion.amplitude,)),
     )
     return make_excitation(

@@ -61,8 +61,7 @@ def isaaclab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
 _CFG = '''\
 _ABOUT_
 
-from pace_actuators import IdentifiedAt, PaceDCMotorCfg
-from pace_actuators.effects import EffectCfg
+from pace_actuators import EffectCfg, IdentifiedAt, PaceDCMotorCfg
 
 ACTUATORS = _MOTORS_
 """For ArticulationCfg(actuators=ACTUATORS), or set_drives(cfg, ACTUATORS) of pace_envs.tasks.velocity."""
@@ -74,8 +73,7 @@ _ABOUT_
 
 from mjlab.entity import EntityArticulationInfoCfg
 
-from pace_actuators import IdentifiedAt, PaceDCMotorCfg
-from pace_actuators.effects import EffectCfg
+from pace_actuators import EffectCfg, IdentifiedAt, PaceDCMotorCfg
 {_MJLAB_IMPORT}
 
 MOTORS = _MOTORS_
@@ -92,8 +90,7 @@ EVENTS = {"drive_friction": drive_friction_event()}
 _ISAACLAB = '''\
 _ABOUT_
 
-from pace_actuators import IdentifiedAt, PaceDCMotorCfg
-from pace_actuators.effects import EffectCfg
+from pace_actuators import EffectCfg, IdentifiedAt, PaceDCMotorCfg
 from pace_actuators.isaaclab import PaceDCMotorActuatorCfg
 
 PHYSICS_DT = _PHYSICS_DT_  # your simulation's dt [s]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction
 from pace_envs import ManagerBasedRLEnv
@@ -41,12 +42,11 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     env = ManagerBasedRLEnv(cfg)
     robot, model = env.scene["robot"], env.sim.model
     spec, left_out = model_of(source)
-    fields = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "damping"}
     for name, column in zip(robot.joint_names, robot.dof_columns.tolist(), strict=True):
         joint = spec.joint(name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
-        for parameter, attribute in fields.items():
-            if not is_undetermined(drives, parameter, name):
-                _set(joint, attribute, drives.values(parameter, [name])[name])
+        for parameter in BASE_PARAMETERS.values():
+            if parameter.mujoco and not is_undetermined(drives, parameter.name, name):
+                _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.solref_friction = model.dof_solref[column]
         joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():

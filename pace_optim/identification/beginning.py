@@ -6,10 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
-from pace_envs.model_file.read import is_model_file
 from pace_optim.log_checks import checked
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.optimizers.convergence import stop_rule
 from pace_optim.optimizers.own_objective import Objective, build, optimizer_class
 from pace_optim.optimizers.way_down import WayDownCfg
@@ -23,30 +21,14 @@ from pace_optim.run.settings import FitSettings
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
-_SHORTER = 0.95
-"""Commands that come at this part of a control step, or faster, are faster."""
 
 
-def logged_control_dt(settings: FitSettings, problem: Problem) -> float | None:
-    """The control step of the fastest log, where a model file is fitted to it, nobody has told one, and it is shorter.
-
-    Args:
-        settings: What to fit.
-        problem: The same, with the control step that model files have.
-    """
-    if settings.control_dt is not None or not is_model_file(settings.task):
-        return None
-    logged = [each.command_dt for each in problem.dataset.recordings if each.command_dt is not None]
-    interval = max(min(logged, default=problem.control_dt), SHORTEST_CONTROL_DT)
-    return interval if interval < _SHORTER * problem.control_dt else None
-
-
-def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Problem:
+def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
     """Read everything, refuse what cannot be fitted, and try the simulation out.
 
     Args:
         settings: What to fit, and how.
-        env_cfg: The task's configuration.
+        env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
         told: Whether an earlier run has told how the recordings are understood.
 
     Raises:
@@ -56,36 +38,43 @@ def load_for_fit(settings: FitSettings, env_cfg: Any, told: bool = False) -> Pro
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
     problem = checked(problem_of(settings, env_cfg, told), settings.trust_log, tell_nobody if told else tell_on_stderr)
-    cmaes = problem.env_cfg.sim2real.cmaes
-    chosen = {
-        name: value for name in ("max_iteration", "epsilon", "sigma") if (value := getattr(settings, name)) is not None
-    }
-    own = optimizer_class(settings.optimizer) if settings.has_own_objective else None
-    problem.env_cfg.sim2real.cmaes = replace(
-        cmaes,
-        per_tree=cmaes.per_tree and not settings.joint_strategy,
-        save_optimization_process=cmaes.save_optimization_process or settings.save_optimization_process,
-        stop=settings.stop or cmaes.stop,
-        **chosen,
-    )
-    for rule in problem.env_cfg.sim2real.cmaes.stop:
-        stop_rule(rule)
     if problem.dataset.num_recordings * 4 > settings.num_envs and settings.only_searches:
         raise ValueError(
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
             f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
         )
     if not bool((problem.space.upper > problem.space.lower).any()):
-        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds_params.")
+        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds.")
     try_out(problem)
-    if own is not None and Objective(own, problem).joins_joints:
-        problem.env_cfg.sim2real.cmaes.per_tree = False
+    search_settings(problem, settings)  # refuses stop rules and objectives that cannot be used
     if settings.device != "cpu":
         problem.for_search(settings.device).make_env(1).close()
     if settings.optimizer != "least_squares":  # which chooses how much it simulates at once
         simulated = search_population(problem, settings) * len(problem.dataset.trained())
         check_size(problem, simulated, settings.num_envs)
     return problem
+
+
+def search_settings(problem: Problem, settings: FitSettings) -> CMAESOptimizerCfg:
+    """The search's own settings: the robot's, with what a fit asks for.
+
+    Raises:
+        ValueError: If there is no such stop rule, or an objective of the user's own fails.
+    """
+    asked = {name: getattr(settings, name) for name in ("max_iteration", "epsilon", "sigma")}
+    cfg = CMAESOptimizerCfg.of(problem.env_cfg.sim2real)
+    cfg = replace(
+        cfg,
+        per_tree=cfg.per_tree and not settings.joint_strategy,
+        save_optimization_process=cfg.save_optimization_process or settings.save_optimization_process,
+        stop=settings.stop or cfg.stop,
+        **{name: value for name, value in asked.items() if value is not None},
+    )
+    for rule in cfg.stop:
+        stop_rule(rule)
+    if settings.has_own_objective and Objective(optimizer_class(settings.optimizer), problem).joins_joints:
+        cfg = replace(cfg, per_tree=False)
+    return cfg
 
 
 def search_population(problem: Problem, settings: FitSettings) -> int:
@@ -101,7 +90,7 @@ def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes
         optimizer_class(settings.optimizer) if settings.has_own_objective else CMAESOptimizer,
         problem,
         search_population(problem, settings),
-        problem.env_cfg.sim2real.cmaes,
+        search_settings(problem, settings),
         trees=problem.trees,
         seed=settings.seed,
         start=problem.space.start,

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from pace_actuators.text import listed
 from pace_optim.log_checks.balance import Balance, Links, View, balances, views_of, without
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.recordings import tell_on_stderr
-from pace_optim.recording.keys import listed
 
 _DOUBTED = 0.04
 """Misfit from which a joint is looked at."""

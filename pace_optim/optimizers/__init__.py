@@ -1,1 +1,1 @@
-"""CMA-ES and least squares; they see vectors and scores, never a simulator."""
+"""CMA-ES and least squares, from vectors and scores; as in PACE, ``CMAESOptimizer`` writes to a rollout."""

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from pace_actuators.own_code import CodeRecord, import_named, import_recorded, loaded_module, split_reference
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.rollout import Rollout
@@ -175,7 +175,7 @@ class Objective:
     ) -> tuple[CMAESOptimizer, Rollout]:
         """The optimizer with these candidates, repeated to its smallest population, and their rollout."""
         m = max(_FEWEST, len(physical))
-        cfg = replace(self.problem.env_cfg.sim2real.cmaes, per_tree=False)
+        cfg = replace(CMAESOptimizerCfg.of(self.problem.env_cfg.sim2real), per_tree=False)
         optimizer = build(self.kind, self.problem, m, cfg)
         optimizer.candidates = torch.cat([physical, physical[-1:].expand(m - len(physical), -1)])
         optimizer.where = where

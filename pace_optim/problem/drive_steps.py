@@ -66,11 +66,12 @@ def set_drive_rate(cfg: PaceSim2realEnvCfg, physics_dt: float | None = None) -> 
         set_physics_dt(cfg, cfg.sim.dt / parts)
 
 
-def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
+def set_drive_step(cfg: PaceSim2realEnvCfg, env: ManagerBasedRLEnv | None = None) -> float | None:
     """The physics step that a task asks for, made finer where drives that run continuously need it.
 
     Args:
-        cfg: The environment; it is changed.
+        cfg: The environment's configuration; it takes steps of second order where a drive runs continuously.
+        env: The environment, if it has been built.
 
     Returns:
         The step [s]; ``None`` if the present one is fine enough. A search may take the present one: it is stable.
@@ -78,10 +79,11 @@ def set_drive_step(cfg: PaceSim2realEnvCfg) -> float | None:
     steps = cfg.sim2real.physics_steps
     if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
         cfg.sim.integrator, cfg.scene.num_envs = "leapfrog", 1
-        env = ManagerBasedRLEnv(cfg)
-        inverse = _inverse_inertia(env, upper=False)
-        damping = of_joints(env, "damping", only_implicit=True)
-        env.close()
+        own = env or ManagerBasedRLEnv(cfg)
+        inverse = _inverse_inertia(own, upper=False)
+        damping = of_joints(own, "damping", only_implicit=True)
+        if env is None:
+            own.close()
         steep = float((damping * cfg.sim.dt * inverse.diagonal()).max())
         steps = max(steps, min(_FINEST, math.ceil(steep / _FINE)))
     return cfg.sim.dt / steps if steps > 1 else None
@@ -154,7 +156,7 @@ def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
 def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     """Of the configuration, or the largest that may be identified, (n,) [kg m²]."""
     own = of_joints(env, "armature")
-    bounds = env.cfg.sim2real.bounds_params[: len(own)].numpy()  # type: ignore[attr-defined]
+    bounds = env.cfg.sim2real.bounds["armature"].numpy()  # type: ignore[attr-defined]
     return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
 
 

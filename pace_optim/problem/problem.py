@@ -9,18 +9,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
+from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.measured_effort import MeasuredDrives, read_drives
-from pace_optim.problem.assumed_gains import told_of_gains, without_loops_of_torques
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -31,17 +30,24 @@ from pace_optim.problem.drive_steps import (
 )
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
-from pace_optim.problem.loop_check import refuse_open_loops
+from pace_optim.problem.log_and_robot import (
+    contradicted_limits,
+    refuse_open_loops,
+    told_of_gains,
+    without_loops_of_torques,
+)
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques, widen_bounds
-from pace_optim.problem.stated_limits import contradicted_limits
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
 from pace_optim.recording.windows import Windows
 from pace_optim.terminal.choices import DELAY_MODES
+
+_SHORTER = 0.95
+"""Commands that come at this part of a control step, or faster, are faster."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -69,6 +75,8 @@ class Problem:
     """Facts of the drives that are identified because nobody knows them."""
     passive_joints: bool = False
     """Whether joints without drives move too."""
+    logged_rate: bool = False
+    """Whether the control step is that of the log's commands, as nothing states one."""
     assumed_loop: float | None = None
     """Assumed period of the drives' loops [s]; 0: continuous. ``None``: it is stated."""
 
@@ -133,14 +141,15 @@ class Problem:
         Args:
             bounds: Lower and upper bound by label, ``<parameter>/<joint>``; of this problem's parameters alone.
         """
-        labels = [f"{group}/{joint}" for group in PARAMETER_GROUPS for joint in self.joint_names] + [f"delay/{GLOBAL}"]
         plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
         for each in (plain, cfg):
-            own = each.sim2real.bounds_params.clone()
-            for row, label in enumerate(labels):
-                low, high = bounds.get(label, own[row].tolist())
-                own[row] = own.new_tensor([min(low, float(own[row, 0])), max(high, float(own[row, 1]))])
-            each.sim2real.bounds_params = own
+            for name, own in each.sim2real.bounds.items():
+                keys = (GLOBAL,) if BASE_PARAMETERS[name].shared else self.joint_names
+                other = own.new_tensor(
+                    [bounds.get(f"{name}/{key}", pair) for key, pair in zip(keys, own.tolist(), strict=True)]
+                )
+                low, high = torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1]
+                each.sim2real.set_bounds(name, low, high)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
     def with_physics_dt(self, physics_dt: float) -> Problem:
@@ -184,6 +193,97 @@ class Problem:
         return replace(self, dataset=windows.cut(self.dataset))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Facts:
+    """A robot as its task states it, with the rates that a fit asks for; its configuration is copied, never changed."""
+
+    task: str
+    cfg: PaceSim2realEnvCfg
+    """Its environment, before effects and a finer physics step."""
+    delay_mode: str | None
+    physics_dt: float | None
+    """Physics step that is asked for [s]."""
+    drive_dt: float | None
+    """Time between two runs of the drives' loops that is asked for [s]; 0: continuous."""
+    follows_log: bool
+    """Whether commands come as fast as the log's: nothing states the control step of a model file."""
+    logged_rate: bool = False
+    """Whether they do."""
+
+    @classmethod
+    def read(
+        cls,
+        task: str,
+        env_cfg: Any = None,
+        *,
+        control_dt: float | None = None,
+        delay_mode: str | None = None,
+        physics_dt: float | None = None,
+        drive_dt: float | None = None,
+    ) -> Facts:
+        """Read what a task says of its robot; the arguments are those of :func:`load_problem`.
+
+        Raises:
+            ValueError: If it is no identification task, or the delay's mode or bounds are unusable.
+        """
+        cfg = load_env_cfg(task, control_dt) if env_cfg is None else copy.deepcopy(env_cfg)
+        if not isinstance(cfg, PaceSim2realEnvCfg):
+            raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
+        if delay_mode is not None and delay_mode not in DELAY_MODES:
+            raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
+        cfg.prepare()
+        set_control_step(cfg)
+        longest = float(cfg.sim2real.bounds["delay"][0, 1])
+        for drive in cfg.scene.robot.actuators.values():
+            drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
+            if drive.largest_delay < longest:
+                raise ValueError(
+                    f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
+                    f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
+                )
+        if drive_dt is not None:
+            _set_drive_dt(cfg, drive_dt)
+        return cls(
+            task=task,
+            cfg=cfg,
+            delay_mode=delay_mode,
+            physics_dt=physics_dt,
+            drive_dt=drive_dt,
+            follows_log=env_cfg is None and control_dt is None and is_model_file(task),
+        )
+
+    @property
+    def control_dt(self) -> float:
+        """Time between two commands [s]."""
+        return self.cfg.sim.dt * self.cfg.decimation
+
+    def with_logs(self, logs: Logs) -> Facts:
+        """The same with what logs say: the rate of their commands, where it follows them, and the joints they hold."""
+        facts = self
+        if self.follows_log and logs.command_dt < _SHORTER * self.control_dt:
+            facts = Facts.read(
+                self.task,
+                control_dt=max(logs.command_dt, SHORTEST_CONTROL_DT),
+                delay_mode=self.delay_mode,
+                physics_dt=self.physics_dt,
+                drive_dt=self.drive_dt,
+            )
+            facts = replace(facts, logged_rate=True)
+        if not logs.held and not logs.note:
+            return facts
+        cfg = copy.deepcopy(facts.cfg).holding(logs.held)
+        cfg.prepare()
+        cfg.sim2real.notes = (*cfg.sim2real.notes, *filter(None, [logs.note]))
+        return replace(facts, cfg=cfg)
+
+    def make_env(self) -> ManagerBasedRLEnv:
+        """One environment of the robot, at the rate of its drives; its configuration is its own."""
+        cfg = copy.deepcopy(self.cfg)
+        cfg.scene.num_envs = 1
+        set_drive_rate(cfg, self.physics_dt)
+        return ManagerBasedRLEnv(cfg)
+
+
 def load_problem(
     task: str,
     *,
@@ -192,6 +292,7 @@ def load_problem(
     delay_mode: str | None = None,
     physics_dt: float | None = None,
     drive_dt: float | None = None,
+    control_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
@@ -202,16 +303,17 @@ def load_problem(
     max_duration: float | None = None,
     tell: Callable[[str], None] = tell_on_stderr,
 ) -> Problem:
-    """Read and check everything that a fit needs.
+    """Read and check everything that a fit needs: what is known of the robot, its logs, then the problem they pose.
 
     Args:
-        task: Registered name of the environment.
+        task: Registered name of the environment, or a model file.
         data: Recordings to train on; none means the robot's own sample.
         validation: Recordings that are never trained on; none keeps the last 30 % of each recording for that.
         delay_mode: ``"command"`` or ``"effort"``; ``None`` keeps the configuration's.
         physics_dt: A finer physics step under the same control rate [s].
         drive_dt: Time between two runs of the drives' own controllers [s]; 0: they run continuously; ``None`` keeps
             the configuration's.
+        control_dt: Time between two commands to a model file's robot [s]; ``None``: as logged, at most 2.5 ms.
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
         unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
@@ -228,86 +330,83 @@ def load_problem(
     Raises:
         ValueError: If anything does not fit.
     """
-    cfg = load_env_cfg(task) if env_cfg is None else copy.deepcopy(env_cfg)
-    if not isinstance(cfg, PaceSim2realEnvCfg):
-        raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
-    if delay_mode is not None and delay_mode not in DELAY_MODES:
-        raise ValueError(f"Unknown delay mode {delay_mode!r}. Available: {', '.join(DELAY_MODES)}.")
-    cfg.prepare()
-    control_dt = cfg.sim.dt * cfg.decimation
-    set_control_step(cfg)
-    for drive in cfg.scene.robot.actuators.values():
-        drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
-        longest = float(cfg.sim2real.bounds_params[-1, 1])
-        if drive.largest_delay < longest:
-            raise ValueError(
-                f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
-                f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
-            )
-    logs = _logs(cfg, data, validation, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
-    cfg = cfg.holding(logs.held)
-    cfg.prepare()
-    if logs.note:
-        cfg.sim2real.notes = (*cfg.sim2real.notes, logs.note)
-        tell(f"note: {logs.note}")
-    if drive_dt is not None:
-        _set_drive_dt(cfg, drive_dt)
-    cfg.scene.num_envs = 1
-    set_drive_rate(cfg, physics_dt)
-    physics_dt = set_drive_step(cfg) if physics_dt is None else physics_dt
-    plain, cfg = cfg, _configured(cfg, physics_dt, effects or cfg.sim2real.effects)
-    env = ManagerBasedRLEnv(cfg)
-    plain.sim2real.slide_joints = cfg.sim2real.slide_joints = env.scene["robot"].slide_joints
-    recordings, held_out = (conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups)
-    recordings, held_out = ([without_loops_of_torques(env, r) for r in group] for group in (recordings, held_out))
-    for each in (plain, cfg):
-        each.sim2real.joint_ranges = _ranges(env, recordings)
-        if is_model_file(task):
-            widen_bounds(each.sim2real, env, recordings)
-    count = len(recordings)
-    measured, unknown = _read_torques(env, [*recordings, *held_out], control_dt, unknown)
-    told, bounds = lift_limits(plain, measured.recordings, unknown)
-    plain.sim2real.effect_bounds = {
-        **plain.sim2real.effect_bounds,
-        **bounds,
-        **measured.gain_bounds(unknown, GAINS),
-    }
-    _narrow_delay(plain, measured)
-    recordings, held_out = told[:count], told[count:]
-    if unknown:
+    stated = Facts.read(
+        task, env_cfg, control_dt=control_dt, delay_mode=delay_mode, physics_dt=physics_dt, drive_dt=drive_dt
+    )
+    env = stated.make_env()
+    try:
+        files = (data or [stated.cfg.sim2real.recording], validation)
+        logs = read_logs(files, env, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
+        if logs.note:
+            tell(f"note: {logs.note}")
+        facts = stated.with_logs(logs)
+        if facts is not stated:
+            env.close()
+            env = facts.make_env()
+        return _posed(facts, logs, env, effects, unknown, strict=strict, max_duration=max_duration, tell=tell)
+    finally:
         env.close()
-        cfg = _configured(plain, physics_dt, with_unknown(effects or plain.sim2real.effects, unknown))
-        env = ManagerBasedRLEnv(cfg)
-    _narrow_delay(cfg, measured)
-    recordings, held_out = (_with_notes(env, each) for each in (recordings, held_out))
-    for each in (plain, cfg) if not {"stiffness", "damping"} & set(unknown) else ():
-        _raise_armature(each, least_armature(env, [*recordings, *held_out]))
-    if is_model_file(task):
-        start = start_by_torques(env, recordings)
-        for each in (plain, cfg):
-            each.sim2real.start_params = {**each.sim2real.start_params, **start}
-    space, trees = ParameterSpace.of(cfg.sim2real), independent_trees(env)
+
+
+def _posed(
+    facts: Facts,
+    logs: Logs,
+    env: ManagerBasedRLEnv,
+    effects: Sequence[EffectCfg | str],
+    unknown: Sequence[str],
+    *,
+    strict: bool,
+    max_duration: float | None,
+    tell: Callable[[str], None],
+) -> Problem:
+    """The problem that logs pose; what they say of bounds, limits and starts is written into the configuration."""
+    cfg: PaceSim2realEnvCfg = env.cfg  # type: ignore[assignment]
+    sim2real, robot, control_dt = cfg.sim2real, env.scene["robot"], facts.control_dt
+    physics_dt = set_drive_step(cfg, env) if facts.physics_dt is None else facts.physics_dt
+    sim2real.slide_joints = robot.slide_joints
+    groups = [conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups]
+    groups = [[without_loops_of_torques(env, recording) for recording in group] for group in groups]
+    sim2real.joint_ranges = _ranges(env, groups[0])
+    if is_model_file(facts.task):
+        widen_bounds(sim2real, env, groups[0])
+    count = len(groups[0])
+    measured, unknown = _read_torques(env, [*groups[0], *groups[1]], control_dt, unknown)
+    told, bounds = lift_limits(cfg, measured.recordings, unknown)
+    sim2real.effect_bounds = {**sim2real.effect_bounds, **bounds, **measured.gain_bounds(unknown, GAINS)}
+    if "effort_limit" in unknown:
+        for drive in robot.actuators.values():
+            drive.effort_limit.fill_(math.inf)
+    if measured.delay_bounds is not None:  # sought where the recordings' torques have it
+        sim2real.set_bounds("delay", *measured.delay_bounds)
+    recordings, held_out = (_with_notes(env, each) for each in (told[:count], told[count:]))
+    if not {"stiffness", "damping"} & set(unknown):  # sought where the loops are stable, with a width to seek in
+        low, high = sim2real.bounds["armature"].unbind(dim=1)
+        least = torch.as_tensor(least_armature(env, [*recordings, *held_out]))
+        sim2real.set_bounds("armature", torch.maximum(low, torch.minimum(least, 0.5 * (low + high))))
+    if is_model_file(facts.task):
+        sim2real.start_params = {**sim2real.start_params, **start_by_torques(env, recordings)}
+    simulated = _configured(cfg, physics_dt, with_unknown(effects or sim2real.effects, unknown))
+    space, trees = ParameterSpace.of(simulated.sim2real), independent_trees(env)
     recordings, held_out = affordable(
-        [recordings, held_out], control_dt, _columns(space, trees), cfg.decimation, max_duration, tell
+        [recordings, held_out], control_dt, _columns(space, trees), simulated.decimation, max_duration, tell
     )
     refuse_open_loops(env, [*recordings, *held_out])
-    problem = Problem(
-        task=task,
-        plain_cfg=plain,
-        env_cfg=cfg,
+    return Problem(
+        task=facts.task,
+        plain_cfg=cfg,
+        env_cfg=simulated,
         dataset=make_dataset(recordings, held_out),
         space=space,
         trees=trees,
-        delay_mode=next(iter(plain.scene.robot.actuators.values())).delay_mode,
+        delay_mode=next(iter(cfg.scene.robot.actuators.values())).delay_mode,
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
-        assumed_loop=_assumed_loop(task, plain, drive_dt, told, unknown, control_dt),
+        logged_rate=facts.logged_rate,
+        assumed_loop=_assumed_loop(facts, cfg, told, unknown),
         contradictions=(*told_of_gains(env, told, unknown), *_contradictions(env, [*recordings, *held_out])),
-        passive_joints=env.scene["robot"].has_passive_joints,
+        passive_joints=robot.has_passive_joints,
     )
-    env.close()
-    return problem
 
 
 def _loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
@@ -316,12 +415,7 @@ def _loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
 
 
 def _assumed_loop(
-    task: str,
-    cfg: PaceSim2realEnvCfg,
-    drive_dt: float | None,
-    recordings: Sequence[Recording],
-    unknown: Sequence[str],
-    control_dt: float,
+    facts: Facts, cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], unknown: Sequence[str]
 ) -> float | None:
     """Period of loops whose rate is not stated [s].
 
@@ -329,28 +423,14 @@ def _assumed_loop(
     assumed, a rate is no more than they are.
     """
     gains = not cfg.sim2real.assumed_gains or any(r.drive.stiffness is not None for r in recordings)
-    assumed = is_model_file(task) and drive_dt is None and (gains or "stiffness" in unknown)
-    return _loop_dt(cfg, control_dt) if assumed else None
+    assumed = is_model_file(facts.task) and facts.drive_dt is None and (gains or "stiffness" in unknown)
+    return _loop_dt(cfg, facts.control_dt) if assumed else None
 
 
 def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
     """Set the period of all drives' loops [s]; 0: they run continuously."""
     for drive in cfg.scene.robot.actuators.values():
         drive.drive_dt, drive.implicit = drive_dt or None, drive_dt == 0
-
-
-def _logs(
-    cfg: PaceSim2realEnvCfg, data: Sequence[str | Path], validation: Sequence[str | Path], **options: Any
-) -> Logs:
-    """The recordings as their files have them, and which joints of the robot they are of."""
-    whole = copy.deepcopy(cfg)
-    whole.scene.num_envs = 1
-    set_drive_rate(whole)
-    env = ManagerBasedRLEnv(whole)
-    try:
-        return read_logs((data or [cfg.sim2real.recording], validation), env, **options)
-    finally:
-        env.close()
 
 
 def _read_torques(
@@ -362,7 +442,7 @@ def _read_torques(
     state. Gains that are read are refined.
     """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
-    low, high = sim2real.bounds_params[-1].tolist()
+    low, high = sim2real.bounds["delay"][0].tolist()
 
     def read(facts: Sequence[str]) -> MeasuredDrives:
         return read_drives(
@@ -392,22 +472,6 @@ def _ranges(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str
         joint: (low, high) if math.isfinite(high - low) else (float(own[0]), float(own[1]))
         for joint, (low, high), own in zip(robot.joint_names, limits, logged, strict=True)
     }
-
-
-def _narrow_delay(cfg: PaceSim2realEnvCfg, measured: MeasuredDrives) -> None:
-    """Seek the delay where the recordings' torques have it."""
-    if measured.delay_bounds is not None:
-        bounds = cfg.sim2real.bounds_params.clone()
-        bounds[-1] = bounds.new_tensor(measured.delay_bounds)
-        cfg.sim2real.bounds_params = bounds
-
-
-def _raise_armature(cfg: PaceSim2realEnvCfg, least: np.ndarray) -> None:
-    """Seek the armature where the drives' loops are stable, and keep a width to seek in."""
-    bounds = cfg.sim2real.bounds_params.clone()
-    low, high = bounds[: len(least)].unbind(dim=1)
-    bounds[: len(least), 0] = torch.maximum(low, torch.minimum(torch.as_tensor(least), 0.5 * (low + high)))
-    cfg.sim2real.bounds_params = bounds
 
 
 def _columns(space: ParameterSpace, trees: list[list[str]]) -> int:

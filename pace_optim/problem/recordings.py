@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,11 +13,12 @@ import numpy as np
 
 from pace_actuators import match_names
 from pace_actuators.joint_units import units_for
+from pace_actuators.text import listed
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
+from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import with_columns
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.keys import listed
 from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
@@ -48,6 +50,12 @@ class Logs:
     """The robot's other joints, and where they are held [rad, of slides m]."""
     note: str = ""
     """What is to be said of them."""
+
+    @property
+    def command_dt(self) -> float:
+        """Shortest time from one command to the next in any of them [s]; infinite where nothing is commanded."""
+        every = [each for group in self.groups for each in group if each.is_commanded.any() and each.num_samples > 2]
+        return min((each.command_dt or command_interval(each) for each in every), default=math.inf)
 
 
 def read_logs(

@@ -249,16 +249,15 @@ class Rollout:
         return result
 
     def samples(
-        self, at_steps: bool = False, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
+        self, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
     ) -> Iterator[tuple[int, torch.Tensor]]:
         """Step and sensed positions at every control step, as late as the effects on the recording have them.
 
         Args:
-            at_steps: Whether at the steps themselves, not at the instants of samples that were taken beside them.
             simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
         """
         simulated = simulated or self.simulated
-        steps, offset = self.duration_steps, None if at_steps else self.dataset.sample_offset
+        steps, offset = self.duration_steps, self.dataset.sample_offset
         lag = self.observation_lag(steps)
         if lag is None and offset is None:
             yield from enumerate(simulated(steps))
@@ -284,7 +283,7 @@ class Rollout:
                 shown, at = seen[k % length].clone(), k - (first + rate * k)
                 if offset is not None:
                     at = at + self._rows(offset[k, :, None])
-                shown[late] = _interpolated(seen[:, late], at)
+                shown[late] = between_steps(seen[:, late], at[None], ring=True)[0]
                 yield k, shown
 
     def observation_lag(self, steps: int) -> torch.Tensor | None:
@@ -335,11 +334,6 @@ class Rollout:
     def look_at(self, where: torch.Tensor) -> None:
         """Say which samples count, (T, R) bool."""
         self._where = where.to(self.env.device)
-
-    def positions_at_every_step(self) -> Iterator[torch.Tensor]:
-        """Simulated positions as when iterating, but at every control step up to the last sample that counts."""
-        for _, sim_dof_pos in self.samples(at_steps=True):
-            yield sim_dof_pos
 
     def begin(self, offset: torch.Tensor | float = 0.0) -> None:
         """Put every environment at its recording's first sample, with the parameters that it has.
@@ -400,18 +394,24 @@ def _changes(enable: torch.Tensor | None) -> frozenset[int]:
     return frozenset(((enable[1:] != enable[:-1]).any(dim=1).nonzero()[:, 0] + 1).tolist())
 
 
-def _interpolated(seen: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-    """A ring of samples (length, m, n) at real-valued steps (m, n), by the cubic through four samples (Lagrange)."""
+def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -> torch.Tensor:
+    """Samples (length, m, n) at real-valued steps (K, m, n), by the cubic through four samples (Lagrange).
+
+    Args:
+        seen: One sample per step.
+        at: The steps.
+        ring: Whether the samples are those of the last steps, each at its step modulo the length.
+    """
     whole = at.floor()
-    f = (at - whole)[None]
-    index = whole.long()[None] + torch.arange(-1, 3, device=at.device)[:, None, None]
-    samples = seen.gather(0, index % len(seen))
-    weights = torch.cat(
-        [
-            -f * (f - 1) * (f - 2) / 6,
-            (f + 1) * (f - 1) * (f - 2) / 2,
-            -(f + 1) * f * (f - 2) / 2,
-            (f + 1) * f * (f - 1) / 6,
-        ]
+    f, index = at - whole, whole.long()
+    weights = (
+        -f * (f - 1) * (f - 2) / 6,
+        (f + 1) * (f - 1) * (f - 2) / 2,
+        -(f + 1) * f * (f - 2) / 2,
+        (f + 1) * f * (f - 1) / 6,
     )
-    return (weights * samples).sum(dim=0)
+    result = torch.zeros_like(at)
+    for i, weight in enumerate(weights, start=-1):
+        rows = (index + i) % len(seen) if ring else (index + i).clamp(0, len(seen) - 1)
+        result += weight * seen.gather(0, rows)
+    return result

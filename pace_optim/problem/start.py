@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pace_actuators.base_parameters import CARRIED
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import defaults
 from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
+from pace_envs.tasks.pace.pace_cfg import PaceCfg
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
 
@@ -67,17 +68,18 @@ def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence
         env: The environment, for the limits and gains that a recording does not state.
         recordings: On the robot's joints, in its order.
     """
-    n, bounds = len(sim2real.joint_order), sim2real.bounds_params.clone()
+    upper = {name: sim2real.bounds[name][:, 1].clone() for name in CARRIED}
     effort = np.max([_scale(env, sim2real, recording) for recording in recordings], axis=0)
     speed = np.nan_to_num(of_joints(env, "velocity_limit"), nan=np.inf)
     for j, joint in enumerate(sim2real.joint_order):
         most = largest_parameters(float(effort[j]), float(speed[j]), is_slide=joint in sim2real.slide_joints)
-        for group, name in enumerate(PARAMETER_GROUPS):
-            if most.get(name, 0.0) > bounds[group * n + j, 1]:
-                bounds[group * n + j, 1] = most[name]
+        for name in CARRIED:
+            if most[name] > upper[name][j]:
+                upper[name][j] = most[name]
                 starts = sim2real.start_params[name] | {joint: OF_BOUNDS * most[name]}  # type: ignore[operator]
                 sim2real.start_params = {**sim2real.start_params, name: starts}
-    sim2real.bounds_params = bounds
+    for name, high in upper.items():
+        sim2real.set_bounds(name, upper=high)
 
 
 def _scale(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> np.ndarray:

@@ -10,9 +10,9 @@ import numpy as np
 
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_actuators.text import listed
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
 from pace_optim.recording import Recording
-from pace_optim.recording.keys import listed
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 
 LIMITS = {

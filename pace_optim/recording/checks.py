@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.text import listed
+
 from .data import Recording
 from .facts import as_array, check_one_line, drive_of, joint_names_of, load_of
-from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest, listed
+from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
 from .stamps import seconds_of, set_back, unrounded
 
 _HUGE = 1e6

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.joint_units import JointType
+from pace_actuators.text import listed
 
 from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
-from .keys import JOINT_SERIES, SAMPLED_SERIES, listed
+from .keys import JOINT_SERIES, SAMPLED_SERIES
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base

@@ -16,8 +16,9 @@ from typing import IO, Any
 import numpy as np
 
 from pace_actuators.memory import check_memory
+from pace_actuators.text import listed
 
-from .keys import COMMAND_SERIES, JOINT_SERIES, POSE_COLUMNS, listed
+from .keys import COMMAND_SERIES, JOINT_SERIES, POSE_COLUMNS
 
 Rows = list[list[str]] | np.ndarray
 """Cells as text, or all of them as numbers."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
+from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
-from pace_optim.recording.keys import listed
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import parsed_json
+from pace_actuators.text import listed
 
 from .data import Drive, Load
-from .keys import BENCH_FACTS, DRIVE_FACTS, did_you_mean, listed
+from .keys import BENCH_FACTS, DRIVE_FACTS, did_you_mean
 
 _MAY_BE_INFINITE = ("effort_limit", "saturation_effort", "velocity_limit")
 _MAY_BE_ZERO = ("stiffness", "damping", "load_mass", "arm_mass")

@@ -13,13 +13,14 @@ import numpy as np
 import torch
 
 from pace_actuators.files import parsed_json, read_tensors, write_atomically, writing
+from pace_actuators.text import listed
 from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
 from .data import Recording
 from .facts import as_array
-from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean, listed
+from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean
 
 SUFFIXES = (".pt", ".npz", ".csv")
 

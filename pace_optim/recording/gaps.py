@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.text import listed
+
 from .checks import MIN_SAMPLES
 from .data import Recording
-from .keys import COMMAND_SERIES, SAMPLED_SERIES, listed
+from .keys import COMMAND_SERIES, SAMPLED_SERIES
 
 _STEPS = 3.0
 """Steps of the usual length that a gap is longer than, and ..."""

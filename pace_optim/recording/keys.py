@@ -57,10 +57,3 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return ", did you mean 'x'?" or ".", to put behind a name that ends a sentence."""
     match = closest(name, known)
     return f", did you mean '{match}'?" if match else "."
-
-
-def listed(names: Iterable[object], limit: int = 40) -> str:
-    """Return names as a comma-separated list for a message, cut after `limit`."""
-    texts = [str(name) for name in names]
-    more = [f"and {len(texts) - limit} more"] if len(texts) > limit else []
-    return ", ".join(texts[:limit] + more) or "none"

@@ -8,9 +8,10 @@ from typing import TypeVar
 import numpy as np
 
 from pace_actuators.joint_units import JointType, all_hinges, units_for
+from pace_actuators.text import listed
 
 from .data import Recording
-from .keys import COMMAND_SERIES, did_you_mean, listed
+from .keys import COMMAND_SERIES, did_you_mean
 
 _STILL = 2e-3  # [rad, of slides m]
 _FAR = 0.5  # [rad, of slides m]

@@ -15,9 +15,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from pace_actuators.joint_units import JointType, all_hinges, units_for
-from pace_optim.report.number_text import position_text, position_unit
-from pace_optim.report.trajectory_errors import held_out_spans, rms
+from pace_actuators.text import position_text, position_unit
 from pace_optim.run.history import History
+from pace_optim.run.tensors import held_out_spans, rms
 
 _TARGET, _MEASURED, _SIMULATED, _HELD_OUT = "#a5abb2", "#1f5fa8", "#e07b00", "#8a6fc4"
 _JOINTS_PER_FIGURE = 12

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.recording.keys import COMMAND_SERIES, MEASURED_SERIES, listed
+from pace_actuators.text import listed
+from pace_optim.recording.keys import COMMAND_SERIES, MEASURED_SERIES
 from pace_optim.recording.resample import interpolate_linear, interpolate_smooth
 
 from .column_map import ColumnMap, Source

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import file_at, write_atomically
-from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean, listed
+from pace_actuators.text import listed
+from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean
 
 from .words import CURRENTS, NEED_FACTOR, TIME_UNITS, UNITS
 

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from pace_actuators.joint_units import JointType
-from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, MEASURED_SERIES, listed
+from pace_actuators.text import listed
+from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, MEASURED_SERIES
 
 from .column_map import ColumnMap, Source
 from .joints import match, only_numbers

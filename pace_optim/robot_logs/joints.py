@@ -15,20 +15,6 @@ def match(label: str, names: Sequence[str]) -> tuple[str, float] | None:
     return scored[0][1], scored[0][0]
 
 
-def renamed(labels: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
-    """{name: label} for every name, or None where a name has no label of its own."""
-    found: dict[str, tuple[float, str]] = {}
-    for label in labels:
-        meant = match(label, names)
-        if meant is None:
-            continue
-        name, score = meant
-        if name in found and found[name][0] == score:
-            return None
-        found[name] = max(found.get(name, (0.0, "")), (score, label))
-    return {name: label for name, (_, label) in found.items()} if len(found) == len(names) else None
-
-
 def _likeness(label: str, name: str) -> float:
     if label == name:
         return 1.0

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pace_actuators.text import listed
 from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.checks import check_recording
 from pace_optim.recording.files import SUFFIXES, add_json_facts
-from pace_optim.recording.keys import listed
 
 from .build import fields_of, rates_of, unused
 from .column_map import ColumnMap, map_text, printable, write_map

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pace_actuators.joint_units import JointType, units_for
-from pace_optim.recording.keys import listed
+from pace_actuators.text import listed
 from pace_optim.recording.noise import noise_floor
 
 from .log import Channel

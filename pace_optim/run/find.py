@@ -6,6 +6,8 @@ import difflib
 import shlex
 from pathlib import Path
 
+from pace_actuators.text import listed
+
 _MOST_NAMED = 8
 _OF_A_RUN = ("settings.json", "result.json", "best_trajectory.pt")
 
@@ -85,5 +87,4 @@ def _age(run: Path) -> tuple[str, int]:
 def _available(what: str, names: list[str], wanted: str) -> str:
     close = difflib.get_close_matches(wanted, names, n=1)
     meant = f" Did you mean {close[0]}?" if close else ""
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return f"{what}: {', '.join(names[:_MOST_NAMED])}{more}.{meant}"
+    return f"{what}: {listed(names, _MOST_NAMED)}.{meant}"

@@ -70,7 +70,6 @@ def check_same_configuration(run: Run, problem: Problem) -> None:
         ValueError: If a value differs.
     """
     now = resolved(problem)
-    now["configuration"]["sim2real"]["cmaes"].pop("max_iteration")  # a resumed run may be given another
     now["configuration"]["sim2real"].pop("notes")  # words about the rest
     if run.overridden:
         now["configuration"]["scene"]["robot"].pop("mjcf_path")

@@ -152,6 +152,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         delay_mode=settings.delay_mode,
         physics_dt=settings.physics_dt,
         drive_dt=settings.drive_dt,
+        control_dt=settings.control_dt,
         effects=settings.effects,
         unknown=settings.unknown,
         env_cfg=env_cfg,

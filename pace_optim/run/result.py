@@ -21,7 +21,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
 from pace_optim.recording.notes import notes_by_kind
 from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.whole_delay import whole_delay
+from pace_optim.uncertainty.undetermined import whole_delay
 
 
 @dataclass(kw_only=True)

@@ -1,4 +1,4 @@
-"""Reading the tensors of a run's folder, checked: trajectories, bounds, a mean of the search."""
+"""Reading the tensors of a run's folder, checked: trajectories and their errors, bounds, a mean of the search."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from pace_actuators.files import read_tensors, refuse
@@ -105,3 +106,19 @@ def _dict(content: Any, where: object, keys: tuple[str, ...]) -> dict[str, Any]:
     if missing := [key for key in keys if key not in content]:
         refuse(where, f"{missing[0]} is missing", _ANEW)
     return content
+
+
+def held_out_spans(time: np.ndarray, train: np.ndarray) -> list[tuple[float, float]]:
+    """From when to when samples are kept for validation [s].
+
+    Args:
+        time: (K,) [s].
+        train: (K,) bool.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], train.astype(bool), [True]]).astype(np.int8)))
+    return [(float(time[a]), float(time[min(b, len(time) - 1)])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def rms(error: np.ndarray) -> float | None:
+    """Root mean square; ``None`` of nothing."""
+    return float(np.sqrt(np.mean(np.square(error)))) if error.size else None

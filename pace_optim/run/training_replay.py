@@ -53,12 +53,6 @@ class TrainingReplay:
     """The same in the training environment."""
 
     @property
-    def largest_change(self) -> float:
-        """Relative change of the error of all joints, the larger of training and validation data."""
-        parts = [part for part in self.replayed if self.replayed[part] and self.fitted.get(part)]
-        return max((abs(self.replayed[p][ALL] / self.fitted[p][ALL] - 1) for p in parts), default=float("nan"))
-
-    @property
     def table(self) -> list[str]:
         """Its lines, one per joint."""
         width = max(len(name) + len(" [mrad]") for name in (*self.joint_names, "joint"))

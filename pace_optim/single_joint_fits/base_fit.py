@@ -11,7 +11,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.fitting_cfg import DEFAULT, FittingCfg
-from pace_optim.single_joint_fits.model import BASE, JointModel
+from pace_optim.single_joint_fits.model import BASE, COLUMN, JointModel
 from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -42,7 +42,7 @@ def fit_base(
     twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
     if along is measured_path and float(fitted.score.max()) > fits.cfg.away**2:
         twins, fitted = _fit_along(fits, problem, fitted, reference_path, names, say)
-    armature = fitted.physical[:, BASE.index("armature")]
+    armature = fitted.physical[:, COLUMN["armature"]]
     return twins, fitted, twins.path.typical_effort(armature)
 
 
@@ -66,7 +66,7 @@ def _fit_along(
     """
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
-        late = later_than_most(fitted.physical[:, BASE.index("delay")], cfg=fits.cfg)
+        late = later_than_most(fitted.physical[:, COLUMN["delay"]], cfg=fits.cfg)
         more = {"late": late, "away": fits.cfg.away} if along is reference_path else {}
         return along(of, whole_vector(of, fitted.physical), model_effects, **more)
 

@@ -7,13 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.problem.box import Box
 from pace_optim.problem.problem import Problem
 from pace_optim.uncertainty.uncertainty import AT_BOUND
 
-BASE = ("armature", "viscous_friction", "friction", "encoder_bias", "delay")
+BASE = tuple(BASE_PARAMETERS)
 """The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
+
+COLUMN = {name: column for column, name in enumerate(BASE)}
+"""The column of each base parameter in a joint's vector."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,7 +200,7 @@ class JointModel:
 
     def _widest(self, parameter: EffectParameter, joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The widest bounds of an effect's parameter on some joints, (n,) bool; physical, one for each of them."""
-        friction = self.upper[joints, BASE.index("friction")].tolist()
+        friction = self.upper[joints, COLUMN["friction"]].tolist()
         bounds = torch.tensor([parameter.widest(each) for each in friction], dtype=torch.float64).reshape(-1, 2)
         ranges = self.ranges[joints].tolist()
         own = torch.tensor([parameter.reaching(*each) for each in ranges], dtype=torch.float64).reshape(-1, 2)

@@ -13,7 +13,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.labels import found_effects
-from pace_optim.single_joint_fits.model import BASE, whole_values
+from pace_optim.single_joint_fits.model import COLUMN, whole_values
 from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.path import ReferencePath
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -80,7 +80,7 @@ class ReferenceUpdate:
         """The motion of the whole robot with a model."""
         problem = self.problem.with_effects(found_effects(now.model, self.problem.joint_names))
         changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
-        held = ~now.model.free[:, BASE.index("delay")]
+        held = ~now.model.free[:, COLUMN["delay"]]
         return reference_path(problem, self._values(problem, now), changing, late=held, away=self.fits.cfg.away)
 
     @staticmethod

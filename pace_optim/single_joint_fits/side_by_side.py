@@ -12,7 +12,7 @@ import torch
 from pace_actuators.effects import Effect, EffectCfg
 from pace_envs.kernels import CannotCompileError
 from pace_optim.problem.rollout import Rollout
-from pace_optim.single_joint_fits.model import BASE, JointModel
+from pace_optim.single_joint_fits.model import BASE, COLUMN, JointModel
 from pace_optim.single_joint_model.kernel_rollout import Compiler, KernelRollout
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -100,7 +100,7 @@ class SideBySide:
         self._write_effects(physical)
         rollout.look_at(where)
         rollout.begin()
-        bias = base[..., BASE.index("encoder_bias")]
+        bias = base[..., COLUMN["encoder_bias"]]
         return bias.view(self._num_candidates, count, bias.shape[1])
 
     def _errors(self, bias: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
@@ -132,14 +132,8 @@ class SideBySide:
         return slice(begin, end)
 
     def _write_base(self, base: torch.Tensor) -> None:
-        robot = self.rollout.robot
-        column = dict(zip(BASE, base.unbind(dim=-1), strict=True))
-        robot.write_joint_armature_to_sim(column["armature"])
-        robot.write_joint_viscous_friction_coefficient_to_sim(column["viscous_friction"])
-        robot.write_joint_friction_coefficient_to_sim(column["friction"])
-        for actuator in robot.actuators.values():
-            actuator.update_encoder_bias(column["encoder_bias"][:, actuator.joint_indices])
-            actuator.update_time_lags(column["delay"][:, actuator.joint_indices])
+        for name, column in COLUMN.items():
+            self.rollout.robot.write_base_parameter_to_sim(name, base[..., column])
 
     def _write_effects(self, physical: Sequence[torch.Tensor]) -> None:
         count, robot = self.dataset.num_recordings, self.rollout.robot

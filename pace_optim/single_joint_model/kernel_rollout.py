@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 
 from pace_optim.one_kernel.drive import commands
+from pace_optim.problem.rollout import between_steps
 from pace_optim.single_joint_model.kernel_recorder import Recorded, record
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ class KernelRollout:
                 if offset is not None:
                     recording = torch.arange(group.rows.start, group.rows.stop) % rollout.dataset.num_recordings
                     when = when + offset[at][:, recording, None].to(self._device)
-                seen = _between_steps(seen, when)
+                seen = between_steps(seen, when)
             elif int(at[0]) == 0:
                 seen[0] = begin
             result[:, rows, columns] = seen
@@ -216,19 +217,3 @@ def _when(at: torch.Tensor, lag: torch.Tensor, steps: int) -> torch.Tensor:
     rate = (lag[1] - lag[0]) / max(1, steps - 1)
     k = at.double()[:, None, None]
     return k - (lag[0] + rate * k)
-
-
-def _between_steps(seen: torch.Tensor, when: torch.Tensor) -> torch.Tensor:
-    """Positions (T, m, n) at real-valued steps (K, m, n): by a rollout's cubic through four samples."""
-    whole = when.floor()
-    f, index = when - whole, whole.long()
-    weights = (
-        -f * (f - 1) * (f - 2) / 6,
-        (f + 1) * (f - 1) * (f - 2) / 2,
-        -(f + 1) * f * (f - 2) / 2,
-        (f + 1) * f * (f - 1) / 6,
-    )
-    result = torch.zeros_like(when)
-    for i, weight in enumerate(weights):
-        result += weight * seen.gather(0, (index + i - 1).clamp(0, len(seen) - 1))
-    return result

@@ -11,16 +11,181 @@ if __name__ == "__main__":
 from __future__ import annotations
 
 import argparse
+import codecs
 import contextlib
 import difflib
+import io
 import os
 import re
 import sys
-from collections.abc import Callable
-from typing import Any, NoReturn
+import sysconfig
+import traceback
+import unicodedata
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn, TextIO
 
-from pace_optim.terminal.faults import is_of_input, own_code, sentence
-from pace_optim.terminal.screen import one_line, safe_streams
+_LONGEST_WORD = 300
+_PLAIN = {"×": "x", "→": "->", "−": "-", "–": "-", "…": "...", "²": "^2", "³": "^3", "·": "*", "°": " deg", "±": "+/-"}
+"""How a terminal without these characters shows them."""
+_ERRORS = "pace_plain"
+
+
+def readable(text: str) -> str:
+    """The text with what steers a terminal written out: ends of lines, escapes, bells, changes of direction."""
+    return text if text.isprintable() else "".join(map(_shown, text))
+
+
+def one_line(text: str) -> str:
+    """The text as one line that can be read; words without an end are cut."""
+    line = readable(" ".join(text.split()))
+    return re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda found: f"{found[0][:80]}…{found[0][-20:]}", line)
+
+
+@contextlib.contextmanager
+def safe_streams() -> Iterator[None]:
+    r"""Let everything in the block print through :func:`readable`, to streams that take any character.
+
+    What is written at once is one line, which may end: the end of a line within it came with a name or a text of
+    somebody else's, and is written out. So nothing foreign can begin a line of its own, such as ``run: …``. Print
+    several lines with ``print(*lines, sep="\n")``. A stream that is closed swallows what it gets: ``2>&-`` must not
+    let messages run into the output.
+    """
+    before = sys.stdout, sys.stderr, warnings.formatwarning
+    sys.stdout, sys.stderr = (_Screen(_open(stream)) for stream in before[:2])  # type: ignore[assignment]
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr, warnings.formatwarning = before
+
+
+def _open(stream: TextIO | None) -> TextIO:
+    if stream is None:
+        return open(os.devnull, "w", encoding="utf-8")
+    if isinstance(stream, io.TextIOWrapper):
+        with contextlib.suppress(ValueError):
+            stream.reconfigure(errors=_ERRORS)
+    return stream
+
+
+class _Screen:
+    """A text stream that shows what steers a terminal instead of passing it on; a line, or a part of one, at a time."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        line = text.removesuffix("\n")
+        shown = line if line == "\r" else readable(line)  # alone it is the progress line's own
+        self._stream.write(shown + text[len(line) :])
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _shown(character: str) -> str:
+    if character == "\t":
+        return character
+    if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
+        return character.encode("unicode_escape").decode() if character < "\ud800" else f"\\u{ord(character):04x}"
+    return character
+
+
+def _in_plain_letters(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start : error.end]
+    return "".join(_PLAIN.get(c, f"\\u{ord(c):04x}") for c in text), error.end
+
+
+codecs.register_error(_ERRORS, _in_plain_letters)
+
+
+_OURS = ("pace_actuators", "pace_envs", "pace_optim", "scripts", "benchmarks", "tests")
+_NO_MEMORY = re.compile(r"allocate memory|bad_alloc|bad allocation|[Cc]ould not allocate|out of memory", re.DOTALL)
+
+
+def is_of_input(error: BaseException) -> bool:
+    """Whether the user can mend it."""
+    is_input = isinstance(error, ValueError | KeyError | OSError | MemoryError)
+    return is_input or lacks_memory(error) or _is_loop(error)
+
+
+def _is_loop(error: BaseException) -> bool:
+    """Whether a path is a link to itself: Python 3.11 and 3.12 have a RuntimeError for it where they resolve one."""
+    return isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from ")
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether memory was asked for that there is not."""
+    return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
+
+
+def sentence(error: BaseException) -> str:
+    """What to say of an error, without its type where the text says it all."""
+    own = own_code(error)
+    if lacks_memory(error):
+        from pace_actuators.memory import available_memory  # with torch: a command that begins has no need of it
+
+        text = f"there is not enough memory ({_text(error)}); {available_memory() / 1e9:.3g} GB are free. "
+        text += "Ask for fewer --num_envs, or for shorter or fewer recordings."
+    elif is_of_input(error):
+        text = _text(error)
+        if isinstance(error, KeyError) and error.args and " " not in str(error.args[0]):
+            text = f"there is no {text!r}"
+    elif own is None:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return (
+            f"this is a fault of the program, not of your input ({type(error).__name__}: {_text(error)}; "
+            f"{Path(where.filename).name}:{where.lineno}). PACE_TRACEBACK=1 in the environment shows all of it."
+        )
+    else:
+        text = f"{type(error).__name__}: {_text(error)}"
+    return text if own is None else f"{own}: {text}"
+
+
+def own_code(error: BaseException) -> str | None:
+    """Where in a user's own code an error arose: file, line and function, and the effect; ``None`` if elsewhere.
+
+    What this project says of bad input stands for itself, though own code may have called it.
+    """
+    found, trace = None, error.__traceback__
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if _is_own(code.co_filename):
+            owner = trace.tb_frame.f_locals.get("self")
+            name = "" if owner is None else f"{getattr(owner, 'name', None) or type(owner).__name__}."
+            found = f"{code.co_filename}:{trace.tb_lineno}, in {name}{code.co_name}"
+        elif _is_ours(code.co_filename) and is_of_input(error):
+            found = None
+        trace = trace.tb_next
+    return found
+
+
+def _is_ours(filename: str) -> bool:
+    here = Path(__file__).resolve().parents[2]
+    path = Path(filename).resolve()
+    return path.is_relative_to(here) and path.relative_to(here).parts[0] in _OURS
+
+
+def _is_own(filename: str) -> bool:
+    if filename.startswith("<") or _is_ours(filename):
+        return False
+    path = Path(filename).resolve()
+    libraries = {sys.prefix, sys.base_prefix, *sysconfig.get_paths().values()}
+    return "site-packages" not in path.parts and not any(path.is_relative_to(Path(each)) for each in libraries)
+
+
+def _text(error: BaseException) -> str:
+    if isinstance(error, KeyError) and error.args:
+        return str(error.args[0])  # str(KeyError) is a repr
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return (str(error) or type(error).__name__)[:2000]
+
 
 FAULT = 1
 USER_ERROR = 2

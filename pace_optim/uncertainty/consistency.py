@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from pace_actuators.text import plural
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
 from pace_optim.optimizers.derivatives import Jacobian, colour, stencil
@@ -150,7 +151,7 @@ def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.nda
 
 def _more(joints: int) -> str:
     """How many joints are not shown."""
-    return "" if joints < 1 else f"; and {joints} more joint{'' if joints == 1 else 's'}"
+    return "" if joints < 1 else f"; and {plural(joints, 'more joint')}"
 
 
 def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[int, float, float] | None:

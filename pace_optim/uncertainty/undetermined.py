@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
-from pace_actuators.drive_result import NOT_NEGATIVE
+from pace_actuators.base_parameters import CARRIED, PER_JOINT
 from pace_actuators.effects import effect_cfgs
 from pace_envs.tasks.pace import GLOBAL
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -21,6 +20,39 @@ from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.uncertainty.honest_end import noise_score
 from pace_optim.uncertainty.uncertainty import HARDLY_KNOWN, SURE, Uncertainty
+
+_NEAR = 0.05
+"""So near to a whole number of control steps a delay is one."""
+_SURE = 3.0
+"""Standard deviations."""
+
+
+def whole_delay(problem: Problem, delay: float, std: float | None) -> list[str]:
+    """What other delays would look the same, in a sentence; nothing where the recordings tell.
+
+    Commands that come on their own clock, at instants at which the loop runs too, are taken over late by a whole number
+    of its steps, whatever their delay.
+
+    Args:
+        problem: What was fitted.
+        delay: As found [control steps].
+        std: Its standard deviation [control steps].
+    """
+    drives = problem.env_cfg.scene.robot.actuators.values()
+    held = all(not drive.implicit and drive.drive_dt in (None, problem.control_dt) for drive in drives)
+    own_clock = any(problem.dataset.recordings[r].des_time is not None for r in problem.dataset.trained())
+    near = max(_NEAR, _SURE * (std or 0.0))
+    if not (held and own_clock and problem.delay_mode == "command" and round(delay) >= 1):
+        return []
+    if abs(delay - round(delay)) > near or near > 0.5:
+        return []
+    step = 1e3 * problem.control_dt
+    return [
+        f"The delay is a whole number of control steps. A drive that takes commands over only when its loop "
+        f"runs, every {step:g} ms, acts so late for every delay above {(round(delay) - 1) * step:g} and up to "
+        f"{round(delay) * step:g} ms of commands that are sent in time with it."
+    ]
+
 
 DELAY = f"delay/{GLOBAL}"
 """Label of the delay."""
@@ -67,11 +99,7 @@ def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) 
     space, value = problem.space, problem.space.to_physical(x).numpy()
     apart = np.maximum(value, np.abs(value - _within_bounds(problem).numpy()))
     unsure = apart < SURE * uncertainty.std  # not where there is none
-    return {
-        label
-        for label, yes in zip(space.labels, unsure, strict=True)
-        if yes and label != DELAY and label.split("/")[0] in NOT_NEGATIVE
-    }
+    return {label for label, yes in zip(space.labels, unsure, strict=True) if yes and label.split("/")[0] in CARRIED}
 
 
 def _of_unknown(problem: Problem) -> set[str]:
@@ -178,7 +206,7 @@ def prior(problem: Problem) -> torch.Tensor:
     result = torch.zeros(space.size, dtype=torch.float64)
     for drive in problem.env_cfg.scene.robot.actuators.values():
         own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]
-        for name in PARAMETER_GROUPS:
+        for name in PER_JOINT:
             if (value := getattr(drive, name)) is not None and name in space.slices:
                 values = resolve_joint_values(value, own, field=name).to(torch.float64)
                 result[space[name]][[joints.index(joint) for joint in own]] = values

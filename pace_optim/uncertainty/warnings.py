@@ -9,6 +9,7 @@ import torch
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import conjoined
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -88,7 +89,7 @@ def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
     return [
         f"The recording cannot tell apart "
-        f"{_listed([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
+        f"{conjoined([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
         ": move more, or in other poses."
         for kind, keys in kinds.items()
     ]
@@ -107,7 +108,7 @@ def _of(keys: Sequence[str]) -> str:
     if list(keys) == [GLOBAL]:
         return ""
     if len(keys) <= _NAMED:
-        return f" of {_listed(list(keys))}"
+        return f" of {conjoined(keys)}"
     return f" of {len(keys)} joints ({', '.join(keys[:_NAMED])}, …)"
 
 
@@ -198,12 +199,8 @@ def in_words(labels: tuple[str, ...]) -> str:
     names = [label.split("/")[0].replace("_", " ") for label in labels]
     keys = {label.split("/", 1)[1] for label in labels} - {ALL}
     if len(keys) == 1:
-        return f"{_listed(names)} of {keys.pop()}"
-    return _listed([f"{name} of {label.split('/', 1)[1]}" for name, label in zip(names, labels, strict=True)])
-
-
-def _listed(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
+        return f"{conjoined(names)} of {keys.pop()}"
+    return conjoined([f"{name} of {label.split('/', 1)[1]}" for name, label in zip(names, labels, strict=True)])
 
 
 def critical_delay(inertia: float, viscous_friction: float, stiffness: float, damping: float) -> float:
@@ -255,6 +252,6 @@ def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
         return []
     return [
         f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of the control loop of "
-        f"{_listed(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
+        f"{conjoined(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
         "--delay_mode command."
     ]

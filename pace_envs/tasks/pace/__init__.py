@@ -1,12 +1,11 @@
 """Identification: a robot held in the air follows a recording's commands."""
 
-from pace_envs.tasks.pace.pace_cfg import CMAESOptimizerCfg, ExcitationCfg, PaceCfg, make_bounds
+from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters, effect_parameters
 
 __all__ = [
     "GLOBAL",
-    "CMAESOptimizerCfg",
     "ExcitationCfg",
     "PaceCfg",
     "PaceSim2realEnvCfg",
@@ -14,5 +13,4 @@ __all__ = [
     "Parameter",
     "base_parameters",
     "effect_parameters",
-    "make_bounds",
 ]

@@ -2,7 +2,7 @@
 
 from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import ANYMAL_D_JOINTS, anymal_d_cfg
-from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, make_bounds
+from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
 
 
@@ -16,14 +16,13 @@ def anymal_d_pace_env_cfg() -> PaceSim2realEnvCfg:
             robot_name="anymal_d",
             data_dir=ASSETS_DIR / "anymal_d" / "chirp.npz",
             joint_order=ANYMAL_D_JOINTS,
-            bounds_params=make_bounds(
-                ANYMAL_D_JOINTS,
-                armature=(1e-5, 1.0),
-                viscous_friction=(0.0, 7.0),
-                friction=(0.0, 0.5),
-                encoder_bias=(-0.1, 0.1),
-                delay=(0.0, 10.0),
-            ),
+            bounds={
+                "armature": (1e-5, 1.0),
+                "viscous_friction": (0.0, 7.0),
+                "friction": (0.0, 0.5),
+                "encoder_bias": (-0.1, 0.1),
+                "delay": (0.0, 10.0),
+            },
             excitation=ExcitationCfg(
                 bias=(0.0, 0.4, 0.8) * 4,
                 direction=(1, 1, 1, -1, 1, 1, 1, -1, -1, -1, -1, -1),

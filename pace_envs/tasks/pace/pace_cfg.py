@@ -2,47 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from pace_actuators.base_parameters import BASE_PARAMETERS, PER_JOINT
 from pace_actuators.config import Config
-from pace_actuators.drive_result import BASE_FIELDS
 from pace_actuators.effects import EffectCfg
-
-PARAMETER_GROUPS = BASE_FIELDS
-"""The parameters of each joint, in the order of the parameter vector; the delay follows them."""
-
-
-@dataclass(kw_only=True)
-class CMAESOptimizerCfg(Config):
-    """Settings of the search."""
-
-    per_tree: bool = True
-    """Whether parts of the robot that do not move each other (legs on a fixed base) are searched apart."""
-
-    max_iteration: int = 200
-    """Largest number of generations."""
-
-    epsilon: float | None = 1e-2
-    """Stop when (max - min) / min of a generation's scores falls below this; ``None`` switches it off."""
-
-    stop: Sequence[Any] = ()
-    """Further rules that end the search, beside ``epsilon`` and ``max_iteration``: ``"plateau"``, ``"window"``,
-    ``"gradient"``, ``"early_stopping"``, ``"parameters"`` or ``"target"``, with numbers as in
-    ``"plateau:generations=30,improvement=0.01"``; or a rule of your own (``pace_optim.optimizers.convergence``)."""
-
-    sigma: float = 0.5
-    """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
-
-    save_interval: int = 10
-    """Generations between two saved means and checkpoints."""
-
-    save_optimization_process: bool = False
-    """Whether every generation's parameters and scores are kept in ``progress.pt``."""
+from pace_actuators.joint_values import resolve_joint_values
 
 
 @dataclass(kw_only=True)
@@ -61,7 +32,7 @@ class ExcitationCfg(Config):
 
 @dataclass(kw_only=True)
 class PaceCfg(Config):
-    """Names, bounds and search settings of a robot's identification."""
+    """Names, bounds and motion of a robot's identification."""
 
     robot_name: str
     """Name of the robot; runs are kept under it."""
@@ -73,12 +44,17 @@ class PaceCfg(Config):
     joint_order: tuple[str, ...]
     """The joints, in the order of every vector."""
 
-    bounds_params: torch.Tensor
-    """Lower and upper bound of each parameter, (4n+1, 2): armature [kg m^2], viscous friction [N m s/rad],
-    Coulomb friction [N m] and encoder bias [rad] of every joint, then the delay [control steps]."""
+    bounds: Mapping[str, Any] = field(default_factory=dict)
+    """Lower and upper bound of each base parameter by name: armature [kg m^2], viscous_friction [N m s/rad],
+    friction [N m] and encoder_bias [rad] of the joints, delay [control steps]. A pair for all joints, a dict of
+    regular expression to pair, or one pair per joint; once prepared, tensors (n, 2), of the delay (1, 2)."""
 
-    cmaes: CMAESOptimizerCfg = field(default_factory=CMAESOptimizerCfg)
-    """Settings of the search."""
+    bounds_params: torch.Tensor | None = None
+    """The same as PACE writes it, (4n+1, 2): armature, viscous friction, friction and bias of every joint, then the
+    delay. It becomes ``bounds`` and is ``None`` once prepared."""
+
+    cmaes: Any = None
+    """Settings of the search, as PACE has them here: a ``pace_optim.CMAESOptimizerCfg``; ``None``: its defaults."""
 
     excitation: ExcitationCfg | None = None
     """How the robot is moved for a recording; ``None`` if it is only fitted to given ones."""
@@ -142,40 +118,47 @@ class PaceCfg(Config):
             ValueError: If bounds, their number or a name are unusable.
         """
         self.joint_order = tuple(self.joint_order)
-        expected = (4 * len(self.joint_order) + 1, 2)
-        self.bounds_params = torch.as_tensor(self.bounds_params, dtype=torch.float64)
-        if tuple(self.bounds_params.shape) != expected:
-            raise ValueError(
-                f"bounds_params has shape {tuple(self.bounds_params.shape)}, expected {expected}: four parameters "
-                f"for each of the {len(self.joint_order)} joints in joint_order, then the delay. Declare a parameter "
-                "of your own in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
-                "apply=function(env, values)),)."
-            )
-        if unknown := sorted(set(self.start_params) - {*PARAMETER_GROUPS, "delay"}):
-            raise ValueError(
-                f"start_params names {', '.join(unknown)}. Available: {', '.join(PARAMETER_GROUPS)}, delay."
-            )
+        if self.bounds_params is not None:
+            self.bounds, self.bounds_params = _of_pace(self.bounds_params, len(self.joint_order)), None
+        self.bounds = _by_name(self.bounds, self.joint_order)
+        if unknown := sorted(set(self.start_params) - set(BASE_PARAMETERS)):
+            raise ValueError(f"start_params names {', '.join(unknown)}. Available: {', '.join(BASE_PARAMETERS)}.")
         low, high = self.friction_ratio_bounds
         if not 0 <= low < high <= 1:
             raise ValueError(f"friction_ratio_bounds is ({low:g}, {high:g}), expected 0 <= lower < upper <= 1.")
-        wrong = (~(self.bounds_params[:, 0] <= self.bounds_params[:, 1])).nonzero()[:, 0]
-        if len(wrong):
-            row = int(wrong[0])
-            low, high = self.bounds_params[row].tolist()
-            raise ValueError(f"bounds_params row {row} is ({low:g}, {high:g}), expected lower <= upper.")
+
+    def replace(self, **changes: Any) -> PaceCfg:
+        """A copy with other values of some fields; ``__post_init__``, which may fill ``bounds_params``, has run."""
+        type(self).__new__(type(self), **changes)  # refuses unknown names
+        result = copy.copy(self)
+        for name, value in changes.items():
+            setattr(result, name, value)
+        return result
+
+    def set_bounds(self, name: str, lower: Any = None, upper: Any = None) -> None:
+        """Replace bounds of a parameter; ``None`` keeps them.
+
+        Args:
+            name: The parameter.
+            lower: A number, or one per joint.
+            upper: The same.
+        """
+        low, high = self.bounds[name].unbind(dim=1)
+        given = ((low, lower), (high, upper))
+        ends = [old if new is None else torch.as_tensor(new, dtype=old.dtype).expand_as(old) for old, new in given]
+        self.bounds = {**self.bounds, name: torch.stack(ends, dim=1)}
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
         """The same for some of the joints, in their order here; effects and parameters of one's own are left out."""
-        kept, n = [i for i, name in enumerate(self.joint_order) if name in joint_names], len(self.joint_order)
-        rows = [group * n + i for group in range(len(PARAMETER_GROUPS)) for i in kept]
+        self.prepare()
+        kept = [i for i, name in enumerate(self.joint_order) if name in joint_names]
         names = tuple(self.joint_order[i] for i in kept)
         motion = self.excitation and {
             each.name: tuple(getattr(self.excitation, each.name)[i] for i in kept) for each in fields(ExcitationCfg)
         }
-        return replace(
-            self,
+        return self.replace(
             joint_order=names,
-            bounds_params=self.bounds_params[[*rows, -1]],
+            bounds={name: own[kept] if name in PER_JOINT else own for name, own in self.bounds.items()},
             excitation=ExcitationCfg(**motion) if motion else None,
             sample_params=_of_joints(self.sample_params, names),
             start_params=_of_joints(self.start_params, names),
@@ -196,16 +179,53 @@ def _of_joints(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any
     }
 
 
-def make_bounds(
-    joint_order: tuple[str, ...],
-    *,
-    armature: tuple[float, float],
-    viscous_friction: tuple[float, float],
-    friction: tuple[float, float],
-    encoder_bias: tuple[float, float],
-    delay: tuple[float, float],
-) -> torch.Tensor:
-    """``bounds_params`` with the same bounds for every joint, (4n+1, 2)."""
-    n = len(joint_order)
-    groups = [armature, viscous_friction, friction, encoder_bias]
-    return torch.tensor([pair for pair in groups for _ in range(n)] + [delay], dtype=torch.float64)
+def _of_pace(bounds: Any, joints: int) -> dict[str, torch.Tensor]:
+    """PACE's tensor of bounds, (4n+1, 2), by name.
+
+    Raises:
+        ValueError: If it has another shape.
+    """
+    rows = torch.as_tensor(bounds, dtype=torch.float64)
+    counts = [1 if parameter.shared else joints for parameter in BASE_PARAMETERS.values()]
+    if tuple(rows.shape) != (sum(counts), 2):
+        raise ValueError(
+            f"bounds_params has shape {tuple(rows.shape)}, expected {(sum(counts), 2)}: four parameters "
+            f"for each of the {joints} joints in joint_order, then the delay. Declare a parameter "
+            "of your own in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
+            "apply=function(env, values)),)."
+        )
+    return dict(zip(BASE_PARAMETERS, rows.split(counts), strict=True))
+
+
+def _by_name(bounds: Mapping[str, Any], joints: Sequence[str]) -> dict[str, torch.Tensor]:
+    """Bounds of every base parameter, {name: (n, 2)}, of the shared ones (1, 2).
+
+    Raises:
+        ValueError: If a name is missing or unknown, or a lower bound is above the upper one.
+    """
+    if set(bounds) != set(BASE_PARAMETERS):
+        raise ValueError(
+            f"bounds has {', '.join(bounds) or 'nothing'}, expected a pair (lower, upper) for each of "
+            f"{', '.join(BASE_PARAMETERS)}."
+        )
+    result = {}
+    for name, parameter in BASE_PARAMETERS.items():
+        keys = ["all"] if parameter.shared else list(joints)
+        result[name] = own = _pairs(bounds[name], keys, name)
+        for key, (low, high) in zip(keys, own.tolist(), strict=True):
+            if not low <= high:
+                raise ValueError(f"bounds of {name} on {key} are ({low:g}, {high:g}), expected lower <= upper.")
+    return result
+
+
+def _pairs(given: Any, keys: list[str], name: str) -> torch.Tensor:
+    """One pair per key, (keys, 2), of a pair for all, a dict of expressions, or pairs in order."""
+    if isinstance(given, Mapping):
+        ends = [{pattern: float(pair[end]) for pattern, pair in given.items()} for end in (0, 1)]
+        return torch.stack([resolve_joint_values(end, keys, field=f"bounds of {name}") for end in ends], dim=1).double()
+    pairs = torch.as_tensor(given, dtype=torch.float64)
+    if pairs.shape not in ((2,), (len(keys), 2)):
+        raise ValueError(
+            f"bounds of {name} have shape {tuple(pairs.shape)}, expected one pair (lower, upper) or {(len(keys), 2)}."
+        )
+    return pairs.expand(len(keys), 2).clone()

@@ -78,7 +78,7 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
             self.scene = dataclasses.replace(self.scene, robot=robot)
         for drive in robot.actuators.values():
             if drive.max_delay is None:  # in the drive's own control steps
-                longest = float(pace.bounds_params[-1, 1]) * self.decimation / drive.control_decimation
+                longest = float(pace.bounds["delay"][0, 1]) * self.decimation / drive.control_decimation
                 drive.max_delay = max(longest, drive.largest_delay)
             drive.delay = drive.delay or 0.0  # identification sets the delay; max_delay alone would be one
         has_effects = all(drive.effects for drive in robot.actuators.values())
@@ -154,7 +154,7 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         return dataclasses.replace(
             self,
             scene=dataclasses.replace(self.scene, robot=robot),
-            sim2real=dataclasses.replace(self.sim2real.on_joints(kept), effects=tuple(effects)),
+            sim2real=self.sim2real.on_joints(kept).replace(effects=tuple(effects)),
         )
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceSim2realEnvCfg:

@@ -10,27 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, units_for
-from pace_envs.tasks.pace.pace_cfg import PARAMETER_GROUPS, PaceCfg
+from pace_envs.tasks.pace.pace_cfg import PaceCfg
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
 
 GLOBAL = ALL
 """The key of a parameter that all joints share."""
-
-_FRICTION = PARAMETER_GROUPS.index("friction")
-
-UNITS = {
-    "armature": "kg m^2",
-    "viscous_friction": "N m s/rad",
-    "friction": "N m",
-    "encoder_bias": "rad",
-    "delay": "control steps",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,40 +87,21 @@ class Parameter:
 def base_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     """Armature, viscous friction, Coulomb friction and encoder bias of every joint, and the delay."""
     cfg.prepare()
-    n, joints = len(cfg.joint_order), tuple(cfg.joint_order)
-    apply = {
-        "armature": _apply_armature,
-        "viscous_friction": _apply_viscous_friction,
-        "friction": _apply_friction,
-        "encoder_bias": _apply_encoder_bias,
-        "delay": _apply_delay,
-    }
-    bounds = cfg.bounds_params
-    result = [
+    joints = tuple(cfg.joint_order)
+    return tuple(
         Parameter(
             name=name,
-            unit=UNITS[name],
-            lower=tuple(bounds[i * n : (i + 1) * n, 0].tolist()),
-            upper=tuple(bounds[i * n : (i + 1) * n, 1].tolist()),
-            apply=apply[name],
-            keys=joints,
-            start=_start(cfg, name, bounds[i * n : (i + 1) * n]),
-            units=_units(UNITS[name], joints, cfg),
+            unit=parameter.unit,
+            lower=tuple(cfg.bounds[name][:, 0].tolist()),
+            upper=tuple(cfg.bounds[name][:, 1].tolist()),
+            apply=partial(_apply_base, name=name),
+            keys=(GLOBAL,) if parameter.shared else joints,
+            start=_start(cfg, name, cfg.bounds[name]),
+            units=None if parameter.shared else _units(parameter.unit, joints, cfg),
+            per_joint_copies=parameter.shared,
         )
-        for i, name in enumerate(PARAMETER_GROUPS)
-    ]
-    low, high = bounds[-1].tolist()
-    delay = Parameter(
-        name="delay",
-        unit=UNITS["delay"],
-        lower=(low,),
-        upper=(high,),
-        apply=apply["delay"],
-        keys=(GLOBAL,),
-        start=_start(cfg, "delay", bounds[-1:]),
-        per_joint_copies=True,
+        for name, parameter in BASE_PARAMETERS.items()
     )
-    return (*result, delay)
 
 
 def _start(cfg: PaceCfg, name: str, bounds: torch.Tensor) -> tuple[float, ...] | None:
@@ -160,7 +132,7 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
                 if kind is DynamicFriction:
                     lower, upper = cfg.friction_ratio_bounds
                 elif effect.wide:
-                    widest = parameter.widest(float(cfg.bounds_params[_FRICTION * len(joints) + i, 1]))
+                    widest = parameter.widest(float(cfg.bounds["friction"][i, 1]))
                     lower, upper = min(lower, widest[0]), max(upper, widest[1])
                 each.append(given.get(joint, (lower, min(max(parameter.start, lower), upper), upper)))
             if effect.shared and each:
@@ -197,23 +169,5 @@ def _apply_effect(
     env.scene["robot"].write_effect_parameter_to_sim(effect, parameter, values, joint_ids)
 
 
-def _apply_armature(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-    env.scene["robot"].write_joint_armature_to_sim(values)
-
-
-def _apply_viscous_friction(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-    env.scene["robot"].write_joint_viscous_friction_coefficient_to_sim(values)
-
-
-def _apply_friction(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-    env.scene["robot"].write_joint_friction_coefficient_to_sim(values)
-
-
-def _apply_encoder_bias(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-    for actuator in env.scene["robot"].actuators.values():
-        actuator.update_encoder_bias(values[:, actuator.joint_indices])
-
-
-def _apply_delay(env: ManagerBasedEnv, values: torch.Tensor) -> None:
-    for actuator in env.scene["robot"].actuators.values():
-        actuator.update_time_lags(values if values.shape[1] == 1 else values[:, actuator.joint_indices])
+def _apply_base(env: ManagerBasedEnv, values: torch.Tensor, *, name: str) -> None:
+    env.scene["robot"].write_base_parameter_to_sim(name, values)

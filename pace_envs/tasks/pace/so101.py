@@ -2,7 +2,7 @@
 
 from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import SO101_JOINTS, so101_cfg
-from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, make_bounds
+from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
 
 
@@ -19,14 +19,13 @@ def so101_pace_env_cfg() -> PaceSim2realEnvCfg:
             robot_name="so101",
             data_dir=ASSETS_DIR / "so101" / "chirp.npz",
             joint_order=SO101_JOINTS,
-            bounds_params=make_bounds(
-                SO101_JOINTS,
-                armature=(5e-3, 0.2),
-                viscous_friction=(0.0, 3.0),
-                friction=(0.0, 1.0),
-                encoder_bias=(-0.2, 0.2),
-                delay=(0.0, 80.0),  # 0.2 s
-            ),
+            bounds={
+                "armature": (5e-3, 0.2),
+                "viscous_friction": (0.0, 3.0),
+                "friction": (0.0, 1.0),
+                "encoder_bias": (-0.2, 0.2),
+                "delay": (0.0, 80.0),  # 0.2 s
+            },
             excitation=ExcitationCfg(
                 bias=(0.0, -1.0, 1.0, 0.0, 0.0, 2.0),
                 direction=(1.0,) * 6,

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
+from pace_actuators.text import plural
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
@@ -84,8 +85,8 @@ def check_data(
     loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
     gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
     sentences.append(
-        f"{_count(len(data.recordings), 'recording')} with {_count(len(loads), 'load')} and "
-        f"{_count(len(gains), 'set')} of gains."
+        f"{plural(len(data.recordings), 'recording')} with {plural(len(loads), 'load')} and "
+        f"{plural(len(gains), 'set')} of gains."
     )
     sentences += unstamped(data.recordings)
     floor = (noise**2 + numerical**2).sqrt()
@@ -145,7 +146,3 @@ def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return dict(value) if isinstance(value, Mapping) else value
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -13,10 +13,10 @@ from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.single_joint_fits.base_fit import later_than_most
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE
+from pace_optim.single_joint_fits.model import COLUMN
 from pace_optim.single_joint_model.problem import TwinProblem
 
-_DELAY = BASE.index("delay")
+_DELAY = COLUMN["delay"]
 
 
 def hold_late_joints(

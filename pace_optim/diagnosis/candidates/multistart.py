@@ -10,7 +10,7 @@ from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
+from pace_optim.single_joint_fits.model import COLUMN, JointModel, start_values
 from pace_optim.single_joint_fits.side_by_side import Slot
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -71,9 +71,9 @@ def _bases(now: Fitted, levels: Sequence[float]) -> list[torch.Tensor]:
     result = [now.physical]
     for level in levels:
         x = now.x.clone()
-        x[:, BASE.index("armature")] = level
-        x[:, BASE.index("viscous_friction")] = level
-        x[:, BASE.index("friction")] = level
-        x[:, BASE.index("delay")] = -0.5
+        x[:, COLUMN["armature"]] = level
+        x[:, COLUMN["viscous_friction"]] = level
+        x[:, COLUMN["friction"]] = level
+        x[:, COLUMN["delay"]] = -0.5
         result.append(now.model.to_physical(x))
     return result

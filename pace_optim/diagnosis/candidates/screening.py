@@ -12,7 +12,7 @@ from pace_actuators.effects import PROBED_EFFORT, Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, start_values
+from pace_optim.single_joint_fits.model import COLUMN, start_values
 from pace_optim.single_joint_fits.side_by_side import Slot
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -99,7 +99,7 @@ def absorbed_effects(
     suspects = [effect for effect in effects if effect.absorbed_by]
     if not suspects:
         return {}
-    takers = sorted({BASE.index(effect.absorbed_by) for effect in suspects})
+    takers = sorted({COLUMN[effect.absorbed_by] for effect in suspects})
     steps = torch.where(now.x > 0, -cfg.seen_step, cfg.seen_step)
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
@@ -109,7 +109,7 @@ def absorbed_effects(
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it absorbs nothing
         jacobian[taker] = torch.where(at_bound, 0.0, change / steps[:, taker].to(change.dtype))
-    result = {effect: now.model.free[:, BASE.index(effect.absorbed_by)].clone() for effect in suspects}
+    result = {effect: now.model.free[:, COLUMN[effect.absorbed_by]].clone() for effect in suspects}
     for (effect, _), change in zip(probes, changes[len(takers) :], strict=True):
         for j in range(now.model.num_joints):
             columns, own = jacobian[..., j].flatten(1).double(), change[..., j].flatten().double()

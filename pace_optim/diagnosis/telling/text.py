@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
+from pace_actuators.text import conjoined, size_text
 from pace_optim.diagnosis.telling.result import Diagnosis
-from pace_optim.report.sizes import size_text
 
 _EFFECTS = 8
 """Effects in the list of what was tried, at most."""
@@ -20,7 +20,7 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
     stuck = dict.fromkeys(f"{size['effect']} ({size['joint']})" for size in diagnosis.sizes if size["at_bound"])
     if stuck:
         lines.append(f"At its bound: {', '.join(stuck)}.")
-    lines += [f"{effect} cannot be told from {_listed(likes)}." for effect, likes in diagnosis.likes.items()]
+    lines += [f"{effect} cannot be told from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in diagnosis.advice]
     names = list(diagnosis.joints)
     for entry in diagnosis.ranking[:_EFFECTS]:
@@ -35,7 +35,3 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
 def size_lines(sizes: Sequence[dict[str, Any]]) -> list[str]:
     """A line for each size: "torque_gain.gain of servo: 0.450 ± 0.002, 0.45 times what was stated"."""
     return [f"{size['effect']}.{size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

@@ -19,7 +19,7 @@ from pace_optim.diagnosis.verdict.proxy_effects import above_floor, near_floor
 from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE
+from pace_optim.single_joint_fits.model import COLUMN
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
@@ -170,7 +170,7 @@ def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list
     names = [p.name for p in effect.parameters]
     curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
     if effect.resists:  # what the base model has of it and what the curve has cannot be told apart everywhere
-        level, viscous = (float(physical[BASE.index(name)]) for name in ("friction", "viscous_friction"))
+        level, viscous = (float(physical[COLUMN[name]]) for name in ("friction", "viscous_friction"))
         slope = viscous if effect.variable == "speed" else 0.0
         total = (max(0.0, level + more) for more in curve["torque"])
         curve["torque"] = [each + slope * x for each, x in zip(total, curve["at"], strict=True)]
@@ -201,7 +201,7 @@ def _shape(effect: type[FreeForm]) -> list[str]:
 def _ranges(problem: TwinProblem, base: Fitted, reached: float) -> dict[str, torch.Tensor]:
     """From where to where each variable goes in what is trained on, (2, n) by its name."""
     path, data = problem.path, problem.dataset
-    effort, load = path.effort(base.physical[:, BASE.index("armature")]), path.load()
+    effort, load = path.effort(base.physical[:, COLUMN["armature"]]), path.load()
     # what holds a load has its size, and pulls the other way
     seen = {"position": path.position, "torque": effort, "speed": path.speed(), "load on the gear": effort - load}
     time = data.session_start + problem.control_dt * torch.arange(len(path.position))[:, None]

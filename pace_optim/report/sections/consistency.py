@@ -5,10 +5,10 @@ from __future__ import annotations
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.text import in_words, pretty_unit
 
 from ..markup import Section, bullets, figure, html, joined
 from ..run_data import RunData
-from ..wording import in_words, pretty_unit
 
 _CONFIDENCE = 1.96
 _COLORS = ("var(--measured)", "var(--simulated)", "var(--third)", "var(--fourth)", "var(--target)")

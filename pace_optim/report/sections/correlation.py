@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.text import capitalised, in_words
 
 from ..markup import Section, bullets, figure, html
 from ..run_data import RunData
-from ..wording import in_words
 
 _STRONG = 0.9
 _MOST_SENTENCES = 8
@@ -67,7 +67,7 @@ def _in_sentences(pairs: list[tuple[float, str, str]], labels: list[str]) -> lis
         said = " and ".join(in_words(name).lower() for name in names)
         range_ = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
         sentences.append(f"{said} of {_listed(found, labels)}: {range_}")
-    return [sentence[:1].upper() + sentence[1:] for sentence in sentences]
+    return [capitalised(sentence) for sentence in sentences]
 
 
 def _listed(found: list[tuple[float, str]], labels: list[str]) -> str:

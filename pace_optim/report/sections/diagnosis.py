@@ -9,12 +9,10 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_optim.report.number_text import three_figures
-from pace_optim.report.sizes import size_text
+from pace_actuators.text import in_words, listed, size_text, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
-from ..wording import in_words
 from .verdict import callout
 
 _SHOWN = 10
@@ -159,17 +157,13 @@ def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup
                 bold(_name(entry)),
                 state,
                 " → ".join(three_figures(factor * entry[f"validation_rmse_{when}"]) for when in ("before", "after")),
-                _few(entry["joints"]),
+                listed(entry["joints"], 3),
                 ", ".join(entry["confounded_with"]) or "–",
                 entry["evidence"],
             ]
         )
     head = ["effect", "", f"validation [{unit}]", "joints", "cannot be told from", "evidence"]
     return table(head, rows, "evidence")
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
 def _joints(content: dict[str, Any]) -> Markup:

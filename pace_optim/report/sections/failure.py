@@ -7,7 +7,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import joint_label, units_for
-from pace_optim.report.number_text import position_unit, three_figures
+from pace_actuators.text import position_unit, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, table
 from ..run_data import RunData

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 from pace_actuators.joint_units import JointType, units_for
-from pace_optim.report.number_text import position_text, position_unit, short_duration
+from pace_actuators.text import position_text, position_unit, short_duration
 
 _PANELS = ("velocity", "since_reversal", "position", "load", "acceleration", "time")
 _MEASURED, _MODEL, _NOISE = "var(--measured)", "var(--simulated)", "var(--muted)"

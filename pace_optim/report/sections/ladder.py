@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType
-from pace_optim.report.number_text import position_unit, three_figures
+from pace_actuators.text import position_unit, three_figures
 
 from ..markup import Section, bold, figure, table
 from ..run_data import RunData

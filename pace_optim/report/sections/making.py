@@ -5,11 +5,11 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
+from pace_actuators.text import count_in_short, duration
 from pace_optim.terminal.cli import command
 
 from ..markup import Section, html
 from ..run_data import RunData
-from ..wording import count_in_short, duration
 
 
 def making(run: RunData) -> Section:

@@ -10,12 +10,11 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_optim.report.number_text import position_text, position_unit, three_figures
+from pace_actuators.text import capitalised, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
-from ..wording import duration, pretty_unit
 from .verdict import verdict_first
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
@@ -143,8 +142,7 @@ def _warnings(result: FitResult) -> Markup:
 
 
 def _sentence(text: str) -> str:
-    text = pretty_unit(text)
-    return text[:1].upper() + text[1:]
+    return capitalised(pretty_unit(text))
 
 
 def _errors_by_joint(result: FitResult) -> Markup:

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.text import in_words, pretty_unit, value_and_error
 
 from ..markup import Section, bold, html, joined, table
 from ..run_data import RunData
-from ..wording import in_words, pretty_unit, value_and_error
 
 _CONFIDENCE = 1.96
 """Standard deviations on either side that hold the value with 95 % probability."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pace_optim.report.number_text import position_unit, three_figures
-from pace_optim.report.trajectory_errors import rms
+from pace_actuators.text import position_unit, three_figures
+from pace_optim.run.tensors import rms
 
 from ..markup import Section, bold, bullets, folded, html, table
 from ..run_data import RecordingData, RunData

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pace_actuators.joint_units import JointType, units_for
-from pace_optim.report.number_text import position_unit, three_figures
-from pace_optim.report.trajectory_errors import held_out_spans, rms
+from pace_actuators.text import position_unit, three_figures
+from pace_optim.run.tensors import held_out_spans, rms
 
 from ..markup import Section, choice, html, json_script
 from ..run_data import RecordingData, RunData

@@ -10,12 +10,11 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pace_optim.report.sizes import size_text
+from pace_actuators.text import in_words, size_text
 from pace_optim.terminal.cli import command
 
 from ..markup import bullets, html, joined
 from ..run_data import RunData
-from ..wording import in_words
 
 _HEADINGS = {
     "effect": ("good", "An effect is missing, and it is known"),

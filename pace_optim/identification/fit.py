@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators.effects import effect_modules
-from pace_envs import load_env_cfg
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.identification.beginning import load_for_fit, logged_control_dt, make_optimizer, make_searcher
+from pace_optim.identification.beginning import load_for_fit, make_optimizer, make_searcher
 from pace_optim.identification.conclusion import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.identification.own_objective import conclude_own
@@ -64,15 +63,12 @@ def fit(
         ValueError: If anything does not fit; nothing has been written then.
     """
     if before is None:
-        env_cfg, place = load_env_cfg(settings.task, settings.control_dt), None
+        problem, place = load_for_fit(settings), None
+        if problem.logged_rate:
+            settings = replace(settings, control_dt=problem.control_dt)
     else:
-        env_cfg, place = before.load_cfg(), before.record.folder
-    problem = load_for_fit(settings, env_cfg, told=before is not None)
-    if before is None and (control_dt := logged_control_dt(settings, problem)) is not None:
-        settings = replace(settings, control_dt=control_dt)
-        env_cfg = load_env_cfg(settings.task, control_dt)
-        problem = load_for_fit(settings, env_cfg, told=True)
-    settings = with_absolute_paths(settings, env_cfg)
+        problem, place = load_for_fit(settings, before.load_cfg(), told=True), before.record.folder
+    settings = with_absolute_paths(settings, problem.plain_cfg)
     own_code = [*effect_modules(problem.effects), *optimizer_modules(settings.optimizer)]
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, own_code, place)
     digests, inputs = recording_digests(settings), input_digests(settings, record)
@@ -171,10 +167,7 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         return
     settings, history, line_generation = start
     settings = replace(settings, device=device)
-    if path is None:
-        env_cfg = load_env_cfg(settings.task, settings.control_dt)
-    else:
-        env_cfg = _reopened(Path(path), settings, task).load_cfg()
+    env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg)
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes)

@@ -1,0 +1,117 @@
+"""How names, numbers and units are written where people read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from pace_actuators.joint_units import JointType, units_for
+
+_POSITIONS = ((1e-4, 1e3, "mrad"), (1e-7, 1e6, "µrad"), (0.0, 1e9, "nrad"))
+_MOST_DECIMALS = 6
+
+
+def listed(names: Iterable[object], most: int = 40) -> str:
+    """Names of a message: "a, b, c"; more than ``most`` are counted: "a, b, c and 2 more"."""
+    texts = [str(name) for name in names]
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more or "none"
+
+
+def conjoined(names: Iterable[object]) -> str:
+    """Names in a sentence: "a, b and c"."""
+    *first, last = [str(name) for name in names]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def plural(count: int, noun: str) -> str:
+    """A count of things: "1 joint", "3 joints"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def capitalised(text: str) -> str:
+    """A text that begins with a capital, the rest as it is."""
+    return text[:1].upper() + text[1:]
+
+
+def in_words(name: str) -> str:
+    """A parameter's name as a heading: ``viscous_friction`` becomes "Viscous friction"."""
+    return capitalised(name.replace("_", " ").replace(".", ": "))
+
+
+def pretty_unit(unit: str) -> str:
+    """``kg m^2`` becomes "kg m²"."""
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
+def three_figures(value: float) -> str:
+    """A number of a table, as 0.120, 12.0 or 120."""
+    return f"{value:#.3g}".rstrip(".")
+
+
+def value_and_error(value: float, std: float | None) -> tuple[str, str]:
+    """A value to the digits that its standard deviation leaves, and the standard deviation to two of its own."""
+    if std is None or std <= 0:
+        return f"{value:.4g}", "–"
+    decimals = 1 - math.floor(math.log10(std))
+    if decimals > _MOST_DECIMALS:
+        return f"{value:.{_MOST_DECIMALS}g}", f"{std:.1e}"
+    decimals = max(0, decimals)
+    return f"{value:.{decimals}f}", f"{std:.{decimals}f}"
+
+
+def position_unit(values: Iterable[float | None], joint_types: Iterable[JointType]) -> tuple[float, str]:
+    """A factor and a unit in which the largest of some positions reads well; mrad or mm unless all are tiny.
+
+    Args:
+        values: Positions or errors of them [rad], of slides [m].
+        joint_types: Of the joints that they belong to.
+    """
+    largest = max((abs(value) for value in values if value is not None and math.isfinite(value)), default=1.0)
+    factor, unit = next((factor, unit) for least, factor, unit in _POSITIONS if largest >= least)
+    return factor, units_for(unit, joint_types)
+
+
+def position_text(value: float | None, joint_types: Iterable[JointType]) -> str:
+    """A position [rad, of slides m] in words: "6.8 mrad", of joints of both types "6.8 mrad or mm"."""
+    if value is None:
+        return "–"
+    factor, unit = position_unit([value], joint_types)
+    return f"{factor * value:.3g} {unit}"
+
+
+def size_text(size: dict[str, Any]) -> str:
+    """A value of ``diagnosis.json`` with its error bar and unit, or as a factor of what was stated."""
+    factor, std = size["factor"], size["std"]
+    value = size["value"] if factor is None else factor
+    text = f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.1g}"
+    if factor is not None:
+        text += " times what was stated"
+    elif size["unit"] != "1":
+        text += f" {size['unit']}"
+    return text + (", at its bound" if size["at_bound"] else "")
+
+
+def count_in_short(count: float) -> str:
+    """A count with a suffix: "3.49 M"."""
+    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if count >= size:
+            return f"{count / size:.3g} {suffix}"
+    return f"{count:.0f}"
+
+
+def short_duration(seconds: float | None) -> str:
+    """A time of milliseconds to seconds in words: "20 ms", "1.17 s"."""
+    seconds = seconds or 0.0
+    return f"{1e3 * seconds:.3g} ms" if seconds < 1 else f"{seconds:.3g} s"
+
+
+def duration(seconds: float) -> str:
+    """A time in words: "2 h 15 min", "3 min 20 s", "8.8 s"."""
+    if seconds < 60:
+        return f"{seconds:.3g} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
