@@ -7,7 +7,7 @@ from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 from test_uncertainty import linear
 
 from pace_envs import set_physics_dt
-from pace_optim.fit import fit
+from pace_optim import fit
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.recording import save_recording
