@@ -27,7 +27,7 @@ class Jump(NamedTuple):
 
 
 class DelayBuffer:
-    """Delays a batched signal (num_envs, num_joints) by a time lag of its own for every environment.
+    """Delays a batched signal (num_envs, num_joints) by a separate time lag for every environment.
 
     With the lag d = i + f (i whole steps, f the fraction), the output at step k is
 

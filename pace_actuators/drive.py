@@ -43,7 +43,7 @@ def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
         return cfg.control_decimation
     if physics_dt is None:
         raise ValueError(
-            f"The drive has a rate of its own (drive_dt = {cfg.drive_dt:g} s), and the time between two calls is not "
+            f"The drive states its rate (drive_dt = {cfg.drive_dt:g} s), and the time between two calls is not "
             "known: set physics_dt [s] in the actuator's configuration."
         )
     if not cfg.drive_dt > physics_dt * (1 - 1e-6):

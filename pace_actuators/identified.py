@@ -198,7 +198,7 @@ class IdentifiedDrives:
         if len(rates) > 1:
             raise ValueError(
                 f"{self.path}: the controllers of {', '.join(joints)} ran at different rates ({', '.join(names)}): "
-                f"{sorted(rates, key=str)}. Make them groups of their own."
+                f"{sorted(rates, key=str)}. Put them into separate groups."
             )
         drive_dt, *flags = rates.pop() if rates else (None,)
         rate = {} if drive_dt is None else {"drive_dt": drive_dt}

@@ -204,7 +204,7 @@ def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:
         inertia = [e.effect_class.name for e in effect_cfgs(motor.effects) if e.effect_class.overrides("armature")]
         if single or inertia:
             raise ValueError(
-                f"{', '.join(single + inertia)} of the drive cannot be told joint by joint from the expressions "
+                f"{', '.join(single + inertia)} of the drive cannot be read joint by joint from the expressions "
                 f"{motor.joint_names_expr!r}. Name the joints one by one in joint_names_expr, in their order."
             )
     if "friction" in known:

@@ -237,7 +237,7 @@ def _verified(entry: Mapping[str, str], where: str, hint: str) -> bytes:
         )
     if not is_trusted(entry["sha256"]):
         raise ValueError(
-            f"{where} names code, {file}, that nobody has named on this machine yet, so it is not imported by itself. "
+            f"{where} names code, {file}, that was never named on this machine, so it is not imported. "
             f"If you trust it, name it: {hint}."
         )
     return content

@@ -94,18 +94,18 @@ def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -
     drives, found = IdentifiedDrives.of(identified), []
     if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
         found.append(
-            f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values make up for what "
-            "the model lacks. Find it with pace diagnose before you train."
+            f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values compensate for "
+            "missing physics. Find it with pace diagnose before you train. [W22]"
         )
     if drives.at_bound:
         found.append(
             f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
-            "and fit again."
+            "and fit again. [W23]"
         )
     if drives.undetermined:
         found.append(
             f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
-            "Record a motion that shows it, or train with --randomize_identified 1."
+            "Record a motion that shows it, or train with --randomize_identified 1. [W24]"
         )
     return found + _other_drives(cfg.scene.robot, drives)
 
@@ -180,7 +180,7 @@ def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]
         for (recorded, value), joints in differs.items():
             found.append(
                 f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({listed(joints, _MOST)}). "
-                "Set the task's to what the robot will run, the recordings' where you do not know."
+                "Set the task's to the robot's, or to the recordings' if you do not know. [W25]"
             )
     return found
 
@@ -199,7 +199,7 @@ def _identified_groups(
         if missing := [joint for joint in own if joint not in identified]:
             raise ValueError(
                 f"{drives.path} has no values for {', '.join(missing)} of the actuator group {group!r}. Put joints "
-                "that were not identified into a group of their own."
+                "that were not identified into a separate group."
             )
         used |= set(identified)
         result[group] = _merged(drive, drives, identified, gains, on_the_rig)

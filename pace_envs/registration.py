@@ -90,8 +90,8 @@ def load_env_cfg(task: str, control_dt: float | None = None) -> Any:
         return cfg_from_model(task) if control_dt is None else cfg_from_model(task, control_dt)
     if control_dt is not None:
         raise ValueError(
-            f"control_dt is {control_dt:g} s, which only a model file (.xml, .urdf) needs to be told: {task} has a "
-            "control step of its own. Leave --control_dt out, or change sim.dt and decimation in its configuration."
+            f"control_dt is {control_dt:g} s, which only a model file (.xml, .urdf) needs: {task} states its "
+            "control step. Omit --control_dt, or change sim.dt and decimation in its configuration."
         )
     module, _, task = task.rpartition(":")
     if task not in registered_tasks():

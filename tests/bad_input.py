@@ -243,7 +243,7 @@ def _judge(trial: Trial, err: str, out: Path, marker: Path, unchanged: bool) -> 
     if "this is a fault of the program" in err or len(re.findall("^error: ", err, re.MULTILINE)) > 1:
         return "message"
     known = Path(trial.target).name in err or Path(trial.target).stem in err
-    if trial.target and not known and "that nobody has named" not in err:  # a task's code, where HOME is not set
+    if trial.target and not known and "that was never named" not in err:  # a task's code, where HOME is not set
         return "unnamed"
     return ""
 

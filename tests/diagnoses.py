@@ -85,7 +85,7 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         },
         "data": ["Measurement noise: 0.1 mrad."],
         "advice": [
-            "These recordings cannot tell stribeck_friction from presliding_friction. Record: "
+            "These recordings cannot separate stribeck_friction from presliding_friction. Record: "
             "scripts/data_collection.py --task Pace-Leg-v0 --excitation ramp"
         ],
         "runs": ["logs/pace/leg/26_01_01_00-00-00"],

@@ -56,7 +56,7 @@ def error_of(problem):
 def test_positions_that_follow_motors_are_told_to_lack_gains(robot):
     problem = load_problem(str(robot), data=[recorded(robot)])
     (said,) = problem.contradictions
-    assert said.startswith("Nobody has stated the gains of pan, tilt: kp = 1.5") and "--unknown stiffness" in said
+    assert said.startswith("The gains of pan, tilt are not stated: kp = 1.5") and "--unknown stiffness" in said
     assert error_of(problem) < 0.3  # a loop moves it, if not the right one
 
 

@@ -146,7 +146,7 @@ def test_a_torque_drive_is_sent_to_its_own_controller(bench):
     problem = replace(problem, dataset=replace(problem.dataset, recordings=like))
     pair = Rivals(names=("payload", "torque_gain"), models=(None, None), joints=[0], hint="Weigh it.")
     (sentence,) = next_experiments(problem, [pair], torch.tensor([1e-4]))
-    assert sentence.endswith("(servo). Record another motion of your own controller, and what it commands. Weigh it.")
+    assert sentence.endswith("(servo). Record another motion of your controller, and log its commands. Weigh it.")
 
 
 def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monkeypatch):

@@ -404,7 +404,7 @@ def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, mo
     monkeypatch.setattr("pace_optim.identification.conclusion._LONG", 0.0)
     settings = FitSettings(task=BENCH, data=[str(save_recording(tmp_path / "r.npz", record()))], log_dir=str(tmp_path))
     fit(settings, ProgressLine(told))
-    first, _, _ = told.getvalue().partition("That was the fit; what follows checks it")
+    first, _, _ = told.getvalue().partition("That was the fit; checks follow")
     assert "error, all joints" in first and "armature" in first
 
 

@@ -164,8 +164,8 @@ def test_parameters_without_influence_and_inseparable_ones_are_named():
     )
     told = fit_warnings(problem, physical(problem), uncertainty, FINE, ["delay/all"])
     assert len(told) == 2
-    assert "do not determine" in told[0] and "delay" in told[0]
-    assert "cannot tell apart encoder bias and friction of servo" in told[1]
+    assert "Delay cannot be identified" in told[0]
+    assert "cannot separate encoder bias and friction of servo" in told[1]
 
 
 @pytest.mark.parametrize(

@@ -132,9 +132,9 @@ def test_warnings_are_one_for_each_kind_and_what_does_not_carry_over_comes_first
     )
     told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"], ["friction/servo"])
     assert "59.0 times" in told[0] and "at its" in told[1]
-    assert told[2].startswith("These recordings do not determine delay:")
-    assert told[3].startswith("These recordings hardly determine friction of servo:")
-    assert sum("cannot tell apart" in text for text in told) == 1
+    assert told[2].startswith("Delay cannot be identified from these recordings:")
+    assert told[3].startswith("Friction of servo is barely identified")
+    assert sum("cannot separate" in text for text in told) == 1
 
 
 def test_exports_and_training_leave_out_what_is_not_determined(tmp_path):

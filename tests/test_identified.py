@@ -105,7 +105,7 @@ def test_a_continuous_controller_stays_one(result):
     changed(result, drive={"implicit": {joint: 1.0 for joint in JOINTS if joint.endswith("KFE")}})
     assert PaceDCMotorCfg.from_result(result, ".*KFE").implicit
     assert not PaceDCMotorCfg.from_result(result, ".*HAA").implicit
-    with pytest.raises(ValueError, match="Make them groups of their own"):
+    with pytest.raises(ValueError, match="Put them into separate groups"):
         PaceDCMotorCfg.from_result(result)
 
 
@@ -223,7 +223,7 @@ def test_another_robot_is_refused(result):
     content = json.loads(result.read_text()) | {"joint_names": list(some), "effects": []}
     content["parameters"] = {**short, "delay": {"all": 1.0}}
     result.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"no values for RF_HAA.*group of their own"):
+    with pytest.raises(ValueError, match=r"no values for RF_HAA.*separate group"):
         use_identified(load_env_cfg(WALK), result)
 
 

@@ -162,7 +162,7 @@ def test_a_folder_that_brings_code_and_its_digest_along_runs_none_of_it(run, tmp
         (forged / name).write_text(json.dumps(content))
     for words in (("fit", "--resume", forged), ("diagnose", forged), ("export", forged, "--format", "json")):
         done = run_script(*words, cwd=forged.parent)
-        assert done.returncode == 2 and "helper.py, that nobody has named on this machine yet" in done.stderr, done
+        assert done.returncode == 2 and "helper.py, that was never named on this machine" in done.stderr, done
     assert not (tmp_path / "executed").exists()
 
 
@@ -171,7 +171,7 @@ def test_code_that_was_named_once_is_known_from_then_on(package, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(package / "state"))
     code = {"trees": package / "trees" / "__init__.py", "trees.leaf": package / "trees" / "leaf.py"}
     record = {name: {"file": str(file), "sha256": digest_of(file.read_bytes())} for name, file in code.items()}
-    with pytest.raises(ValueError, match=r"nobody has named on this machine yet.*--import trees"):
+    with pytest.raises(ValueError, match=r"was never named on this machine.*--import trees"):
         import_recorded("trees.leaf", record, "result.json", "--import trees.leaf")
     import_named("trees.leaf")
     forget()

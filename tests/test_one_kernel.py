@@ -229,6 +229,6 @@ def test_a_compiler_that_never_ends_leaves_the_simulation_without_kernels(monkey
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(host, "_FIRST_S", 0.3)
     begin = time.monotonic()
-    with pytest.warns(UserWarning, match=r"c\+\+ has not ended after 0\.3 s: the simulation goes on without"):
+    with pytest.warns(UserWarning, match=r"c\+\+ has not ended after 0\.3 s: the simulation continues without"):
         assert host_kernels.__wrapped__() is None
     assert time.monotonic() - begin < 5.0

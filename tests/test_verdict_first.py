@@ -74,7 +74,7 @@ def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
     assert lines[2].endswith("times what was stated, at its bound")
     assert lines[3:6] == [
         "At its bound: torque_gain (knee).",
-        "torque_gain cannot be told from payload.",
+        "torque_gain cannot be separated from payload.",
         "- Record more.",
     ]
 
@@ -89,7 +89,7 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
     for page in pages:
         first = page.text.split("Error of each joint")[0]
         assert "An effect is missing, and it is known" in first and "0.45 ± 0.002 times what was stated" in first
-        assert "and 2 more" in first and "torque_gain cannot be told from payload" in first
+        assert "and 2 more" in first and "torque_gain cannot be separated from payload" in first
     html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
 

@@ -8,26 +8,38 @@ from pace_actuators.effects.registry import available_effects, get_effect
 _HEAD = """\
 # Physical effects
 
-What a drive can have beyond the base model of armature, viscous friction, Coulomb friction, encoder bias and delay.
-`scripts/fit.py --effects NAME` identifies an effect beside the base parameters; on some joints only with
-`NAME@JOINTS` (a regular expression), with one value for all joints with `NAME@shared`, for some with
-`NAME@JOINTS@shared`; `@wide` at the end widens its bounds as far as physics allows. At its null value an effect
-vanishes exactly. A parameter without a null value shapes the effect; it matters only where the effect acts.
+Effects extend the base model of armature, viscous friction, Coulomb friction, encoder bias and delay.
+`pace fit --effects NAME` identifies an effect beside the base parameters.
 
-Effects act where the drive's path has them, whatever the order in which they are named: command, measurement,
-controller, drive, friction, transmission; `model` changes the rigid body, `recording` only what the log shows. Within
-the drive the torque that is asked is limited first (`effort_limit`, `torque_limit`), then the current follows
-(`drive_bandwidth`), then torque comes of it (`torque_gain`, `torque_ripple`), and the supply limits what is left
-(`torque_speed_limit`, the torque-speed line). Of `joint_elasticity` and `backlash`, give a joint one: a backlash has an
-elasticity of its own, and a joint with both has one gap with the two springs in series behind it. Friction then acts
-on the motor, other torques on the link.
+| form | meaning |
+|---|---|
+| `NAME` | on all joints, each with its values |
+| `NAME@JOINTS` | on some joints (a regular expression) |
+| `NAME@shared` | one value for all joints |
+| `NAME@JOINTS@shared` | one value for some joints |
+| `…@wide` | bounds as wide as physics allows |
 
-The last six, `torque_over_…` and `friction_over_…`, are curves of any form: straight from knot to knot, at `center +
-reach · knot`, and constant beyond the last. They say what is missing and not why: `scripts/diagnose.py` does not look
-for them, but holds them against the effects that it found, and takes one where none of them explains the error.
+At its null value an effect vanishes exactly. A parameter without a null value shapes the effect, and matters only where
+the effect acts.
 
-This page is made by `python -m pace_actuators.effects > docs/effects.md`. An effect of your own:
-[your_own_effect.md](your_own_effect.md).
+The order of the names does not matter: effects act along the drive's path. The stages are command, measurement,
+controller, drive, friction and transmission. `model` changes the rigid body. `recording` only changes the log.
+
+Within the drive, effects act in this order:
+
+1. The requested torque is limited (`effort_limit`, `torque_limit`).
+2. The current follows (`drive_bandwidth`).
+3. Torque comes from the current (`torque_gain`, `torque_ripple`).
+4. The supply limits the result (`torque_speed_limit`, the torque-speed line).
+
+Give a joint either `joint_elasticity` or `backlash`: a backlash includes an elasticity. A joint with both has one gap,
+and behind it the two springs in series. Friction then acts on the motor, other torques on the link.
+
+The last six, `torque_over_…` and `friction_over_…`, are free-form curves. They are straight from knot to knot, at
+`center + reach · knot`, and constant beyond the last knot. They show what is missing, not why. `pace diagnose` compares
+them with the effects that it found, and takes a curve if no effect explains the error.
+
+`python -m pace_actuators.effects > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
 
 ## Equations
 
@@ -43,31 +55,38 @@ Results call them `<effect>.<parameter>`.
 |---|---|---|---|---|---|
 """
 _LOOKS = """
-## What a person sees, and what separates an effect from its likes
+## What you see, and what separates an effect from similar ones
 
 | effect | seen in the data | separated by recording |
 |---|---|---|
 """
 _TWINS = """
-## Which cannot be told apart
+## Which effects are confounded
 
-With one load, one gain and no absolute reference of the position, these act alike by construction. An error that one of
-them removes, the other removes as well:
+With one load, one gain and no absolute reference of the position, these effects act alike by construction. If one of
+them removes an error, so does the other:
 
-| effect | acts like | what separates them |
+| effect | acts like | separated by |
 |---|---|---|
 """
 _PARTLY = """
-Others are alike in part, the more so the narrower the recording: `com_offset` and the encoder bias (an absolute
-reference separates them), `drive_bandwidth` and `joint_elasticity` (a known added mass), `parallel_spring` and a gain
-or a payload (a wide range of motion), `encoder_scale` and `payload` (a known added mass), `torque_speed_limit` and
-`quadratic_friction` (a large, fast motion), `backlash` and `joint_elasticity` (several amplitudes), and the three
-frictions that do not stick, `presliding_friction`, `creeping_friction` and `soft_friction` (a staircase that holds each
-of its steps longer). Of these give a joint one: each takes Coulomb friction over from the simulator. `soft_friction` is
-no physics of a drive but that of MuJoCo's solver: it is for recordings that were made in MuJoCo.
+Others are similar in part, especially in narrow recordings:
 
-Not to be found by any smooth model, but a quality of the recording: a delay that jitters, dropped commands, coarse
-quantisation. They raise the noise.
+| similar | separated by |
+|---|---|
+| `com_offset` and the encoder bias | an absolute reference |
+| `drive_bandwidth` and `joint_elasticity` | a known added mass |
+| `parallel_spring` and a gain or a payload | a wide range of motion |
+| `encoder_scale` and `payload` | a known added mass |
+| `torque_speed_limit` and `quadratic_friction` | a large, fast motion |
+| `backlash` and `joint_elasticity` | several amplitudes |
+| `presliding_friction`, `creeping_friction` and `soft_friction` | a staircase that holds each step longer |
+
+Give a joint only one of the last three: each replaces the simulator's Coulomb friction. `soft_friction` is not the
+physics of a drive but of MuJoCo's solver. Use it for recordings from MuJoCo.
+
+No smooth model finds a delay that jitters, dropped commands or coarse quantisation. They are qualities of the
+recording and raise the noise.
 """
 
 

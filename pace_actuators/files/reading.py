@@ -84,7 +84,9 @@ def read_tensors(path: str | Path, cure: str) -> Any:
             content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         if "Unsupported" in str(error) or "weights_only" in str(error).lower():
-            reason = "it holds Python objects beside tensors, numbers, text, lists and dicts, or is none of torch.save"
+            reason = (
+                "it holds Python objects beside tensors, numbers, text, lists and dicts, or torch.save did not write it"
+            )
         else:
             reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise ValueError(f"{path} cannot be read ({reason}). {cure}") from None

@@ -130,7 +130,7 @@ def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str,
     if any(int(model.wrap_type[w]) != mujoco.mjtWrap.mjWRAP_JOINT for w in wraps):
         raise ValueError(
             f"The actuator {name} pulls the spatial tendon {label}, whose lever arm changes with the posture: no drive "
-            f"here follows that. Give its joints actuators of their own, or leave the actuator out: see {_REFERENCE}."
+            f"here follows that. Give each joint an actuator, or remove this one: see {_REFERENCE}."
         )
     joints = [int(model.wrap_objid[w]) for w in wraps]
     ratio, rest = 0.0, 0.0

@@ -21,11 +21,11 @@ class Memory:
     """A tensor's memory while operations on it are put off."""
 
     def __init__(self, storage: torch.UntypedStorage, is_own: bool):
-        """Hold it, so that nobody else gets it meanwhile.
+        """Hold the memory, so that it is not reused meanwhile.
 
         Args:
             storage: The memory.
-            is_own: Whether it was taken for a result that was put off: then nobody else can know it.
+            is_own: Whether it belongs to a deferred result, which no other tensor shares.
         """
         self.storage, self.is_own = storage, is_own
         self.written: tuple[int, Mode] | None

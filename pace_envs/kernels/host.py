@@ -157,8 +157,8 @@ class HostKernels:
         if not self._is_stuck:
             self._is_stuck = True
             warnings.warn(
-                f"The compiler {self._command[0]} has not ended after {limit:g} s: the simulation goes on without "
-                "compiled kernels, more slowly. Repair it, or put another one first in PATH.",
+                f"The compiler {self._command[0]} has not ended after {limit:g} s: the simulation continues without "
+                "compiled kernels, more slowly. Repair it, or put another one first in PATH. [W21]",
                 stacklevel=2,
             )
 

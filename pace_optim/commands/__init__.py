@@ -1,6 +1,6 @@
 """The command lines: ``pace VERB …`` is the ``main`` of the module of that name here, and so is ``scripts/VERB.py``.
 
-A verb is imported when it is called, and no other: a file more in this folder is a verb more.
+Only the called verb is imported. A new file in this folder is a new verb.
 """
 
 from __future__ import annotations

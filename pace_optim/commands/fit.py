@@ -56,14 +56,14 @@ def main() -> None:
         nargs="+",
         default=[],
         metavar="FACT",
-        help=f"facts of the drives that nobody knows, to be identified: {', '.join(UNKNOWN_FACTS)}",
+        help=f"unknown facts of the drives, to be identified: {', '.join(UNKNOWN_FACTS)}",
     )
     parser.add_argument(
         "--optimizer",
         default="hybrid",
         metavar="NAME",
-        help=f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell says "
-        "what is minimised",
+        help=f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell() "
+        "adds the scores",
     )
     parser.add_argument(
         "--stop",

@@ -25,7 +25,7 @@ from pace_optim.terminal.options import add_common_options, add_overwrite_option
 def main() -> None:
     """Parse the command line, draw, show or save."""
     parser = make_parser(
-        "Plot a run's trajectories and score: on screen, or as PNG files where there is none.",
+        "Plot a run's trajectories and score: on screen, or as PNG files without a screen.",
         example="scripts/plot_trajectory.py logs/pace/anymal_d/26_01_01_12-00-00 --plot_trajectory --output plots",
     )
     parser.add_argument("run", nargs="?", metavar="RUN", help="the run's folder (default: the newest)")

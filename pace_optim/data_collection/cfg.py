@@ -90,7 +90,7 @@ class CollectionCfg:
         if self.command_only and self.effects:
             raise ValueError("Nothing is simulated with --command_only, so --effect has no use. Leave one out.")
         if self.effect_joints != ".*" and not self.effects:
-            raise ValueError("--effect_joints says where effects are, and there are none. Add --effect NAME.")
+            raise ValueError("--effect_joints needs an effect. Add --effect NAME.")
         if self.command_only and self.output is not None:
             raise ValueError(
                 "Nothing is recorded with --command_only, so --output has no use. Name the file of the commands with "

@@ -55,7 +55,7 @@ def plan_files(cfg: CollectionCfg, sim2real: PaceCfg, names: Sequence[str]) -> l
     ]
     paths = [path for file in files for path in (file.recording, file.command, file.plot) if path]
     if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
-        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each a name of its own.")
+        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each another name.")
     recordings = [path for file in files if file.recording for path in written_files(file.recording)]
     truth = [truth_file(cfg, sim2real)] if cfg.effects else []
     refuse_taken(dict.fromkeys((*paths, *recordings, *truth)), option="--output", overwrite=cfg.overwrite)

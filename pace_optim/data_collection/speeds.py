@@ -44,7 +44,7 @@ def driven_by_speed(env: ManagerBasedRLEnv, cfg: CollectionCfg) -> tuple[str, ..
         raise ValueError(
             f"Nothing would move {listed(loose, 3)}: stiffness and damping are 0, so the drive follows torques, and "
             "motions are made of positions and speeds. State the gains (--stiffness, --damping), or record with a "
-            "controller of your own and log the torques that it commands (des_dof_effort)."
+            "torque controller and log its commands (des_dof_effort)."
         )
     return tuple(names[by_speed].tolist())
 
@@ -64,7 +64,6 @@ def told_speeds(trajectory: Trajectory, by_speed: tuple[str, ...], cfg: Collecti
         )
     if cfg.effects:
         raise ValueError(
-            f"The plant that hides effects is told positions, and {listed(by_speed, 3)} follow speeds. Leave --effect "
-            "out."
+            f"The plant that hides effects follows positions, and {listed(by_speed, 3)} follow speeds. Omit --effect."
         )
     return replace(trajectory, by_speed=by_speed)

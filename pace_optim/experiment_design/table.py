@@ -61,7 +61,7 @@ def _motion(design: Design, j: int) -> str:
 
 
 def _unknown(which: str, uncertainty: Uncertainty) -> list[str]:
-    lines = [f"{which}: the recording cannot tell apart {in_words(group)}." for group in uncertainty.indistinguishable]
+    lines = [f"{which}: the recording cannot separate {in_words(group)}." for group in uncertainty.indistinguishable]
     if uncertainty.no_influence:
         lines.append(f"{which}: no influence: {', '.join(uncertainty.no_influence)}.")
     return lines

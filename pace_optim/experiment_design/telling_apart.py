@@ -94,8 +94,10 @@ def next_experiments(
     cfg = cfg or MenuCfg()
     by_torque = _told(problem) == "torque"
     if not pairs or problem.env_cfg.sim2real.excitation is None or bool(by_torque.any()):
-        own = " Record another motion of your own controller, and what it commands." if bool(by_torque.any()) else ""
-        return [f"These recordings cannot tell {_named(pair, problem)}.{own} {pair.hint}".rstrip() for pair in pairs]
+        own = " Record another motion of your controller, and log its commands." if bool(by_torque.any()) else ""
+        return [
+            f"These recordings cannot separate {_named(pair, problem)}.{own} {pair.hint}".rstrip() for pair in pairs
+        ]
     menus = {joint: list(menu(problem, joint, cfg)) for joint in dict.fromkeys(pair.joints[0] for pair in pairs)}
     recordings = {joint: [choice.recording for choice in choices] for joint, choices in menus.items()}
     apart = distances(problem, pairs, [recordings[pair.joints[0]] for pair in pairs])
@@ -111,7 +113,7 @@ def next_experiments(
         left = [pair for pair in left if pair not in [each.pair for each in best]]
     for pair in left:
         count = sum(each.pair is pair for each in predictions)
-        text = f"These recordings cannot tell {_named(pair, problem)}. Nor would any of {count} others tried."
+        text = f"These recordings cannot separate {_named(pair, problem)}. Nor would any of {count} others tried."
         result.append(f"{text} {pair.hint}".rstrip())
     return result
 
@@ -132,7 +134,7 @@ def _sentence(told: Sequence[Prediction], problem: Problem) -> str:
     apart = _range([1e3 * each.apart for each in told], "{:.2g}")
     times = _range([each.times for each in told], "{:.0f}")
     return (
-        f"These recordings cannot tell {pairs}. {choice.words} would: the motions that they predict differ by {apart} "
+        f"These recordings cannot separate {pairs}. {choice.words} would: the predicted motions differ by {apart} "
         f"{unit}, {times} times the noise. {command('data_collection')} --task {task} {choice.arguments} "
         "--command_only --export_command next.csv"
     )

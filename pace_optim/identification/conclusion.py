@@ -122,9 +122,9 @@ def conclude(
         for check in checks:
             _write(run, record, end)
             end = check(run, end)
-            if check is _told_of_step and run.progress.elapsed > _LONG:
+            if check is _with_step and run.progress.elapsed > _LONG:
                 text = summary(_result(run, record, end))
-                run.progress.tell(*text, "That was the fit; what follows checks it (Ctrl-C keeps it).")
+                run.progress.tell(*text, "That was the fit; checks follow (Ctrl-C keeps the fit).")
     except KeyboardInterrupt:
         if not keep_interrupted:
             raise
@@ -153,6 +153,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
     unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
     rates = end.rates
+    stalled = f"stalled: residual is {end.times or 0.0:,.0f}x the measurement noise"
     return make_result(
         problem,
         end.x,
@@ -165,10 +166,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         generations=run.optimizer.generation if run.optimizer else 0,
         simulated_steps=run.steps + end.consistency.simulated_steps,
         wall_time_s=run.progress.elapsed,
-        stop_reasons=[
-            f"stands still at {end.times:,.0f} times the noise" if end.is_far and reason == "converged" else reason
-            for reason in end.stop_reasons
-        ],
+        stop_reasons=[stalled if end.is_far and reason == "converged" else reason for reason in end.stop_reasons],
         undetermined=end.left_open,
         times_noise=end.times,
         std_means_nothing=end.is_far,
@@ -219,7 +217,7 @@ def _assessor(run: Optimization, problem: Problem) -> Evaluator:
     return run.assessor if problem is run.problem else problem.evaluator()
 
 
-def _told_of_rate(run: Optimization, end: _End) -> _End:
+def _with_loop_rate(run: Optimization, end: _End) -> _End:
     """Add what depends on an assumed loop rate; take another rate where only others fit."""
     if end.problem.assumes_loop_rate:
         run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
@@ -238,8 +236,8 @@ def _told_of_rate(run: Optimization, end: _End) -> _End:
     return replace(end, problem=end.problem.with_drive_dt(rates.chosen)).moved(run, x)
 
 
-def _told_of_step(run: Optimization, end: _End) -> _End:
-    """What of each value comes from the physics step; where it is much of the error, half the step is taken."""
+def _with_step(run: Optimization, end: _End) -> _End:
+    """Add the physics step's part of each error bar; halve the step if it makes much of the error."""
     for _ in range(_HALVINGS):
         end = _with_step_share(run, end)
         if run.settings.physics_dt is not None or not _shows_its_step(end):
@@ -253,7 +251,7 @@ def _told_of_step(run: Optimization, end: _End) -> _End:
 
 
 def _with_step_share(run: Optimization, end: _End) -> _End:
-    run.progress.say("simulating with a finer step, to tell what comes from the step")
+    run.progress.say("simulating with a finer step, to measure the part of the step")
     physical = end.problem.space.to_physical(end.x)
     return replace(end, without_step=change_without_step(end.problem, physical, end.jacobian.residuals))
 
@@ -287,7 +285,7 @@ def _at_prior(run: Optimization, end: _End, cfg: LeastSquaresCfg | None) -> _End
 
 
 def _perhaps_without_delay(run: Optimization, end: _End) -> _End:
-    """A delay that is none is put to none."""
+    """Set an insignificant delay to zero."""
     x = without_delay(end.problem, end.x, end.uncertainty, end.left_open, NEAR)
     return end if x is None else end.moved(run, x, [*end.left_open, DELAY])
 
@@ -304,5 +302,5 @@ def _consistent(run: Optimization, end: _End) -> _End:
     return replace(end, consistency=result)
 
 
-_CHECKS = (_told_of_rate, _told_of_step, _with_prior, _perhaps_without_delay, _consistent)
+_CHECKS = (_with_loop_rate, _with_step, _with_prior, _perhaps_without_delay, _consistent)
 """What is checked of a result, in this order."""

@@ -183,5 +183,5 @@ def _far(times: float | None) -> list[str]:
         return []
     return [
         f"The positions of this minimum are {times:,.0f} times the measurement noise away from the recording: the "
-        "objective is another than the position error. Compare with a fit without --optimizer."
+        "objective differs from the position error. Compare with a fit without --optimizer. [W19]"
     ]

@@ -630,5 +630,5 @@ def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] =
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:
         raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
     for each in found:
-        tell(f"warning: {each.sentence}")
-    return replace(problem, contradictions=(*problem.contradictions, *(each.sentence for each in found)))
+        tell(f"warning: {each.sentence} [W3]")
+    return replace(problem, contradictions=(*problem.contradictions, *(f"{each.sentence} [W3]" for each in found)))

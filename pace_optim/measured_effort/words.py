@@ -74,9 +74,9 @@ def contradiction(
     if unit := _unit_between(value / stated if stated else 0.0):
         text += f", {unit}"
     if holds:
-        text += f": what is {where} is used. Correct {fact}, or fit with --unknown {fact}."
+        text += f": the {where} value is used. Correct {fact}, or fit with --unknown {fact}. [W4]"
     else:
-        text += ": that is used."
+        text += ": the torque's value is used. [W4]"
     return units_for(text, [joint_type])
 
 

@@ -1,4 +1,4 @@
-"""Symbols in the places of tensors, until all is put back."""
+"""Replace tensors by symbols while a step is recorded, and restore them afterwards."""
 
 from __future__ import annotations
 

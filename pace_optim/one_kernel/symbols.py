@@ -78,7 +78,7 @@ class Symbol:
         self._write(self._operations.node(_plain(value)))
 
     def __bool__(self) -> bool:
-        """Nobody knows.
+        """A traced value has no truth value.
 
         Raises:
             NotTraceableError: Always.

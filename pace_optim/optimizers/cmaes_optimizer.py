@@ -272,7 +272,7 @@ class TreeSearch:
 
 
 class CMAESOptimizer(TreeSearch):
-    """Searches by CMA-ES: ask, simulate, tell, evolve, until finished.
+    """Searches by CMA-ES: ``ask``, simulate, ``tell``, ``evolve``, until finished.
 
         while not optimizer.finished():
             optimizer.ask()
@@ -491,7 +491,7 @@ class CMAESOptimizer(TreeSearch):
     def evolve(self) -> None:
         """End the generation: strategies learn from the scores."""
         if self.scores_buffer is None:
-            raise ValueError("There are no scores to learn from. Call update_simulator and tell first.")
+            raise ValueError("There are no scores to learn from. Call update_simulator() and tell() first.")
         self._end_sample()
         per_joint = self._of_all(self._by_joint(self.scores_buffer))
         scores = torch.zeros(self.population_size, len(self.strategies), dtype=torch.float64)

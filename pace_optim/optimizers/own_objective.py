@@ -78,7 +78,7 @@ def _class_of(module: ModuleType, name: str, text: str) -> type[CMAESOptimizer]:
         except TypeError:
             raise ValueError(
                 f"--optimizer {text}: {method}{inspect.signature(getattr(kind, method))} does not take what it is "
-                f"given. Write def {method}(self, {arguments}); the robot is rollout.robot, a parameter of your own a "
+                f"given. Write def {method}(self, {arguments}); the robot is rollout.robot. A custom parameter is a "
                 "Parameter in PaceCfg.extra_parameters."
             ) from None
     return kind

@@ -19,7 +19,7 @@ from pace_optim.recording import Recording
 from pace_optim.recording.commands import acting_loops
 
 _STATE = (
-    "state them beside the log (NAME.json: stiffness, damping), in its column map, or in a configuration of your own "
+    "state them beside the log (NAME.json: stiffness, damping), in its column map, or in your configuration "
     "(pace new-robot)"
 )
 
@@ -73,9 +73,9 @@ def told_of_gains(env: ManagerBasedRLEnv, recordings: Sequence[Recording], unkno
         return []
     kp, kd = (of_joints(env, name)[where][0] for name in ("stiffness", "damping"))
     return [
-        f"Nobody has stated the gains of {listed(names[where], 3)}: kp = {kp:.3g}, kd = {kd:.3g} ({names[where][0]}) "
-        f"are assumed, and every inertia, friction and torque that is found is in proportion to them. If you know the "
-        f"real ones, {_STATE}; else let them be sought: --unknown stiffness damping."
+        f"The gains of {listed(names[where], 3)} are not stated: kp = {kp:.3g}, kd = {kd:.3g} ({names[where][0]}) are "
+        f"assumed. Every inertia, friction and torque of the fit is proportional to them. If you know the real gains, "
+        f"{_STATE}; otherwise identify them: --unknown stiffness damping. [W5]"
     ]
 
 
@@ -153,6 +153,6 @@ def contradicted_limits(
                 own_unit = units_for(unit, joint_types[j : j + 1])
                 notes.append(
                     f"the recording contradicts the stated {words}: {name} reaches {largest:.3g} {own_unit}, {field} "
-                    f"is {stated[j]:.3g} {own_unit}. Correct {field}."
+                    f"is {stated[j]:.3g} {own_unit}. Correct {field}. [W2]"
                 )
     return notes

@@ -27,7 +27,7 @@ class ParameterSpace:
         names = [parameter.name for parameter in parameters]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise ValueError(f"The parameter {repeated[0]!r} is declared twice. Give each a name of its own.")
+            raise ValueError(f"The parameter {repeated[0]!r} is declared twice. Give each another name.")
         self.parameters = tuple(parameters)
         self.slices: dict[str, slice] = {}
         start = 0

@@ -178,7 +178,7 @@ def _each(
         more = f" (The other {len(faults) - 1} files cannot be used either.)" if len(faults) > 1 else ""
         raise ValueError(faults[0] + more)
     for fault in faults:
-        tell(f"warning: set aside (--strict would refuse all): {fault}")
+        tell(f"warning: set aside (--strict would refuse all): {fault} [W20]")
     return result
 
 

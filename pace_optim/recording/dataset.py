@@ -251,7 +251,7 @@ def _speed(recording: Recording) -> np.ndarray:
 def _unknown_start(recording: Recording, known: np.ndarray) -> str:
     joints = listed([name for name, yes in zip(recording.joint_names, known, strict=True) if not yes], 3)
     return (
-        f"It begins in motion, and its first samples do not tell the speed of {joints}: the first {_SETTLING:g} s are "
+        f"It begins in motion, and its first samples do not show the speed of {joints}: the first {_SETTLING:g} s are "
         "left out. Begin at rest, or record speeds (dof_vel)."
     )
 

@@ -116,7 +116,7 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
     if limits.shape != (len(names), 2) or np.any(np.isnan(limits)) or np.any(limits[:, 0] > limits[:, 1]):
         raise ValueError(
             f"joint_pos_limits has shape {limits.shape}; expected ({len(names)}, 2), lower and upper limit "
-            "[rad] of each joint in joint_order, infinite where there is none. Correct the argument."
+            "[rad] of each joint in joint_order, infinite without a limit. Correct the argument."
         )
     excess = {
         key: np.maximum(limits[:, 0] - values.min(axis=0), values.max(axis=0) - limits[:, 1])

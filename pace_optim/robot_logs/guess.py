@@ -287,8 +287,8 @@ def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -
         result[name] = {s: c for s, c in by.items() if s not in plan}
     if left:
         notes.append(
-            f"{listed(sorted(left))}: taken to be a plan that the drives are not told; map it as des_dof_vel or "
-            "des_dof_effort if they are."
+            f"{listed(sorted(left))}: taken to be a plan that the drives do not receive. If they do, map it as "
+            "des_dof_vel or des_dof_effort."
         )
     return result
 

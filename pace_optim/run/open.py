@@ -131,7 +131,7 @@ def open_problem(
     columns: str | None = None,
     strict: bool = False,
 ) -> Problem:
-    """The problem of a run of any robot; :meth:`Run.open` and :meth:`Run.problem` tell the arguments."""
+    """The problem of a run of any robot; :meth:`Run.open` and :meth:`Run.problem` have the arguments."""
     return Run.open(run, task).problem(
         data=data, physics_dt=physics_dt, effects=effects, columns=columns, strict=strict
     )

@@ -90,7 +90,7 @@ class FitResult(DriveResult):
         named = [*self.at_bound, *self.no_influence, *self.undetermined]
         named += [*(label for group in self.indistinguishable for label in group)]
         if foreign := [label for label in named if label not in labels]:
-            refuse(source, f"{foreign[0]!r} is none of its parameters", CURE)
+            refuse(source, f"{foreign[0]!r} is not one of its parameters", CURE)
 
     def save(self, path: Path) -> None:
         """Write the file atomically."""

@@ -213,7 +213,7 @@ class JointModel:
         return has & ((self.lower[:, columns] < least) | (self.upper[:, columns] > most)).any(dim=1)
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
-        """The same with an effect's structural parameter held where it is: a choice between things is no way to walk.
+        """Fix the discrete parameter of an effect: it cannot be optimized by gradients.
 
         Args:
             effect: The effect.

@@ -115,7 +115,7 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--columns",
         metavar="MAP",
-        help="column map of logs (.toml: joints, units, signs, gear ratios); without it, it is guessed and told",
+        help="column map of logs (.toml: joints, units, signs, gear ratios); guessed and printed without it",
     )
     parser.add_argument(
         "--strict", action="store_true", help="refuse all recordings where one cannot be used (default: set it aside)"

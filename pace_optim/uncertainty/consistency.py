@@ -143,8 +143,8 @@ def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.nda
                 text if key == GLOBAL else f"{key} {text}"
             )
     return [
-        f"{name.replace('_', ' ')} [{unit}] is another in {recording} than in the other recordings: "
-        f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}."
+        f"{name.replace('_', ' ')} [{unit}] differs between {recording} and the other recordings: "
+        f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}. [W17]"
         for (name, unit, recording), places in found.items()
     ]
 
@@ -210,7 +210,7 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
             sentences.append(
                 f"{name} behaves as if its {field_name} were {abs(value):.0%} {direction} than stated "
                 f"({nominal * (1 + value):.3g} instead of {nominal:.3g}, ± {abs(nominal) * error:.1g}): check the "
-                f"{field_name} that was in force."
+                f"{field_name} that was in force. [W18]"
             )
     return sentences, steps
 

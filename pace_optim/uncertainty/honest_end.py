@@ -12,7 +12,7 @@ from pace_optim.recording.noise import noise_floor
 from pace_optim.terminal.cli import command
 
 FAR_ABOVE_NOISE = 10.0
-"""An error of this many times the noise is no residual of noise: its error bars say nothing of the values' truth."""
+"""Above this multiple of the noise the residual is not noise, and the error bars mean nothing."""
 
 
 def times_noise(problem: Problem, rmse: float | None) -> float | None:
@@ -38,7 +38,7 @@ def noise_score(problem: Problem) -> float:
 
 
 def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Sequence[JointType] = ()) -> list[str]:
-    """What to know of a fit that ended far above the noise, and what to do; nothing where it did not.
+    """A warning with a cure if a fit ended far above the noise, else nothing.
 
     Args:
         times: Its error as a multiple of the noise.
@@ -48,10 +48,10 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
-    search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches from everywhere."
+    search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches all bounds."
     unit = units_for("mrad", joint_types)
     return [
         f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: physics is missing, a fact "
-        f"of the drive is wrong, or the fit is in a wrong valley, and the error bars mean nothing.{search} "
-        f"{command('diagnose')} looks for what is missing."
+        f"of the drive is wrong, or the fit is in a local minimum. The error bars mean nothing.{search} "
+        f"{command('diagnose')} looks for the missing physics. [W1]"
     ]

@@ -91,20 +91,20 @@ class LoopRates:
         }
 
     def sentences(self, space: ParameterSpace, known: np.ndarray) -> list[str]:
-        """What is to be told of the rate.
+        """The warning about the rate.
 
         Args:
             space: The parameters.
             known: Which of them have an error bar, (size,) bool.
         """
         slow, fast = self.chosen, self.allowed[-1]
-        begin = "The rate of the drives' loops is not stated (--drive_dt). "
+        begin = "The loop rate of the drives is not stated (--drive_dt). "
         if len(self.allowed) == 1:
-            begin += f"These recordings favour {_rate(slow)}; the error bars hold the others. "
+            begin += f"These recordings favour {_rate(slow)}; the error bars include the others. "
         elif slow != self.assumed:
             begin += f"These recordings allow {_rate(self.allowed[0])} to {_rate(fast)}; {_rate(slow)} is used. "
         if fast == slow:
-            return [begin.strip()]
+            return [f"{begin}[W15]"]
         change = self.value_at(fast) - self.value_at(slow)
         size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(slow)), 1e-12), 0.0)
         shown = [
@@ -113,8 +113,8 @@ class LoopRates:
             for i in np.argsort(-size)[:_NAMED].tolist()
         ]
         return [
-            f"{begin}These recordings do not tell {_rate(slow)} from {_rate(fast)}: {', '.join(shown)}. The error bars "
-            "hold the difference; a stated rate takes it out."
+            f"{begin}These recordings cannot separate {_rate(slow)} and {_rate(fast)}: {', '.join(shown)}. The error "
+            "bars include the difference; a stated rate removes it. [W15]"
         ]
 
 

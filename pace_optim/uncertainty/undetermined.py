@@ -22,7 +22,7 @@ from pace_optim.uncertainty.honest_end import noise_score
 from pace_optim.uncertainty.uncertainty import HARDLY_KNOWN, SURE, Uncertainty
 
 _NEAR = 0.05
-"""So near to a whole number of control steps a delay is one."""
+"""A delay this near to a whole number of control steps counts as whole."""
 _SURE = 3.0
 """Standard deviations."""
 
@@ -48,9 +48,9 @@ def whole_delay(problem: Problem, delay: float, std: float | None) -> list[str]:
         return []
     step = 1e3 * problem.control_dt
     return [
-        f"The delay is a whole number of control steps. A drive that takes commands over only when its loop "
-        f"runs, every {step:g} ms, acts so late for every delay above {(round(delay) - 1) * step:g} and up to "
-        f"{round(delay) * step:g} ms of commands that are sent in time with it."
+        f"The delay is exactly {round(delay)} control step{'s' * (round(delay) > 1)}. A drive that samples commands "
+        f"every {step:g} ms shows the same motion for any delay above {(round(delay) - 1) * step:g} and up to "
+        f"{round(delay) * step:g} ms. [W16]"
     ]
 
 
@@ -65,9 +65,9 @@ BIAS = "encoder_bias"
 def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, far: bool = False) -> list[str]:
     """Labels of parameters without influence, and of those whose error bar is as wide as their bounds or value.
 
-    As wide as the value: an inertia or a friction that is told neither from none nor from its prior. A fact that the
-    user declares unknown is open too where others can make up for it: what is stated then holds. So is an encoder bias
-    that others make up for exactly, as the phase of a ripple where gravity does not load the joint: a choice of origin.
+    As wide as the value: an inertia or a friction that differs significantly neither from zero nor from its prior. A
+    fact that the user declares unknown is open too if other parameters compensate for it; the stated value then holds.
+    An encoder bias is open if others compensate for it exactly, such as the phase of a ripple on an unloaded joint.
 
     Args:
         problem: What was fitted.
@@ -146,10 +146,10 @@ def held_at_prior(
 def without_delay(
     problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, held: Sequence[str], cfg: LeastSquaresCfg
 ) -> torch.Tensor | None:
-    """A vector without a delay, the rest fitted again, where none is as good; else ``None``.
+    """A vector without a delay, the rest fitted again, if zero delay is as good; else ``None``.
 
-    A delay cannot be below 0. One that is told from 0 neither by its error bar nor by the error takes damping and
-    inertia along where a drive's gains are large: kd of delay is inertia, kp of it viscous friction.
+    A delay cannot be below 0. An insignificant one biases damping and inertia where a drive's gains are large: kd times
+    the delay is inertia, kp times it viscous friction.
 
     Args:
         problem: What was fitted.

@@ -18,11 +18,11 @@ from pace_optim.uncertainty.uncertainty import Uncertainty
 
 _OVERFIT_RATIO = 1.5
 _NAMED = 3
-_ROUGH = 0.05
-"""Part of the error that is worth a word if the simulation's own noise makes it."""
 """Joints that a sentence names, at most."""
+_ROUGH = 0.05
+"""Part of the error from the simulation's own noise above which a warning is given."""
 _NOTHING = 1e-6
-"""Errors below this are nothing to speak of [rad]."""
+"""Errors below this are negligible [rad]."""
 _OF_THE_STEP = (0.3, 5.0)
 """The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
 recording comes from a simulation with this very step."""
@@ -64,8 +64,8 @@ def fit_warnings(
 def _undetermined(labels: Sequence[str]) -> list[str]:
     """One sentence for each parameter that the recordings leave open on some joints."""
     return [
-        f"These recordings do not determine {name.replace('_', ' ')}{_of(keys)}: no influence, or an error bar as wide "
-        "as the bounds, or as the value itself. It keeps its prior, and exports leave it out."
+        f"{_first(name)}{_of(keys)} cannot be identified from these recordings: it has no influence, or its error bar "
+        "is as large as its bounds or its value. The prior is kept, and exports omit it. [W10]"
         for name, keys in _by_parameter(labels).items()
     ]
 
@@ -73,24 +73,30 @@ def _undetermined(labels: Sequence[str]) -> list[str]:
 def _unsure(labels: Sequence[str]) -> list[str]:
     """The same for those whose error bar leaves open what the error does not, with this physics step."""
     return [
-        f"These recordings hardly determine {name.replace('_', ' ')}{_of(keys)}: an error bar as wide as the value "
-        "itself or as the bounds, or others can make up for it. It keeps the value that fits best with this physics "
-        "step."
+        f"{_first(name)}{_of(keys)} is barely identified by these recordings: its error bar is as large as its value "
+        "or its bounds, or other parameters compensate for it. The value that fits best with this physics step is "
+        "kept. [W11]"
         for name, keys in _by_parameter(labels).items()
     ]
 
 
+def _first(name: str) -> str:
+    """A parameter's name in words, as a sentence begins with it."""
+    words = name.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
 def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
-    """One sentence for each kind of parameters that cannot be told apart, with the joints."""
+    """One sentence for each kind of confounded parameters, with the joints."""
     kinds: dict[tuple[str, ...], list[str]] = {}
     for group in groups:
         keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
     return [
-        f"The recording cannot tell apart "
+        f"The recordings cannot separate "
         f"{conjoined([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
-        ": move more, or in other poses."
+        ": move more, or in other poses. [W12]"
         for kind, keys in kinds.items()
     ]
 
@@ -122,8 +128,8 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequ
         return []
     unit = units_for("mrad", joint_types)
     return [
-        f"The error on data kept for validation ({1e3 * validation:.3g} {unit}) is {validation / train:.1f} times "
-        f"that on the training data ({1e3 * train:.3g} {unit}): the fit does not carry over."
+        f"The validation error ({1e3 * validation:.3g} {unit}) is {validation / train:.1f} times the training error "
+        f"({1e3 * train:.3g} {unit}): the fit does not carry over. Use more recordings, at other gains and speeds. [W6]"
     ]
 
 
@@ -139,19 +145,20 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
     if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [
-        f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between; "
-        "with a delay of 0 they still come too late. If the drive got more of them than were logged, this log cannot "
-        "tell its parameters: log every command, on its own clock (des_time)."
+        f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between. "
+        "Even with a delay of 0 they come too late. The drive probably received more commands than were logged: log "
+        "every command, with its instant (des_time). [W7]"
     ]
 
 
 def rough_motion(noise: float, score: float) -> list[str]:
-    """Whether the simulation's own noise [rad] is a part of the error (score [rad²]) that is worth a word."""
+    """Whether the simulation's own noise [rad] is a notable part of the error (score [rad²])."""
     if noise < _ROUGH * score**0.5:
         return []
     return [
         "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
-        f"{100 * noise / score**0.5:.0f} % of the error. Derivatives use larger steps; error bars are less accurate."
+        f"{100 * noise / score**0.5:.0f} % of the error. Derivatives use larger steps; error bars are less accurate. "
+        "[W14]"
     ]
 
 
@@ -172,7 +179,7 @@ def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: fl
     return [
         f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} {unit}, "
         f"and the error is {1e3 * left:.3g} {unit}: part of it may come from the step. Fit with "
-        f"--physics_dt {problem.physics_dt / 2:.12g}."
+        f"--physics_dt {problem.physics_dt / 2:.12g}. [W13]"
     ]
 
 
@@ -189,7 +196,7 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
     return [
         f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.unit_of(name, keys[0])})"
         + _of(keys).replace(" of ", " on ", 1)
-        + ": widen the bound, or physics is missing that this parameter stands in for."
+        + ": widen the bound, or find the missing physics that this parameter stands in for. [W9]"
         for (name, side, bound), keys in places.items()
     ]
 
@@ -253,5 +260,5 @@ def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
     return [
         f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of the control loop of "
         f"{conjoined(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
-        "--delay_mode command."
+        "--delay_mode command. [W8]"
     ]

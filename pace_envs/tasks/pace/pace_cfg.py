@@ -190,8 +190,8 @@ def _of_pace(bounds: Any, joints: int) -> dict[str, torch.Tensor]:
     if tuple(rows.shape) != (sum(counts), 2):
         raise ValueError(
             f"bounds_params has shape {tuple(rows.shape)}, expected {(sum(counts), 2)}: four parameters "
-            f"for each of the {joints} joints in joint_order, then the delay. Declare a parameter "
-            "of your own in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
+            f"for each of the {joints} joints in joint_order, then the delay. Declare another parameter "
+            "in extra_parameters=(Parameter(name=…, unit=…, keys=joint_order, lower=…, upper=…, "
             "apply=function(env, values)),)."
         )
     return dict(zip(BASE_PARAMETERS, rows.split(counts), strict=True))

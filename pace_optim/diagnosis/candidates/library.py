@@ -25,8 +25,8 @@ def candidate_effects(
     curves = [name for name, effect in zip(extra, own, strict=True) if effect.free_form]
     if curves:
         raise ValueError(
-            f"{curves[0]} is a curve of any form: a diagnosis holds it against the effects that it finds without being "
-            f"told to. Leave it out, or fit it: scripts/fit.py --effects {shlex.quote(curves[0])}."
+            f"{curves[0]} is a free-form curve, which every diagnosis compares with its effects. "
+            f"Omit it, or fit it: scripts/fit.py --effects {shlex.quote(curves[0])}."
         )
     every = [] if only else [get_effect(name) for name in available_effects()]
     every = [effect for effect in every if switched_off or not effect.acts_while_off]

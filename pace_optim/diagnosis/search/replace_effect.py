@@ -31,7 +31,7 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
     exchanges = _exchanges(now, rounds, errors.mse.sqrt() > cfg.next_effect * search.at_floor, cfg)
     if not exchanges:
         return branch
-    search.say("trying others in place of what was found")
+    search.say("trying replacements for the found effects")
     joints = {effect: list(own) for effect, own in exchanges.items()}
     every = sorted({j for own in joints.values() for j in own})
     starts = [_start(now, rounds, effect, own) for effect, own in exchanges.items()]

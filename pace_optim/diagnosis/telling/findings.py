@@ -124,7 +124,7 @@ def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     ways = []
     if not math.isclose(run.physics_dt, problem.physics_dt):
         ways.append(f"the physics step is {1e3 * problem.physics_dt:g} instead of {1e3 * run.physics_dt:g} ms")
-    ways.append("each joint is simulated alone with a delay of its own, in blocks of up to one second")
+    ways.append("each joint is simulated alone with a separate delay, in blocks of up to one second")
     unit = units_for("mrad", problem.joint_types)
     return [
         f"The run's own validation error of the base model is {1e3 * own:.3g} {unit}, here it is "

@@ -20,7 +20,7 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
     stuck = dict.fromkeys(f"{size['effect']} ({size['joint']})" for size in diagnosis.sizes if size["at_bound"])
     if stuck:
         lines.append(f"At its bound: {', '.join(stuck)}.")
-    lines += [f"{effect} cannot be told from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
+    lines += [f"{effect} cannot be separated from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in diagnosis.advice]
     names = list(diagnosis.joints)
     for entry in diagnosis.ranking[:_EFFECTS]:

@@ -24,9 +24,7 @@ def correlation(run: RunData) -> Section | None:
     if len(words) > _MOST_SENTENCES:
         words = [*words[:_MOST_SENTENCES], f"and {len(words) - _MOST_SENTENCES} more"]
     said = (
-        html(
-            "<p>Beyond ±{{ strong }}, so that the recording hardly tells one from the other:</p>", strong=f"{_STRONG:g}"
-        )
+        html("<p>Beyond ±{{ strong }}, so the recording hardly separates them:</p>", strong=f"{_STRONG:g}")
         + bullets(words)
         if words
         else html("<p>No pair is beyond ±{{ strong }}.</p>", strong=f"{_STRONG:g}")

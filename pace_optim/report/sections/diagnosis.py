@@ -71,7 +71,7 @@ def _sizes(content: dict[str, Any]) -> Markup:
         ]
         for size in sizes
     ]
-    head = ["effect", "parameter", "joint", "size ± standard deviation", "cannot be told from"]
+    head = ["effect", "parameter", "joint", "size ± standard deviation", "cannot be separated from"]
     return _titled("How large it is", table(head, rows))
 
 
@@ -162,7 +162,7 @@ def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup
                 entry["evidence"],
             ]
         )
-    head = ["effect", "", f"validation [{unit}]", "joints", "cannot be told from", "evidence"]
+    head = ["effect", "", f"validation [{unit}]", "joints", "cannot be separated from", "evidence"]
     return table(head, rows, "evidence")
 
 

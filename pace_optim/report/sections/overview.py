@@ -129,7 +129,7 @@ def _figures(result: FitResult) -> Markup:
 def _warnings(result: FitResult) -> Markup:
     count = len(result.warnings)
     if not count:
-        text = "No parameter is at a bound, without influence, or impossible to tell from another."
+        text = "No parameter is at a bound, without influence, or confounded with another."
         return html('<div class="callout good"><h3>No warnings</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
     sentences = [_sentence(text) for text in result.warnings]

@@ -171,5 +171,5 @@ def _flags(run: RunData, label: str, value: float) -> Markup:
     for group in result.indistinguishable:
         if label in group:
             others = [in_words(other.split("/")[0]).lower() for other in group if other != label]
-            flags.append("cannot be told from " + " and ".join(dict.fromkeys(others)))
+            flags.append("cannot be separated from " + " and ".join(dict.fromkeys(others)))
     return html('{% for flag in flags %}<span class="flag">{{ flag }}</span>{% endfor %}', flags=flags)

@@ -19,7 +19,7 @@ from ..run_data import RunData
 _HEADINGS = {
     "effect": ("good", "An effect is missing, and it is known"),
     "nothing_missing": ("good", "Nothing is missing"),
-    "unknown": ("bad", "Something is missing, and it is none of the known effects"),
+    "unknown": ("bad", "Something is missing, and no known effect explains it"),
 }
 _PARTLY = 0.8
 """Effects that explain less than this part of the error above the floor are not all that is missing."""
@@ -41,7 +41,9 @@ def _in_short(run: RunData) -> Markup:
     said = [f"{size['effect']} {size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes[:_SHOWN]]
     if len(sizes) > _SHOWN:
         said.append(f"and {len(sizes) - _SHOWN} more")
-    said += [f"{effect} cannot be told from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()]
+    said += [
+        f"{effect} cannot be separated from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()
+    ]
     link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
     more = [*([bullets(said, "notes")] if said else []), _refit_link(run, content), link]
     return callout(content, run.result.effects, joined(more))
@@ -52,7 +54,7 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
     if content.get("free_form"):
-        part_known = "only a part of it is known" if content["added"] else "it is none of the known effects"
+        part_known = "only a part of it is known" if content["added"] else "no known effect explains it"
         css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
     elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
