@@ -1,4 +1,4 @@
-"""Pages of the site that lie elsewhere, or are made: README, benchmarks, reference, one page for each effect.
+"""Pages of the site that lie elsewhere, or are made: README, benchmarks, commands, reference, a page for each effect.
 
 MkDocs calls :func:`on_files` and :func:`on_page_markdown` (mkdocs.yml, ``hooks``).
 """
@@ -6,9 +6,15 @@ MkDocs calls :func:`on_files` and :func:`on_page_markdown` (mkdocs.yml, ``hooks`
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
+import os
 import posixpath
 import re
+import sys
+from importlib import import_module
 from pathlib import Path
+from unittest import mock
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
@@ -17,6 +23,7 @@ from mkdocs.structure.pages import Page
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.pages import effect_page
+from pace_optim.commands import verbs
 
 ROOT = Path(__file__).parents[2]
 ELSEWHERE = {"README.md": "index.md"}
@@ -31,7 +38,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path in [*ROOT.glob("*.md"), *(ROOT / "benchmarks").glob("*.md")]:
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, ELSEWHERE.get(name, name), content=path.read_text("utf-8")))
-    for name, text in {**effect_pages(), "reference.md": reference()}.items():
+    for name, text in {**effect_pages(), "commands.md": commands(), "reference.md": reference()}.items():
         made = File.generated(config, name, content=text)
         if name.startswith("effects/") and name != "effects/index.md":
             made.inclusion = InclusionLevel.NOT_IN_NAV  # the gallery leads there
@@ -86,6 +93,27 @@ def _card(effect: type[Effect]) -> str:
         f"\n## {effect.name}\n\n{seen} [Equation and parameters]({effect.name}.md)\n"
         f"\n![Error that {effect.name} leaves](../images/effects/{effect.name}.png)\n"
     )
+
+
+def commands() -> str:
+    """The commands of ``pace``, as ``--help`` prints them."""
+    names = {module: {"import_log": "import"}.get(module, module).replace("_", "-") for module in verbs()}
+    text = ["# Command line\n\n`pace VERB --help` prints the same.\n\n| command | |\n|---|---|\n"]
+    text += [f"| [`pace {name}`](#pace-{name}) | {verbs()[module]} |\n" for module, name in names.items()]
+    for module, name in names.items():
+        text.append(f"\n## pace {name}\n\n```text\n{_help(module, name).strip()}\n```\n")
+    return "".join(text)
+
+
+def _help(module: str, name: str) -> str:
+    main, out = import_module(f"pace_optim.commands.{module}").main, io.StringIO()
+    words, width = (
+        mock.patch.object(sys, "argv", [f"pace {name}", "--help"]),
+        mock.patch.dict(os.environ, COLUMNS="100"),
+    )
+    with words, width, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        main()
+    return out.getvalue()
 
 
 def reference() -> str:
