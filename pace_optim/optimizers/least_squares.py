@@ -99,6 +99,8 @@ class Descent(DescentState):
     """JᵀJ where it was looked last, (size, size)."""
     gradient: torch.Tensor | None = None
     """Jᵀr at x, (size,); ``None``: look around first."""
+    jacobian: Jacobian | None = None
+    """J at x where it is at hand, for the next iteration alone; no part of a checkpoint."""
 
     @classmethod
     def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
@@ -127,7 +129,7 @@ class Descent(DescentState):
     ) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
         """H and g at x; where they are not known, they, the noise and J are taken."""
         if self.hessian is not None and self.gradient is not None:
-            return self.hessian, self.gradient, None
+            return self.hessian, self.gradient, self.jacobian
         around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
         residuals = evaluator.residuals(evaluator.space.to_physical(vectors), where)
@@ -193,6 +195,7 @@ def _iterate(
     """Look around if x has moved, try steps, take the best, and say when it is time to stop."""
     blind = descent.hessian is None
     hessian, gradient, jacobian = descent.look(evaluator, colouring, where)
+    descent.jacobian = None
     if not descent.scores:
         descent.stop_reason = "diverged at its start"
         return

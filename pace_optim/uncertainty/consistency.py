@@ -113,7 +113,7 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
     colouring = colour(problem.space, problem.trees, problem.joint_names)
     start = Descent(x=x.clamp(-1.0, 1.0).clone())
     if there is not None:
-        start.hessian, start.gradient = there.normal_equations()
+        start.jacobian, (start.hessian, start.gradient) = there, there.normal_equations()
         start.scores = [float(there.residuals.score[0])]
     cfg = replace(_REFINE, noise_score=noise_score(problem))
     best = least_squares(evaluator, colouring, [start], cfg)[0]
