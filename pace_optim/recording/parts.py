@@ -86,6 +86,8 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
         return [recording]
     number = recording.num_samples // length
     speed = np.diff(recording.dof_pos, axis=0, prepend=recording.dof_pos[:1]) / dt
+    if recording.free is not None:  # what joints do where the ground holds them says nothing
+        speed = speed * recording.free[recording.sample_steps]
     energy = np.square(speed[: number * length]).reshape(number, length, -1).mean(axis=1)
     energy /= energy.max(axis=0) + 1e-300
     chosen: list[int] = []
@@ -111,7 +113,7 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
     }
     commands: dict[str, Any] = {
         key: value[grid]
-        for key in ("command", "command_vel", "command_effort", "command_torque_enable")
+        for key in ("command", "command_vel", "command_effort", "command_torque_enable", "frame", "free")
         if (value := getattr(recording, key)) is not None
     }
     own: dict[str, Any] = {  # which joints have which commands is read from these
