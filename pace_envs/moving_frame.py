@@ -30,6 +30,19 @@ class FrameState:
     subtree_com: np.ndarray
     qvel: np.ndarray
 
+    @classmethod
+    def empty(cls, model: mujoco.MjModel, count: int) -> FrameState:
+        """Room for that many states of a model."""
+        shapes = {"cdof": (model.nv, 6), "cdof_dot": (model.nv, 6), "cvel": (model.nbody, 6),
+                  "cinert": (model.nbody, 10), "subtree_com": (model.nbody, 3), "qvel": (model.nv,)}  # fmt: skip
+        return cls(**{name: np.empty((count, *shapes[name])) for name in FIELDS})
+
+    def keep(self, row: int, data: mujoco.MjData) -> None:
+        """Take over a state whose positions and velocities have been computed."""
+        for name in FIELDS:
+            own = getattr(self, name)[row]
+            own[...] = np.reshape(getattr(data, name), own.shape)
+
 
 def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Forces of the motion on each degree of freedom in a moving frame, with the sign of MuJoCo's ``qfrc_bias``.

@@ -43,7 +43,23 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
         sample = np.searchsorted(at, steps, side="right") - 1
         for foot, joints in enumerate(joints_of_feet(env, recording.feet, recording.label)):
             free[:, joints] &= free_phases(standing[:, foot], dt)[sample][:, None]
-    return replace(recording, frame=frame, frame_point=point, free=free)
+    notes = (*recording.notes, _swings(recording, standing, free, env))
+    return replace(recording, frame=frame, frame_point=point, free=free, notes=notes)
+
+
+def _swings(recording: Recording, standing: np.ndarray | None, free: np.ndarray, env: ManagerBasedEnv) -> str:
+    """How much of the recording counts."""
+    if standing is None:
+        return (
+            "The base moves as the IMU shows, and nothing says when feet touch the ground: all of the recording "
+            "counts. A robot that walks needs contact or foot_force."
+        )
+    said = []
+    for foot, joints in zip(recording.feet, joints_of_feet(env, recording.feet, recording.label), strict=True):
+        own = free[:, joints[0]]
+        phases = int((np.diff(own.astype(int), prepend=0) == 1).sum())
+        said.append(f"{foot} {100 * own.mean():.0f} % of the time in {phases} swings")
+    return f"The base moves as the IMU shows, and a leg counts while its foot is in the air: {listed(said)}."
 
 
 def imu_pose(model: mujoco.MjModel, imu: ImuPose, label: str) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,8 @@ from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, meas
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
 
+_TURN = 4.0
+"""Of a robot that walks, so much time is trained and validated on in turns [s]."""
 _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
 _SHORTEST = 3.0
@@ -159,8 +161,10 @@ class Dataset:
                 continue
             whole = validation_only or not parts["validation"]
             share = float(getattr(self, which)[:, r].sum()) / float(self.sampled[:, r].sum())
-            place = "first" if which == "train" else "last"
-            result.append(recording.name if whole else f"{recording.name} ({place} {100 * share:.0f} %)")
+            place = "first " if which == "train" else "last "
+            in_turns = recording.frame is not None
+            part = f"{'' if in_turns else place}{100 * share:.0f} %{' in turns' if in_turns else ''}"
+            result.append(recording.name if whole else f"{recording.name} ({part})")
         return result
 
 
@@ -172,7 +176,8 @@ def make_dataset(
     Args:
         recordings: To train on, conformed to the same joints and control step.
         validation: Never trained on. If there are none, the last part in time of each recording is kept for it.
-        train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing.
+        train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
+            a base that moves, it is that part of every 4 s.
 
     Raises:
         ValueError: If there is no recording.
@@ -202,8 +207,10 @@ def make_dataset(
             _hold(enable[:, r], recording.command_torque_enable)
         if r < len(recordings):
             whole = bool(validation) or train_fraction >= 1
-            end = recording.num_samples if whole else validation_start(recording, train_fraction)
-            train[at[:end], r] = True
+            trained = np.arange(recording.num_samples) < validation_start(recording, min(train_fraction, 0.99))
+            if recording.frame is not None:  # what a robot does changes as it walks
+                trained = (recording.time - recording.time[0]) % _TURN < train_fraction * _TURN
+            train[at[torch.from_numpy(trained | whole)], r] = True
         speed, known = start_speed(recording)
         start_vel[r] = torch.as_tensor(speed)
         if not known.all() and recording.duration > _SHORTEST * _SETTLING:

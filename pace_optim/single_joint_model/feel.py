@@ -11,7 +11,7 @@ import torch
 
 from pace_envs import ManagerBasedEnv
 from pace_envs.closed_loops import ClosedLoops
-from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
+from pace_envs.moving_frame import FrameState, bias_in_frame
 from pace_optim.recording.moving_base import Carried
 
 
@@ -149,18 +149,13 @@ class Links:
         if motion.frame is None or motion.point is None:
             return None
         count, data = len(motion.qpos), mujoco.MjData(model)
-        fields = {name: np.empty((count, *getattr(data, name).shape)) for name in FIELDS}
+        state = FrameState.empty(model, count)
         for k in range(count):
             data.qpos[:], data.qvel[:] = motion.qpos[k, r].numpy(), motion.qvel[k, r].numpy()
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
-            for name, values in fields.items():
-                values[k] = getattr(data, name)
-        sizes = {"cdof": 6, "cdof_dot": 6, "cvel": 6, "cinert": 10, "subtree_com": 3}
-        state = {
-            name: values.reshape(count, -1, sizes[name]) if name in sizes else values for name, values in fields.items()
-        }
-        return bias_in_frame(model, FrameState(**state), motion.frame[:, r].numpy(), motion.point[r].numpy())
+            state.keep(k, data)
+        return bias_in_frame(model, state, motion.frame[:, r].numpy(), motion.point[r].numpy())
 
     def shifts(self, motion: Motion, joints: Sequence[int], by: float) -> torch.Tensor:
         """What moves when some of the driven joints move, one of each tree, (T, R, nq)."""
