@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from recordings import says
+from recordings import conform, recording, says
 from walking import DT, crawler, walking_problem, write_log
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
@@ -14,6 +14,7 @@ from pace_optim.optimizers.derivatives import colour, stencil
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.moving_base import Carried, force_noise, free_phases
+from pace_optim.recording.parts import informative_parts
 
 
 @pytest.fixture(scope="module")
@@ -159,3 +160,24 @@ def test_an_unknown_foot_and_a_wrong_imu_are_refused(env):
     axes, point = imu_pose(model, ImuPose(body="trunk", pos=(0.1, 0, 0), quat=(0, 0, 0, 1)), "walk")
     site, at = imu_pose(model, ImuPose(), "walk")
     assert axes == pytest.approx(site @ np.diag([-1, -1, 1])) and point - at == pytest.approx([0.05, -0.01, -0.02])
+
+
+def test_of_minutes_of_walking_the_parts_that_swing_most_are_used():
+    steps = 40 * 400
+    time = DT * np.arange(steps)
+    free = np.zeros((steps, 3), dtype=bool)
+    free[4000:6000] = free[10000:12000] = True
+    frame = np.tile([0, 0, 0, 0, 0, 9.81], (steps, 1))
+    walk = conform(recording(time))
+    walk = replace(walk, frame=frame, frame_point=np.zeros(3), free=free, command=walk.dof_pos)
+    parts = informative_parts(walk, 10.0)
+    assert [part.name for part in parts] == ["leg 10 to 15 s", "leg 25 to 30 s"]
+    assert "10 s that move the joints most are used (25 %)" in parts[0].notes[-1]
+    assert parts[0].free.all() and len(parts[0].frame) == len(parts[0].command) == 2000
+
+
+def test_a_leg_that_stands_throughout_is_named(tmp_path):
+    always = crawler(1).simulate(1.0)["contact"]
+    always[:, 3] = True
+    problem, _ = walking_problem(tmp_path, duration=1.0, contact=always)
+    assert any("rr_hip, rr_knee: always held by the ground" in note for note in problem.dataset.recordings[0].notes)
