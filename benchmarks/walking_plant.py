@@ -173,6 +173,8 @@ class Plant:
             "stiffness": self.kp,
             "damping": self.kd,
             "effort_limit": self.effort_limit,
+            "saturation_effort": np.inf,  # no torque-speed line
+            "velocity_limit": np.inf,
         }
 
 
