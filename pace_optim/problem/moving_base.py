@@ -59,7 +59,9 @@ def _swings(recording: Recording, standing: np.ndarray | None, free: np.ndarray,
         own = free[:, joints[0]]
         phases = int((np.diff(own.astype(int), prepend=0) == 1).sum())
         said.append(f"{foot} {100 * own.mean():.0f} % of the time in {phases} swings")
-    held = [name for name, any_free in zip(recording.joint_names, free.any(axis=0), strict=True) if not any_free]
+    held = [
+        name for name, any_free in zip(recording.joint_names, free.any(axis=0).tolist(), strict=True) if not any_free
+    ]
     never = (
         f" {listed(held, 6)}: always held by the ground, so nothing of them is identified. Lift that leg, or record it "
         "in the air."

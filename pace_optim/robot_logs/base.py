@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pace_optim.recording.keys import BASE_COLUMNS, listed
+from pace_actuators.text import listed
+from pace_optim.recording.keys import BASE_COLUMNS
 
 from .log import Channel, Log
 
