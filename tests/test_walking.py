@@ -13,6 +13,7 @@ from pace_envs.kernels import host
 from pace_optim.optimizers.derivatives import colour, stencil
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet
 from pace_optim.recording.data import ImuPose
+from pace_optim.recording.dataset import make_dataset
 from pace_optim.recording.moving_base import Carried, force_noise, free_phases
 from pace_optim.recording.parts import informative_parts
 
@@ -181,3 +182,14 @@ def test_a_leg_that_stands_throughout_is_named(tmp_path):
     always[:, 3] = True
     problem, _ = walking_problem(tmp_path, duration=1.0, contact=always)
     assert any("rr_hip, rr_knee: always held by the ground" in note for note in problem.dataset.recordings[0].notes)
+
+
+@pytest.mark.parametrize(("duration", "turns"), [(1.0, 1), (12.0, 3)])
+def test_a_walk_is_trained_and_validated_on_in_turns(duration, turns):
+    walk = conform(recording(DT * np.arange(round(duration / DT))))
+    frame = np.tile([0, 0, 0, 0, 0, 9.81], (walk.num_samples, 1))
+    walk = replace(walk, frame=frame, frame_point=np.zeros(3), command=walk.dof_pos)
+    data = make_dataset([walk])
+    assert int((data.train[1:, 0] > data.train[:-1, 0]).sum()) == turns - 1
+    assert float(data.train.double().mean()) == pytest.approx(0.7, abs=0.01)
+    assert bool(data.validation.any()) and not bool((data.validation & data.train).any())

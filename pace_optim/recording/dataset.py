@@ -177,7 +177,7 @@ def make_dataset(
         recordings: To train on, conformed to the same joints and control step.
         validation: Never trained on. If there are none, the last part in time of each recording is kept for it.
         train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
-            a base that moves, it is that part of every 4 s.
+            a base that moves, it is that part of every 4 s or so.
 
     Raises:
         ValueError: If there is no recording.
@@ -209,7 +209,8 @@ def make_dataset(
             whole = bool(validation) or train_fraction >= 1
             trained = np.arange(recording.num_samples) < validation_start(recording, min(train_fraction, 0.99))
             if recording.frame is not None:  # what a robot does changes as it walks
-                trained = (recording.time - recording.time[0]) % _TURN < train_fraction * _TURN
+                since, turns = recording.time - recording.time[0], max(1, round(recording.duration / _TURN))
+                trained = since * turns / (recording.duration or 1.0) % 1.0 < train_fraction
             train[at[torch.from_numpy(trained | whole)], r] = True
         speed, known = start_speed(recording)
         start_vel[r] = torch.as_tensor(speed)
