@@ -209,8 +209,8 @@ def make_dataset(
             whole = bool(validation) or train_fraction >= 1
             trained = np.arange(recording.num_samples) < validation_start(recording, min(train_fraction, 0.99))
             if recording.frame is not None:  # what a robot does changes as it walks
-                since, turns = recording.time - recording.time[0], max(1, round(recording.duration / _TURN))
-                trained = since * turns / (recording.duration or 1.0) % 1.0 < train_fraction
+                turns, count = max(1, round(recording.duration / _TURN)), recording.num_samples
+                trained = np.arange(count) * turns / count % 1.0 < train_fraction
             train[at[torch.from_numpy(trained | whole)], r] = True
         speed, known = start_speed(recording)
         start_vel[r] = torch.as_tensor(speed)
