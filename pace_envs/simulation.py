@@ -16,6 +16,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
+from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
 from pace_envs.quaternions import from_rotation_vector, multiply
 
@@ -152,11 +153,32 @@ class Simulation:
         self._drift = Drift(self.model, self.device) if self.is_trapezoidal else None
         self._link_fields: dict[str, torch.Tensor] = {}
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
+        self._frame: _Frame | None = None
 
-    @cached_property
+    @property
     def qfrc_bias(self) -> torch.Tensor:
         """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m]."""
+        return self._own_bias if self._frame is None or self._frame.bias is None else self._frame.bias
+
+    @cached_property
+    def _own_bias(self) -> torch.Tensor:
+        """The same where the base is at rest."""
         return self.bind("qfrc_bias")
+
+    def move_base(self, motion: torch.Tensor | None, point: np.ndarray | None = None) -> None:
+        """Let the base move in the next physics steps: see :func:`~pace_envs.moving_frame.bias_in_frame`.
+
+        Args:
+            motion: Of each physics step, (steps, num_envs, 9): angular velocity [rad/s], angular acceleration [rad/s²]
+                and specific force [m/s²] in the middle of it, in the model's axes; ``None``: it rests under gravity.
+            point: Where the specific force was measured, (num_envs, 3) [m], in the model's world.
+        """
+        if motion is None or point is None:
+            self._frame = None
+        elif self._frame is None:
+            self._frame = _Frame(motion=motion, point=point, fields=[self.bind(name).numpy() for name in FIELDS])
+        else:
+            self._frame.motion, self._frame.point, self._frame.step = motion, point, 0
 
     def bind(self, field: str) -> torch.Tensor:
         """A live tensor over an ``MjData`` field, shape (num_envs, ...).
@@ -258,8 +280,15 @@ class Simulation:
             self._leap(self._drift)
 
     def _step(self) -> None:
-        """MuJoCo's own step."""
+        """MuJoCo's own step, in the frame of a base that moves."""
+        if self._frame is None:
+            self.batch.step()
+            return
+        applied, own = self.qfrc_applied.clone(), self._own_bias  # bound before it is computed
+        self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.qfrc_applied += own - self._frame.next_bias(self.model)
         self.batch.step()
+        self.qfrc_applied.copy_(applied)
 
     def _leap(self, drift: Drift) -> None:
         """A step of second order around MuJoCo's, which moves the positions of its middle with the new speed.
@@ -374,6 +403,30 @@ class Simulation:
             return spec.compile()
         except ValueError as error:
             raise ValueError(f"MuJoCo cannot compile the model: {error}") from None
+
+
+@dataclass(kw_only=True)
+class _Frame:
+    """How the base moves in the physics steps to come."""
+
+    motion: torch.Tensor
+    """(steps, num_envs, 9)."""
+    point: np.ndarray
+    """(num_envs, 3) [m]."""
+    fields: Sequence[np.ndarray]
+    """Of :data:`FIELDS`, live."""
+    step: int = 0
+    """Of ``motion``, the one that comes next."""
+    bias: torch.Tensor | None = None
+    """Of the last step, (num_envs, nv) [N m]."""
+
+    def next_bias(self, model: mujoco.MjModel) -> torch.Tensor:
+        """Of the step that comes next, at the present state."""
+        motion = self.motion[min(self.step, len(self.motion) - 1)].numpy()
+        self.step += 1
+        state = FrameState(**dict(zip(FIELDS, self.fields, strict=True)))
+        self.bias = torch.from_numpy(bias_in_frame(model, state, motion, self.point))
+        return self.bias
 
 
 class Drift:

@@ -77,6 +77,12 @@ def test_the_tutorial_for_an_own_effect_works_when_typed(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_tutorial_for_a_walking_robot_works_when_typed(tmp_path):
+    printed = type_in(ROOT / "docs" / "walking.md", tmp_path, ROOT)
+    assert "verdict: nothing_missing" in printed
+
+
+@pytest.mark.slow
 def test_the_page_for_users_of_pace_works_when_typed(tmp_path):
     printed = type_in(ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
     assert "plot: " in printed and "objective my_optimizers:Weighted" in printed

@@ -89,6 +89,9 @@ class Curved:
     def __init__(self, bend):
         self.bend, self.space = bend, SimpleNamespace(to_physical=lambda x: x)
 
+    def look_at_phases(self, physical, anew=False):
+        return False
+
     def residuals(self, physical, where=None):
         x = physical[:, 0]
         error = torch.stack([x - 0.3, 1 + 0.5 * self.bend * x.square()], dim=1)[..., None, None]
@@ -208,6 +211,9 @@ class Fake:
 
     def to_physical(self, x):
         return x
+
+    def look_at_phases(self, physical, anew=False):
+        return False
 
     def residuals(self, x, where=None):
         self.batches.append(x)
@@ -333,6 +339,9 @@ class Rattling:
         self.slope[:, 1] = 10 * self.slope[:, 0] + 3 * self.slope[:, 1]
         self.noise, self.phase, self.wave = NOISE * draw(SAMPLES), 6 * draw(SAMPLES), 1e6 * draw(SAMPLES, 3)
         self.rattle, self.space, self.rows = rattle, SimpleNamespace(to_physical=lambda x: x), 0
+
+    def look_at_phases(self, physical, anew=False):
+        return False
 
     def residuals(self, x, where=None):
         self.rows += len(x)

@@ -30,7 +30,7 @@ def test_the_parts_move_every_joint():
     assert len(parts) == 8 and all(part.duration == pytest.approx(5.0 - DT) for part in parts)
     moved = sum((np.ptp(part.dof_pos, axis=0) > 0.1).astype(int) for part in parts)
     assert (moved >= 1).all()
-    assert "of 79.99 s the 40 s that move the joints most are used, in 8 parts" in parts[0].notes[-1]
+    assert "of 79.99 s the 40 s that move the joints most are used (50 %), in 8 parts" in parts[0].notes[-1]
     assert [part.time_origin for part in parts] == sorted({part.time_origin for part in parts})
 
 

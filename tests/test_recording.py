@@ -13,6 +13,7 @@ from recordings import CONTROL_DT, JOINTS, conform, fields_of, position, recordi
 
 from pace_optim.recording import (
     Drive,
+    ImuPose,
     Load,
     Recording,
     load_recording,
@@ -37,6 +38,21 @@ def full_recording() -> Recording:
     )
 
 
+def walking_recording(**changes) -> Recording:
+    """Of a robot whose base moves."""
+    rng = np.random.default_rng(1)
+    series = {
+        "base_ang_vel": rng.standard_normal((400, 3)),
+        "base_lin_acc": rng.standard_normal((400, 3)) + [0, 0, 9.81],
+        "base_quat": np.tile([1.0, 0.0, 0.0, 0.0], (400, 1)),
+        "contact": rng.random((400, 2)) < 0.5,
+        "foot_force": rng.standard_normal((400, 2, 3)),
+        "feet": ("left", "right"),
+        "imu": ImuPose(body="base", pos=(0.1, 0.0, 0.02), quat=(0.0, 1.0, 0.0, 0.0)),
+    }
+    return recording(**{**series, **changes})
+
+
 def assert_same(one, other, ignore=()):
     for field in fields(one):
         if field.name in ignore:
@@ -54,7 +70,7 @@ def assert_same(one, other, ignore=()):
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".npz", ".csv", ".NPZ"])
-@pytest.mark.parametrize("make", [recording, full_recording])
+@pytest.mark.parametrize("make", [recording, full_recording, walking_recording])
 def test_a_recording_survives_a_round_trip_bit_for_bit(tmp_path, suffix, make):
     saved = make()
     path = save_recording(tmp_path / f"other{suffix}", saved)
@@ -118,6 +134,45 @@ def test_unknown_columns_are_noted_and_columns_may_come_in_any_order(tmp_path):
     assert loaded.des_dof_pos[3].tolist() == [3.25, 3.5] and loaded.dof_pos[3].tolist() == [3.0, -3.0]
     assert loaded.torque_enable.tolist() == [bool(i % 2) for i in range(30)]
     assert any("voltage" in note for note in loaded.notes)
+
+
+def test_feet_of_one_force_each_are_columns_of_their_names(tmp_path):
+    saved = walking_recording(contact=None, foot_force=np.arange(800.0).reshape(400, 2))
+    path = save_recording(tmp_path / "walk.csv", saved)
+    path.with_suffix(".json").unlink()
+    loaded = load_recording(path)
+    assert loaded.feet == ("left", "right") and np.array_equal(loaded.foot_force, saved.foot_force)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"base_ang_vel": np.zeros((100, 3))}, ("base_ang_vel without base_lin_acc", "Add it")),
+        ({"base_lin_acc": np.zeros((100, 2))}, ("(100, 2)", "(100, 3)")),
+        ({"gyroscope": np.zeros((100, 3))}, ("gyroscope", "base_ang_vel")),
+        ({"contact": np.zeros((100, 2))}, ("without feet", "2 columns")),
+        ({"contact": np.full((100, 2), 3.0), "feet": ["a", "b"]}, ("0 and 1", "foot_force")),
+        ({"contact": np.zeros((100, 2)), "feet": ["a"]}, ("expected 2 different names",)),
+        ({"contact": np.zeros((100, 2)), "feet": ["a", "b"]}, ("without base_ang_vel and base_lin_acc",)),
+        ({"imu": {"body": "base", "pos": [1, 2]}}, ("imu.pos", "expected 3 numbers")),
+        ({"imu": {"site": "imu"}}, ("the name of a site", "{body, pos, quat}")),
+        ({"imu": {"body": "base", "quat": [1, 1, 0, 0]}}, ("imu.quat", "length 1")),
+    ],
+)
+def test_what_is_wrong_with_a_base_that_moves_is_said(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=says(*words)):
+        load_recording(written(tmp_path, **changes))
+
+
+def test_contacts_keep_to_the_nearest_sample_and_an_imu_is_interpolated():
+    time = np.arange(400) * 0.003
+    walk = walking_recording(time=time, dof_pos=position(time), des_dof_pos=position(time))
+    walk = replace(walk, base_ang_vel=np.stack([time, -time, 2 * time], axis=1))
+    conformed = conform(walk)
+    assert conformed.base_ang_vel == pytest.approx(np.outer(conformed.time, [1, -1, 2]), abs=1e-12)
+    at = conformed.time / 0.003
+    clear = np.abs(at % 1 - 0.5) > 1e-6
+    assert np.array_equal(conformed.contact[clear], walk.contact[np.round(at[clear]).astype(int)])
 
 
 # Faults of files --------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import signal
 
 from pace_envs import ManagerBasedEnv
+from pace_envs.moving_frame import FrameState, bias_in_frame
 from pace_optim.problem.evaluator import Evaluator
 
 _CUTOFF = 10.0
@@ -38,8 +39,15 @@ def load_torques(evaluator: Evaluator, encoder_bias: np.ndarray) -> list[np.ndar
         position = smoothed(recording.dof_pos, dt) + encoder_bias
         speed = np.gradient(position, dt, axis=0)
         acceleration = np.gradient(speed, dt, axis=0)
-        result.append(inverse_dynamics(model, joints, position, speed, acceleration))
+        frame = None if recording.frame is None else frame_motion(recording.frame[recording.sample_steps], dt)
+        point = recording.frame_point
+        result.append(inverse_dynamics(model, joints, position, speed, acceleration, frame, point))
     return result
+
+
+def frame_motion(frame: np.ndarray, dt: float) -> np.ndarray:
+    """Angular velocity, angular acceleration and specific force, (K, 9), of the first and the last of them, (K, 6)."""
+    return np.concatenate([frame[:, :3], np.gradient(frame[:, :3], dt, axis=0), frame[:, 3:]], axis=1)
 
 
 def smoothed(position: np.ndarray, dt: float) -> np.ndarray:
@@ -61,15 +69,36 @@ def model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
 
 
 def inverse_dynamics(
-    model: mujoco.MjModel, joints: Sequence[str], position: np.ndarray, speed: np.ndarray, acceleration: np.ndarray
+    model: mujoco.MjModel,
+    joints: Sequence[str],
+    position: np.ndarray,
+    speed: np.ndarray,
+    acceleration: np.ndarray,
+    frame: np.ndarray | None = None,
+    point: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Torques of some joints that make a model move as given, (K, n) [N m]; positions, speeds and so on (K, n)."""
+    """Torques of some joints that make a model move as given, (K, n) [N m].
+
+    Args:
+        model: The links.
+        joints: Names, (n,).
+        position: (K, n) [rad].
+        speed: (K, n) [rad/s].
+        acceleration: (K, n) [rad/s²].
+        frame: How the model's frame moves, (K, 9): see :mod:`pace_envs.moving_frame`; ``None``: it rests.
+        point: Where its specific force acts, (3,) [m].
+    """
     data = mujoco.MjData(model)
     qpos = [model.joint(name).qposadr[0] for name in joints]
     dof = [model.joint(name).dofadr[0] for name in joints]
     torque = np.empty_like(position)
+    moves = frame is not None and point is not None
+    state = FrameState.empty(model, len(position) if moves else 0)
     for k in range(len(position)):
         data.qpos[qpos], data.qvel[dof], data.qacc[dof] = position[k], speed[k], acceleration[k]
         mujoco.mj_inverse(model, data)
         torque[k] = data.qfrc_inverse[dof]
-    return torque
+        if moves:
+            torque[k] -= data.qfrc_bias[dof]
+            state.keep(k, data)
+    return torque if frame is None or point is None else torque + bias_in_frame(model, state, frame, point)[:, dof]

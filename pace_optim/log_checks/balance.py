@@ -23,8 +23,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.comparison.load_torque import inverse_dynamics, model_of
+from pace_optim.comparison.load_torque import frame_motion, inverse_dynamics, model_of
+from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
+from pace_optim.recording.moving_base import standing_feet
 
 _SMOOTHING = 0.01
 """Standard deviation of the smoothing [s]; of slow recordings 1.5 samples."""
@@ -32,6 +34,8 @@ _ROWS = 1500
 """Instants at which a recording is looked at, at most."""
 _FEW_ROWS = 200
 """The same of a coarse look."""
+_SELDOM = 4
+"""Times as many instants where joints are free at times only."""
 _FEWEST = 60
 """Instants without which a joint is not judged."""
 _MOVING = 0.1
@@ -86,6 +90,16 @@ class View:
     """(3,) [m/s²]."""
     ranges: np.ndarray
     """The joints' ranges in the model, (n, 2) [rad]."""
+    frame: np.ndarray | None = None
+    """Angular velocity [rad/s] and specific force [m/s²] of a base that moves, in the model's axes, (K, 6)."""
+    point: np.ndarray | None = None
+    """Where that force acts, (3,) [m]."""
+    free: np.ndarray | None = None
+    """Where joints are free, (K, n) bool; ``None``: everywhere."""
+    standing: np.ndarray | None = None
+    """Which feet touch the ground, (K, feet) bool."""
+    feet: tuple[tuple[str, list[int]], ...] = ()
+    """Name of each foot, and the joints that the ground holds where it stands."""
     coarse: bool = False
     """Whether few instants and delays are looked at."""
     _given: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False, repr=False)
@@ -164,6 +178,11 @@ def views_of(problem: Problem) -> list[View]:
             model=model,
             gravity=model.opt.gravity.copy(),
             ranges=robot.data.joint_pos_limits.cpu().numpy(),
+            frame=None if recording.frame is None else recording.frame[recording.sample_steps],
+            point=recording.frame_point,
+            free=None if recording.free is None else recording.free[recording.sample_steps],
+            standing=None if recording.frame is None else standing_feet(recording),
+            feet=tuple(zip(recording.feet, joints_of_feet(env, recording.feet, recording.label), strict=True)),
         )
         result.append(view)
     return result
@@ -191,11 +210,17 @@ class Links:
         direction = view.smooth(np.sign(speed))
         edge = int(np.ceil(4 * view.width))
         first = edge + int(np.ceil(view.most_delay * view.control_dt / view.dt))
-        every = max(1, int(view.width), (len(position) - first - edge) // (_FEW_ROWS if view.coarse else _ROWS))
+        few = _FEW_ROWS if view.coarse else _ROWS
+        if view.free is not None:  # most of them do not count
+            few *= _SELDOM
+        every = max(1, int(view.width) if view.free is None else 1, (len(position) - first - edge) // few)
         rows = np.arange(first, len(position) - edge, every)
         model = copy.copy(view.model)
         model.opt.gravity[:] = view.gravity
-        torque = inverse_dynamics(model, view.joints, position[rows], speed[rows], acceleration[rows])
+        frame = None if view.frame is None else frame_motion(view.smooth(view.frame), view.dt)[rows]
+        torque = inverse_dynamics(
+            model, view.joints, position[rows], speed[rows], acceleration[rows], frame, view.point
+        )
         return cls(
             rows=rows, torque=torque, speed=speed[rows], acceleration=acceleration[rows], direction=direction[rows]
         )
@@ -222,9 +247,11 @@ def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarra
     """
     result = {}
     still = view.smooth((~view.used).astype(float))[links.rows] > _TOUCHED
+    held = None if view.free is None else view.smooth((~view.free).astype(float))[links.rows] > _TOUCHED
     for j in joints:
         speed = np.abs(links.speed[:, j])
         moving = ~still & (speed > _MOVING * np.sqrt(np.square(speed).mean()))
+        moving &= True if held is None else ~held[:, j]
         if moving.sum() >= _FEWEST and (found := _balance(view, links, j, moving, further)) is not None:
             result[j] = found
     return result

@@ -17,6 +17,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from pace_actuators.text import listed
 from pace_optim.log_checks.balance import Balance, Links, View, balances, views_of, without
+from pace_optim.log_checks.imu import late, other_axes, other_units, stuck_contacts
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.recordings import tell_on_stderr
 
@@ -116,7 +117,10 @@ class Evidence:
     def is_same_motion(self, view: View) -> bool:
         """Whether another log has the same positions, so that the links move alike."""
         own = self.view
-        return all(getattr(view, name) is getattr(own, name) for name in ("position", "gravity", "used", "coarse"))
+        return all(
+            getattr(view, name) is getattr(own, name)
+            for name in ("position", "gravity", "used", "frame", "free", "coarse")
+        )
 
     def coarse(self) -> Evidence:
         """The same at few instants."""
@@ -378,6 +382,8 @@ def turned_gravity(evidence: Evidence) -> Iterator[Change]:
     """Gravity points elsewhere than in the model: the robot lies, or its base is tilted."""
     few = evidence.coarse()
     view, links = few.view, few.links
+    if view.frame is not None:
+        return
     g = float(np.linalg.norm(view.gravity))
     if not evidence.doubted or g == 0.0:
         return
@@ -406,6 +412,42 @@ def turned_gravity(evidence: Evidence) -> Iterator[Change]:
             text=f"gravity points along ({', '.join(f'{v:.2f}' for v in gravity / g)}), {angle:.0f}° from the model's "
             "direction: the robot lies or its base is tilted. Turn the base in the model, or its option gravity.",
         )
+
+
+def imu_units(evidence: Evidence) -> Iterator[Change]:
+    """What the IMU shows is in other units."""
+    yield from _of_imu(evidence, other_units)
+
+
+def imu_axes(evidence: Evidence) -> Iterator[Change]:
+    """The IMU is turned, or its axes are exchanged."""
+    yield from _of_imu(evidence, other_axes)
+
+
+def _of_imu(evidence: Evidence, changed: Callable[[View], Iterator[tuple[View, str]]]) -> Iterator[Change]:
+    if joints := tuple(evidence.doubted):
+        for view, text in changed(evidence.view):
+            yield Change(joints=joints, view=view, text=text)
+
+
+def _of_base(view: View, evidence: Evidence) -> list[Finding]:
+    """What is seen of a base that moves once all else has been looked at: an IMU that is late, contacts that stick."""
+    result = []
+    if (found := late(evidence.view)) is not None:
+        change = Change(
+            joints=tuple(evidence.balance),
+            view=found[0],
+            text=f"the IMU is {1e3 * found[1]:.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
+            "Correct its time stamps.",
+        )
+        result.append(_finding(_LATE_IMU, change))
+    for joints, text in stuck_contacts(view, lambda: evidence.doubted):
+        result.append(_finding(_CONTACTS, Change(joints=tuple(joints), view=view, text=text)))
+    return result
+
+
+_LATE_IMU = Check(name="IMU delay", changes=lambda _: iter(()), stops=False)
+_CONTACTS = Check(name="contacts", changes=lambda _: iter(()), stops=False)
 
 
 def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
@@ -528,6 +570,8 @@ SIGHTS = (
 )
 """What is seen in a log by itself."""
 CHECKS = (
+    Check(name="IMU units", changes=imu_units, stops=True),
+    Check(name="IMU axes", changes=imu_axes, stops=True),
     Check(name="reversed sign", changes=reversed_sign, stops=True),
     Check(name="swapped joints", changes=swapped, stops=True),
     Check(name="wrapped targets", changes=wrapped_targets, stops=True),
@@ -559,7 +603,7 @@ def explained(view: View) -> list[Finding]:
         if misfits and max(misfits) < _EXPLAINED:
             at_first = max(before.balance[j].misfit for j in change.joints if j in before.balance)
             findings.append(_finding(check, change, at_first, max(misfits)))
-    return findings
+    return findings if view.frame is None else findings + _of_base(view, evidence)
 
 
 def _finding(check: Check, change: Change, before: float | None = None, after: float = 0.0) -> Finding:

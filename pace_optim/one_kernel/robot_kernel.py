@@ -25,6 +25,7 @@ from pace_optim.one_kernel.tape import NotTraceableError
 
 if TYPE_CHECKING:
     from pace_optim.recording.dataset import Dataset
+    from pace_optim.recording.moving_base import Course
 
 _BLOCK = 40_000
 """Steps of single robots in a call: between two calls an interruption is seen."""
@@ -33,9 +34,15 @@ _BLOCK = 40_000
 class CompiledRobot:
     """A robot's recordings by compiled drives, where these can be compiled and that pays."""
 
-    def __init__(self, env: ManagerBasedEnv, dataset: Dataset):
-        """Nothing is recorded yet; environment c * R + r follows recording r."""
-        self._env, self._dataset = env, dataset
+    def __init__(self, env: ManagerBasedEnv, dataset: Dataset, course: Course | None = None):
+        """Nothing is recorded yet; environment c * R + r follows recording r.
+
+        Args:
+            env: The environment.
+            dataset: The recordings.
+            course: How bases move and joints are held; ``None``: they rest, and all joints are free.
+        """
+        self._env, self._dataset, self._course = env, dataset, course
         self._kernel: RobotKernel | None = None
         self._refused = False
 
@@ -54,7 +61,7 @@ class CompiledRobot:
             return None
         try:
             if self._kernel is None:
-                self._kernel = RobotKernel(self._env, self._dataset, kernels)
+                self._kernel = RobotKernel(self._env, self._dataset, kernels, self._course)
             self._kernel.record()
             return self._kernel.positions(at, state) if self._kernel.pays(int(at[-1])) else None
         except CannotCompileError:
@@ -68,22 +75,24 @@ class RobotKernel:
     The numbers are those of stepping the environment itself. Its own state stays where it is.
     """
 
-    def __init__(self, env: ManagerBasedEnv, dataset: Dataset, kernels: HostKernels):
+    def __init__(self, env: ManagerBasedEnv, dataset: Dataset, kernels: HostKernels, course: Course | None = None):
         """Record what the drives do.
 
         Args:
             env: The environment; environment c * R + r follows recording r.
             dataset: The recordings.
             kernels: Compiles.
+            course: How bases move and joints are held.
 
         Raises:
             NotTraceableError: If a kernel cannot do it.
         """
         robot, sim = env.scene["robot"], env.sim
         own = type(robot) is Articulation and type(sim) is Simulation and type(env).simulate is ManagerBasedEnv.simulate
-        if not own or sim.cfg.integrator == "implicit":
+        holds_loops = course is not None and robot.closed_loops is not None
+        if not own or holds_loops or sim.cfg.integrator == "implicit":
             raise NotTraceableError("a simulation of the user's own")
-        self._env, self._dataset, self._kernels = env, dataset, kernels
+        self._env, self._dataset, self._kernels, self._course = env, dataset, kernels, course
         self._flags: object = None
         self._programs: list[DriveProgram] = []
         self._source: RobotSource
@@ -140,9 +149,13 @@ class RobotKernel:
             "before": torch.empty(env.num_envs, 2, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
+        if (course := self._course) is not None:
+            tensors |= {name: getattr(course, name) for name in ("motion", "point", "held", "shift", "push")}
+            tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
-            "step": self._batch.address_of("mj_step"),
+            **dict.fromkeys(ARGUMENTS, 0),
+            **{name: self._batch.address_of(f"mj_{name}") for name in ("step", "step1", "step2")},
             "drift": self._batch.address_of("mj_integratePos") if env.sim.is_trapezoidal else 0,
             "robots": env.num_envs,
             "recordings": self._dataset.num_recordings,

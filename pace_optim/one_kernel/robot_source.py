@@ -8,12 +8,15 @@ from itertools import accumulate
 
 import torch
 
+from pace_envs.moving_frame import COLUMNS, SOURCE
 from pace_optim.one_kernel.robot import STATE, WRITTEN, DriveProgram
 from pace_optim.one_kernel.source import BEGIN, Names, changing_nodes, needed_nodes
 from pace_optim.one_kernel.tape import Node, NotTraceableError
 
 ARGUMENTS = {
     "step": "void (*step)(const mjModel*, mjData*)",
+    "step1": "void (*step1)(const mjModel*, mjData*)",
+    "step2": "void (*step2)(const mjModel*, mjData*)",
     "drift": "void (*drift)(const mjModel*, mjtNum*, const mjtNum*, mjtNum)",
     "robots": "long long robots",
     "recordings": "long long recordings",
@@ -28,14 +31,24 @@ ARGUMENTS = {
     "before": "double* before",
     "out": "double* out",
     "state": "double* state",
+    "motion": "const double* motion",
+    "point": "const double* point",
+    "push": "const double* push",
+    "room": "double* room",
+    "held": "const double* held",
+    "shift": "const double* shift",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step, and its ``mj_integratePos`` where steps are those of
-``Simulation._leap``, else 0; environments and recordings; the control steps from ``first`` to before ``last`` that it
-takes, and the one at which joints are only shown; how many steps commands last; to which row of ``out`` each step is
-shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of gravity and motion of
-each environment; room for the forces applied and the damping before a step (environments, 2, nv); what is shown (rows,
-environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Then the
-leaves of each drive, each with the memory of its delays behind it."""
+"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, and its ``mj_integratePos`` where steps
+are those of ``Simulation._leap``, else 0; environments and recordings; the control steps from ``first`` to before
+``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to which row of
+``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of
+gravity and motion of each environment; room for the forces applied and the damping before a step (environments, 2, nv);
+what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments,
+nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9),
+where its specific force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with
+(environments, 12 nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints,
+2; NaN: free), and what is added to them (environments, joints, 2). Then the leaves of each drive, each with the memory
+of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + BEGIN
@@ -75,10 +88,10 @@ def robot_source(
     parts, names = len(programs[0].written), [drive.name for drive in drives]
     loop = []
     for part in range(parts):
-        loop += ["keep(m, d, robot, k, a);"] if part == 0 else []
+        loop += ["hold(d, robot, k, a);", "keep(m, d, robot, k, a);"] if part == 0 else []
         loop += [f"{name}_{part}(x, robot, m, d, k, a);" for name in names]
         loop += ["if (k == a->end) break;"] if part == 0 else []
-        loop += ["advance(m, d, robot, a);"] if part + 1 < parts else []
+        loop += [f"advance(m, d, robot, k, {part}, a);"] if part + 1 < parts else []
     functions = "\n".join(drive.functions(parts) for drive in drives)
     begin = "\n    ".join(f"{name}_begin(x, robot, a, a->leaves[{i}]);" for i, name in enumerate(names))
     steps = "\n    ".join(loop)
@@ -95,9 +108,37 @@ static void keep(const mjModel* m, const mjData* d, long long robot, long long k
   memcpy(kept, d->qpos, m->nq * sizeof(double));
   memcpy(kept + m->nq, d->qvel, m->nv * sizeof(double));
 }}
-static void advance(mjModel* m, mjData* d, long long robot, const Arguments* a) {{
-  if (!a->drift) {{
+static const int Q[{num_joints}] = {{{", ".join(map(str, qpos.tolist()))}}};
+static const int V[{num_joints}] = {{{", ".join(map(str, dof.tolist()))}}};
+static long long row(long long robot, long long k, long long parts, long long part, const Arguments* a) {{
+  return ((k < a->commands ? k : a->commands - 1) * parts + part) * a->recordings + robot % a->recordings;
+}}
+static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
+  if (!a->held) return;
+  const double* held = a->held + row(robot, k, 1, 0, a) * {2 * num_joints};
+  const double* shift = a->shift + robot * {2 * num_joints};
+  for (int j = 0; j < {num_joints}; ++j, held += 2, shift += 2) {{
+    if (held[0] != held[0]) continue;
+    d->qpos[Q[j]] = held[0] + shift[0];
+    d->qvel[V[j]] = held[1] + shift[1];
+  }}
+}}
+{SOURCE}
+static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
+  if (!a->motion) {{
     a->step(m, d);
+    return;
+  }}
+  double motion[{COLUMNS}];
+  memcpy(motion, a->motion + row(robot, k, {parts - 1}, part, a) * {COLUMNS}, sizeof motion);
+  for (int i = 0; i < 3; ++i) motion[{COLUMNS - 3} + i] += a->push[robot * 3 + i];
+  a->step1(m, d);
+  bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
+  a->step2(m, d);
+}}
+static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
+  if (!a->drift) {{
+    step(m, d, robot, k, part, a);
     return;
   }}
   const int n = m->nv;
@@ -110,7 +151,7 @@ static void advance(mjModel* m, mjData* d, long long robot, const Arguments* a) 
     d->qfrc_applied[i] -= m->dof_damping[i] * d->qvel[i];
   }}
   a->drift(m, d->qpos, d->qvel, 0.5 * h);
-  a->step(m, d);
+  step(m, d, robot, k, part, a);
   a->drift(m, d->qpos, d->qvel, -0.5 * h);
   memcpy(m->dof_damping, damping, n * sizeof(double));
   memcpy(d->qfrc_applied, applied, n * sizeof(double));

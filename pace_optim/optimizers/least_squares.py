@@ -128,14 +128,18 @@ class Descent(DescentState):
         self, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
         """H and g at x; where they are not known, they, the noise and J are taken."""
+        renewed = evaluator.look_at_phases(evaluator.space.to_physical(self.x), anew=True)
         if self.hessian is not None and self.gradient is not None:
             return self.hessian, self.gradient, self.jacobian
         around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
         residuals = evaluator.residuals(evaluator.space.to_physical(vectors), where)
         self.simulations += len(vectors)
-        if not self.scores and math.isfinite(score := float(residuals.score[0])):
+        score = float(residuals.score[0])
+        if not self.scores and math.isfinite(score):
             self.scores = [score]
+        elif renewed and math.isfinite(score):  # by what is known of phases here
+            self.scores[-1] = score
         self.noise = around.noise(residuals)
         jacobian = around.jacobian(residuals)
         self.hessian, self.gradient = jacobian.normal_equations()

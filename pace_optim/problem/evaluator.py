@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 
+from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset
@@ -29,6 +30,8 @@ class Residuals:
     """Where there is a sample, (K, R) bool."""
     step: torch.Tensor
     """Control step of each of the K steps, (K,)."""
+    weight: torch.Tensor | None = None
+    """What errors were multiplied by, (K, R, n): see :attr:`~pace_optim.recording.dataset.Dataset.weight`."""
 
     def rows(self, begin: int, end: int) -> Residuals:
         """Those of some of the candidates."""
@@ -49,16 +52,30 @@ class Residuals:
 class Evaluator:
     """Simulates any number of candidates; environments of each batch size are built once and kept."""
 
-    def __init__(self, make_env: Callable[[int], ManagerBasedEnv], dataset: Dataset, space: ParameterSpace):
+    def __init__(
+        self,
+        make_env: Callable[[int], ManagerBasedEnv],
+        dataset: Dataset,
+        space: ParameterSpace,
+        trees: Sequence[Sequence[str]] = (),
+        phases: FreePhases | None = None,
+    ):
         """Keep what is needed to build environments.
 
         Args:
             make_env: Builds the environment with a given number of environments.
             dataset: The recordings.
             space: The parameters.
+            trees: Groups of joints that do not influence each other; none: all are one.
+            phases: What is not known of free phases; ``None``: what the candidates themselves show of that.
         """
         self.dataset = dataset
         self.space = space
+        names = dataset.recordings[0].joint_names
+        self._trees = [[names.index(name) for name in tree] for tree in trees or [names]]
+        self.phases = phases
+        """What is not known of free phases; ``None`` where no base moves, or no candidate has been simulated yet."""
+        self._phases_at: torch.Tensor | None = None
         self._make_env = make_env
         self._rollouts: dict[int, Rollout] = {}
         self.simulations = 0
@@ -99,17 +116,50 @@ class Evaluator:
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
             initial_offset: Added to each recording's first position, (m, n) [rad].
         """
+        self.look_at_phases(physical[0])
         self.simulations += len(physical)
         widest = max(1, _WIDEST // self.dataset.num_recordings)
         offsets = [None] * len(physical) if initial_offset is None else initial_offset.split(widest)
         parts = [
             self._residuals(part, where, offset) for part, offset in zip(physical.split(widest), offsets, strict=False)
         ]
-        return (
-            parts[0]
-            if len(parts) == 1
-            else Residuals(error=torch.cat([part.error for part in parts]), where=parts[0].where, step=parts[0].step)
-        )
+        return parts[0] if len(parts) == 1 else replace(parts[0], error=torch.cat([part.error for part in parts]))
+
+    def look_at_phases(self, physical: torch.Tensor, anew: bool = False) -> bool:
+        """See how errors depend on what is not known of free phases, at a candidate: it is taken out of them.
+
+        Nothing where no base moves. The first candidate that is simulated is one.
+
+        Args:
+            physical: Its parameters, (size,).
+            anew: Whether to do it although that is known of another candidate.
+
+        Returns:
+            Whether errors are others from now on.
+        """
+        known = self.phases is not None and (self._phases_at is None or not anew)
+        if self.dataset.carried is None or known or (anew and _same(self._phases_at, physical)):
+            return False
+        self.phases, self._phases_at = self.free_phases(physical), physical.clone()
+        return True
+
+    def free_phases(self, physical: torch.Tensor) -> FreePhases:
+        """What is not known of free phases, by its influence at a candidate (size,).
+
+        Raises:
+            ValueError: If no base moves.
+        """
+        carried = self.dataset.carried
+        if carried is None:
+            raise ValueError("No base moves in these recordings: they have no free phases.")
+        probes = PhaseProbes.of(carried, self._trees)
+        shift, push = (torch.cat([torch.zeros_like(each[:1]), each]) for each in (probes.shift, probes.push))
+        rollout = self.rollout(len(shift))
+        rollout.start(physical.expand(len(shift), -1), self.dataset.sampled, shift=shift, push=push)
+        shown = rollout.positions(torch.arange(rollout.duration_steps))
+        shown = shown.view(len(shown), len(shift), self.dataset.num_recordings, -1)
+        change = (shown[:, 1:] - shown[:, :1]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).permute(1, 0, 2, 3)
+        return free_phases(carried, self._trees, change)
 
     def _residuals(
         self, physical: torch.Tensor, where: torch.Tensor | None, initial_offset: torch.Tensor | None
@@ -127,4 +177,13 @@ class Evaluator:
         error = error.to("cpu", torch.float64).view(len(step), m, count, n)
         if not bool(kept.all()):
             error.mul_(kept[:, None, :, None])
-        return Residuals(error=error.permute(1, 0, 2, 3), where=kept, step=step)
+        error = error.permute(1, 0, 2, 3)
+        if data.weight is None or self.phases is None:
+            return Residuals(error=error, where=kept, step=step)
+        weight = data.weight[step]
+        error = self.phases.taken_out(error, step, mask).mul_(weight)
+        return Residuals(error=error, where=kept, step=step, weight=weight)
+
+
+def _same(one: torch.Tensor | None, other: torch.Tensor) -> bool:
+    return one is not None and torch.equal(one, other)

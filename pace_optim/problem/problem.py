@@ -36,6 +36,7 @@ from pace_optim.problem.log_and_robot import (
     told_of_gains,
     without_loops_of_torques,
 )
+from pace_optim.problem.moving_base import on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques, widen_bounds
@@ -181,11 +182,11 @@ class Problem:
 
     def evaluator(self) -> Evaluator:
         """An evaluator of candidates on all recordings."""
-        return Evaluator(self.make_env, self.dataset, self.space)
+        return Evaluator(self.make_env, self.dataset, self.space, self.trees)
 
     def training_evaluator(self) -> Evaluator:
         """An evaluator of candidates on the recordings that are trained on."""
-        return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space)
+        return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space, self.trees)
 
     def on_pieces(self, share: float) -> Problem:
         """The same, trained on windows of what the recordings train on, a share of each."""
@@ -365,6 +366,7 @@ def _posed(
     physics_dt = set_drive_step(cfg, env) if facts.physics_dt is None else facts.physics_dt
     sim2real.slide_joints = robot.slide_joints
     groups = [conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups]
+    groups = [[on_moving_base(recording, env) for recording in group] for group in groups]
     groups = [[without_loops_of_torques(env, recording) for recording in group] for group in groups]
     sim2real.joint_ranges = _ranges(env, groups[0])
     if is_model_file(facts.task):

@@ -14,6 +14,7 @@ from pace_optim.one_kernel.robot_kernel import CompiledRobot
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.dataset import Dataset
+from pace_optim.recording.moving_base import Course
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -62,7 +63,8 @@ class Rollout:
         self.space = space
         self.num_candidates = env.num_envs // count
         self.simulated_steps = 0
-        self._compiled = CompiledRobot(env, self.dataset)
+        self._course = self._course_of(dataset)
+        self._compiled = CompiledRobot(env, self.dataset, self._course)
         self._where = self.dataset.train
         self._enable_changes = _changes(dataset.torque_enable)
         self._step, self._contacts_at, self._is_late = 0, -1, False
@@ -159,6 +161,8 @@ class Rollout:
         where: torch.Tensor | None = None,
         per_joint: Mapping[str, torch.Tensor] | None = None,
         initial_offset: torch.Tensor | None = None,
+        shift: torch.Tensor | None = None,
+        push: torch.Tensor | None = None,
     ) -> None:
         """Write candidates and put every environment at its recording's first sample.
 
@@ -168,6 +172,9 @@ class Rollout:
             per_joint: Values per joint of shared parameters, in place of those in ``physical``:
                 {name: (num_candidates, n)}.
             initial_offset: Added to each recording's first position, (num_candidates, n) [rad].
+            shift: Added to positions [rad] and speeds [rad/s] at which joints are held until a free phase begins,
+                (num_candidates, n, 2).
+            push: Added to the specific force of a base that moves, (num_candidates, 3) [m/s²].
         """
         count = self.dataset.num_recordings
         self.look_at(self.dataset.train if where is None else where)
@@ -176,7 +183,8 @@ class Rollout:
         self.env.scene.reset()
         copies = {name: on_device(values).repeat_interleave(count, dim=0) for name, values in (per_joint or {}).items()}
         self.space.apply(self.env, self.physical, copies)
-        self.begin(0.0 if initial_offset is None else on_device(initial_offset).repeat_interleave(count, dim=0))
+        changes = (initial_offset, shift, push)
+        self.begin(*(0.0 if each is None else on_device(each).repeat_interleave(count, dim=0) for each in changes))
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
@@ -221,7 +229,8 @@ class Rollout:
         """Simulated positions at control steps, (len(at), num_envs, n) [rad]; ``state`` gets MuJoCo's there."""
         last, robot = int(at[-1]), self.robot
 
-        def note(row: int) -> None:
+        def note(row: int, step: int) -> None:
+            self.hold(step)
             result[row] = robot.sensed_joint_pos()
             if state is not None:
                 state[row] = torch.cat([self.env.sim.qpos, self.env.sim.qvel], dim=1)
@@ -229,8 +238,9 @@ class Rollout:
         shape = len(at), self.env.num_envs, robot.num_joints
         result = torch.empty(shape, dtype=self.env.dtype, device=self.env.device)
         begin = int(at[0] == 0)
+        self.hold(0)
         if begin:
-            note(0)
+            note(0, 0)
         if last > 0:
             self.advance(0)
             compiled = self._compiled.positions(at[begin:], None if state is None else state[begin:])
@@ -238,8 +248,9 @@ class Rollout:
                 row = {k: i for i, k in enumerate(at.tolist())}
                 for k in range(1, last + 1):
                     if k in row:
-                        note(row[k])
+                        note(row[k], k)
                     else:
+                        self.hold(k)
                         robot.sensed_joint_pos()  # brings the motor to the present
                     if k < last:
                         self.advance(k)
@@ -305,6 +316,7 @@ class Rollout:
     def simulated(self, steps: int) -> Iterator[torch.Tensor]:
         """Simulate that many control steps; yields the sensed positions at each, (num_envs, n) [rad]."""
         for j in range(steps):
+            self.hold(j)
             yield self.robot.sensed_joint_pos()
             if j + 1 == steps:
                 break
@@ -322,7 +334,41 @@ class Rollout:
             self.robot.set_joint_velocity_target(self._rows(data.command_vel[k]))
         if data.command_effort is not None:
             self.robot.set_joint_effort_target(self._rows(data.command_effort[k]))
+        if self._course is not None:
+            motion = self._course.motion[k].repeat(1, self.num_candidates, 1)
+            motion[..., 6:] += self._course.push
+            self.env.sim.move_base(motion, self._course.point.repeat(self.num_candidates, 1).numpy())
         self.env.simulate(self._rows(data.command[k]))
+
+    def hold(self, step: int) -> None:
+        """Put joints that are not free to where they were measured at a control step."""
+        if self._course is None:
+            return
+        held = self._course.held[min(step, len(self._course.held) - 1)].repeat(self.num_candidates, 1, 1)
+        wanted, now = held + self._course.shift, self.robot.data
+        free = held[..., 0].isnan()
+        if not bool(free.all()):
+            position, speed = wanted.unbind(dim=-1)
+            self.robot.write_joint_state_to_sim(
+                torch.where(free, now.joint_pos, position), torch.where(free, now.joint_vel, speed)
+            )
+
+    def _course_of(self, dataset: Dataset) -> Course | None:
+        """How the base moves and joints are held, as the simulation wants it."""
+        carried = dataset.carried
+        if carried is None:
+            return None
+        if self.env.device.type != "cpu":
+            raise ValueError(
+                "The base moves in these recordings, which is simulated on the processor alone: use --device cpu."
+            )
+        return Course(
+            motion=carried.motion(self.env.cfg.decimation, self.env.step_dt),
+            point=carried.point,
+            held=carried.held(),
+            shift=torch.zeros(self.env.num_envs, self.robot.num_joints, 2, dtype=self.env.dtype),
+            push=torch.zeros(self.env.num_envs, 3, dtype=self.env.dtype),
+        )
 
     def _rows(self, per_recording: torch.Tensor) -> torch.Tensor:
         """(R, m) to (num_envs, m): the same for every candidate."""
@@ -335,12 +381,23 @@ class Rollout:
         """Say which samples count, (T, R) bool."""
         self._where = where.to(self.env.device)
 
-    def begin(self, offset: torch.Tensor | float = 0.0) -> None:
+    def begin(
+        self,
+        offset: torch.Tensor | float = 0.0,
+        shift: torch.Tensor | float = 0.0,
+        push: torch.Tensor | float = 0.0,
+    ) -> None:
         """Put every environment at its recording's first sample, with the parameters that it has.
 
         Args:
             offset: Added to the first positions, (num_envs, n) [rad].
+            shift: Added to where joints are held, (num_envs, n, 2) [rad, rad/s].
+            push: Added to the specific force of the base, (num_envs, 3) [m/s²].
         """
+        if self._course is not None:
+            self._course.shift[:], self._course.push[:] = shift, push
+            for actuator in self.robot.actuators.values():
+                self._course.shift[:, actuator.joint_indices, 0] += actuator.encoder_bias
         shown = self._rows(self.dataset.measured[0]).clone()
         if self.dataset.sample_offset is not None:
             late = self.dataset.sample_offset[0, :, None] * self.env.step_dt

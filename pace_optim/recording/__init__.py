@@ -6,12 +6,13 @@
 """
 
 from .conform import conform_recording, with_columns
-from .data import Drive, Load, Recording, validation_start
+from .data import Drive, ImuPose, Load, Recording, validation_start
 from .files import SUFFIXES, load_recording, save_recording, without_fact_files, written_files
 
 __all__ = [
     "SUFFIXES",
     "Drive",
+    "ImuPose",
     "Load",
     "Recording",
     "conform_recording",

@@ -10,8 +10,8 @@ import numpy as np
 from pace_actuators.text import listed
 
 from .data import Recording
-from .facts import as_array, check_one_line, drive_of, joint_names_of, load_of
-from .keys import COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
+from .facts import as_array, check_one_line, drive_of, feet_of, imu_of, joint_names_of, load_of
+from .keys import BASE_COLUMNS, COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
 from .stamps import seconds_of, set_back, unrounded
 
 _HUGE = 1e6
@@ -75,6 +75,7 @@ def check_recording(
         des_time=des_time,
         torque_enable=torque_enable,
         real_ee_pose=None if pose is None else _pose(pose, len(time), source),
+        **_base(fields, len(time), source),
         time_origin=_origin(fields.get("time_origin"), origin, source),
         drive=drive_of(fields, joint_names, _commanded(series, num_joints), source),
         load=load_of(fields, source),
@@ -223,6 +224,63 @@ def _pose(value: Any, num_samples: int, source: str) -> np.ndarray:
             "(x, y, z, qw, qx, qy, qz). Put the columns in this order."
         )
     return array
+
+
+def _base(fields: Mapping[str, Any], num_samples: int, source: str) -> dict[str, Any]:
+    """What the recording says of a base that moves, and of its feet."""
+    result: dict[str, Any] = {}
+    for key, columns in BASE_COLUMNS.items():
+        if (value := fields.get(key)) is None:
+            continue
+        array = _numeric(key, value, source)
+        if array.shape != (num_samples, len(columns)):
+            raise ValueError(
+                f"{source}: {key} has shape {array.shape}; expected ({num_samples}, {len(columns)}), columns "
+                f"{listed(columns)}, one row per sample."
+            )
+        _check_finite(key, array, columns, source)
+        result[key] = array
+    if ("base_ang_vel" in result) != ("base_lin_acc" in result):
+        there, missing = sorted(("base_ang_vel", "base_lin_acc"), key=lambda key: key not in result)
+        raise ValueError(f"{source}: {there} without {missing}; expected both of them. Add it, or leave both out.")
+    contact, force = fields.get("contact"), fields.get("foot_force")
+    if contact is not None:
+        array = as_array(contact)
+        if array.dtype.kind not in "biuf" or array.ndim != 2 or not np.isin(array, (0, 1)).all():
+            raise ValueError(
+                f"{source}: contact is {array.dtype} of shape {array.shape}; expected (T, feet) of 0 and 1. Store 1 "
+                "where a foot touches the ground; forces belong to foot_force."
+            )
+        result["contact"] = array.astype(bool)
+    if force is not None:
+        array = _numeric("foot_force", force, source)
+        if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+            raise ValueError(f"{source}: foot_force has shape {array.shape}; expected (T, feet) or (T, feet, 3) [N].")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{source}: foot_force holds NaN or infinite values. Remove those samples.")
+        result["foot_force"] = array
+    of_feet = [result[key] for key in ("contact", "foot_force") if key in result]
+    for key in ("contact", "foot_force"):
+        if key in result and (len(result[key]) != num_samples or result[key].shape[1] != of_feet[0].shape[1]):
+            raise ValueError(
+                f"{source}: {key} has shape {result[key].shape}; expected ({num_samples}, {of_feet[0].shape[1]}), a "
+                "row per sample and a column per foot."
+            )
+    if of_feet and not (feet := feet_of(fields.get("feet"), of_feet[0].shape[1], source)):
+        raise ValueError(
+            f"{source}: contact or foot_force without feet; expected the names of their {of_feet[0].shape[1]} columns. "
+            'Add feet, such as ["LF_FOOT", "RF_FOOT"]: bodies, geoms, sites or legs of the model.'
+        )
+    if of_feet and "base_ang_vel" not in result:
+        raise ValueError(
+            f"{source}: contacts without base_ang_vel and base_lin_acc; expected what the IMU shows. Add both, or "
+            "leave the contacts out where the base is fixed."
+        )
+    return {
+        **result,
+        **({"feet": feet} if of_feet else {}),
+        "imu": imu_of(fields.get("imu"), source),
+    }
 
 
 def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], source: str) -> None:

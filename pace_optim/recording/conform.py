@@ -14,7 +14,7 @@ from pace_actuators.text import listed
 from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
-from .keys import JOINT_SERIES, SAMPLED_SERIES
+from .keys import FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base
@@ -102,7 +102,8 @@ def with_columns(recording: Recording, columns: Sequence[int], joint_order: tupl
     def take(array: np.ndarray | None) -> np.ndarray | None:
         return None if array is None else array[..., columns]
 
-    series: dict[str, Any] = {key: take(getattr(recording, key)) for key in (*JOINT_SERIES, *GRID_COMMANDS.values())}
+    by_joint = (*JOINT_SERIES, *GRID_COMMANDS.values(), "free")
+    series: dict[str, Any] = {key: take(getattr(recording, key)) for key in by_joint}
     drive = Drive(**{f.name: take(getattr(recording.drive, f.name)) for f in fields(Drive)})
     return replace(recording, joint_names=joint_order, drive=drive, **series)
 
@@ -166,9 +167,15 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
         ("dof_vel", interpolate_smooth),
         ("dof_effort", interpolate_linear),
         ("real_ee_pose", interpolate_linear),
+        ("base_ang_vel", interpolate_linear),
+        ("base_lin_acc", interpolate_linear),
     ):
         if (values := getattr(recording, key)) is not None:
             result[key] = interpolate(stamps, values, at)
+    for key in ("base_quat", *FEET_SERIES):
+        if (values := getattr(recording, key)) is not None:
+            after = np.searchsorted(stamps, at).clip(1, len(stamps) - 1)
+            result[key] = values[after - (at - stamps[after - 1] < stamps[after] - at)]
     if recording.torque_enable is not None:
         share_on = hold_on_grid(stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count)
         result["command_torque_enable"] = share_on[:, 0] >= 0.5

@@ -18,7 +18,7 @@ import numpy as np
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
 
-from .keys import COMMAND_SERIES, JOINT_SERIES, POSE_COLUMNS
+from .keys import BASE_COLUMNS, COMMAND_SERIES, FEET_SERIES, JOINT_SERIES, POSE_COLUMNS
 
 Rows = list[list[str]] | np.ndarray
 """Cells as text, or all of them as numbers."""
@@ -54,6 +54,11 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         elif series == "real_ee_pose" and set(index_of) in (set(POSE_COLUMNS[:3]), set(POSE_COLUMNS)):
             names = POSE_COLUMNS[: len(index_of)]
             fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in BASE_COLUMNS and set(index_of) == set(BASE_COLUMNS[series]):
+            names = BASE_COLUMNS[series]
+            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in FEET_SERIES and "" not in index_of:
+            fields |= _of_feet(path, series, index_of, own, fields.get("feet"))
         elif series in JOINT_SERIES and joints:
             _check_joints(path, series, list(index_of), joints, header)
             none = np.full(len(own), np.nan)
@@ -67,7 +72,28 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     return fields, tuple(header)
 
 
-def write_csv(file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tuple[str, ...]) -> None:
+def _of_feet(
+    path: Path, series: str, index_of: Mapping[str, int], rows: Rows, feet: list[str] | None
+) -> dict[str, Any]:
+    """Contacts by foot, or forces with three columns ``<foot>/x`` to ``/z`` each, and the names of the feet."""
+    parts = {name.rpartition("/")[2] for name in index_of}
+    axes = ("x", "y", "z") if parts == {"x", "y", "z"} else ()
+    found = list(dict.fromkeys(name.rpartition("/")[0] if axes else name for name in index_of))
+    feet = feet or found
+    wanted = [[f"{foot}/{axis}" for axis in axes] or [foot] for foot in feet]
+    if set(found) != set(feet) or not {name for names in wanted for name in names} <= set(index_of):
+        raise ValueError(
+            f"{path}: {series} has the columns {listed(index_of)}; expected one for each of the feet {listed(feet)}, "
+            "or three of them, /x, /y and /z. Correct them."
+        )
+    values = [[_numbers(path, f"{series}/{name}", rows, index_of[name]) for name in names] for names in wanted]
+    array = np.stack([np.stack(each, axis=1) for each in values], axis=1)
+    return {"feet": feet, series: array if axes else array[..., 0]}
+
+
+def write_csv(
+    file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tuple[str, ...], feet: tuple[str, ...] = ()
+) -> None:
     """Write series as CSV; every number with as many digits as it takes to read back the same."""
     num_joints = series["dof_pos"].shape[1]
     joints = joint_names or tuple(f"joint_{i}" for i in range(num_joints))
@@ -78,11 +104,15 @@ def write_csv(file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tu
             header.append(key)
             columns.append((values.astype(int) if values.dtype == bool else values).tolist())
             continue
-        names = POSE_COLUMNS[: values.shape[1]] if key == "real_ee_pose" else joints
-        for joint, column in zip(names, values.T, strict=True):
+        names: tuple[str, ...] = BASE_COLUMNS.get(key, joints)
+        if key == "real_ee_pose":
+            names = POSE_COLUMNS[: values.shape[1]]
+        elif key in FEET_SERIES:
+            names = feet if values.ndim == 2 else tuple(f"{foot}/{axis}" for foot in feet for axis in "xyz")
+        for name, column in zip(names, values.reshape(len(values), -1).T, strict=True):
             if not np.isnan(column).all():
-                header.append(f"{key}/{joint}")
-                columns.append(column.tolist())
+                header.append(f"{key}/{name}")
+                columns.append((column.astype(int) if column.dtype == bool else column).tolist())
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -38,6 +38,20 @@ class Load:
     """Mass of the test bench's uniform rod [kg]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImuPose:
+    """Where an IMU is on the base, and how it is turned."""
+
+    site: str = "imu"
+    """Name of the model's site; not used where a body is named."""
+    body: str = ""
+    """Body that it is fixed to, of a pose that is stated."""
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """In that body's frame [m]."""
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """From the IMU's axes to that body's, (w, x, y, z)."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """One recording of n joints over T samples.
@@ -72,6 +86,20 @@ class Recording:
     """False where the drive gives no torque, (T,) bool."""
     real_ee_pose: np.ndarray | None = None
     """Measured pose of the end effector in the base's frame, (T, 3) [m], or (T, 7) with a quaternion (w, x, y, z)."""
+    base_ang_vel: np.ndarray | None = None
+    """Angular velocity of a base that moves, in the IMU's axes, (T, 3) [rad/s]."""
+    base_lin_acc: np.ndarray | None = None
+    """Specific force of it at the IMU, in its axes, (T, 3) [m/s²]: +9.81 upwards at rest."""
+    base_quat: np.ndarray | None = None
+    """Orientation of it in the world, (T, 4), (w, x, y, z): drawn, not needed."""
+    contact: np.ndarray | None = None
+    """Which feet touch the ground, (T, feet) bool."""
+    foot_force: np.ndarray | None = None
+    """Force on each foot, (T, feet) or (T, feet, 3) [N]."""
+    feet: tuple[str, ...] = ()
+    """Bodies, geoms, sites or legs that these are of."""
+    imu: ImuPose = field(default_factory=ImuPose)
+    """Where the IMU is."""
     time_origin: float = 0.0
     """What the log's own clock showed at `time` = 0 [s]: Unix time where the log has it."""
     drive: Drive = field(default_factory=Drive)
@@ -107,6 +135,25 @@ class Recording:
     """Time between two commands as they were logged [s]; None until conformed."""
     part_of: str = ""
     """Name of the recording that this is a part of; empty: it is whole."""
+    frame: np.ndarray | None = None
+    """Angular velocity [rad/s] and specific force [m/s²] of the base in the model's axes at control steps, (steps, 6);
+    None until it has been conformed to a robot, and where the base rests."""
+    frame_point: np.ndarray | None = None
+    """Where that force acts, (3,) [m], in the model's world."""
+    free: np.ndarray | None = None
+    """Where nothing but its drive and the base acts on a joint, (steps, n) bool; None: everywhere."""
+
+    @property
+    def control_dt(self) -> float:
+        """Control step [s], once conformed."""
+        last = self.num_samples - 1
+        offset = 0.0 if self.sample_offset is None else float(self.sample_offset[last] - self.sample_offset[0])
+        return self.duration / (float(self.sample_steps[last]) + offset)
+
+    @property
+    def base_moves(self) -> bool:
+        """Whether it says how the base moves."""
+        return self.base_ang_vel is not None and self.base_lin_acc is not None
 
     @property
     def num_samples(self) -> int:

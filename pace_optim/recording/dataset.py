@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
+from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
 
+_TURN = 4.0
+"""Of a robot that walks, so much time is trained and validated on in turns [s]."""
 _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
 _SHORTEST = 3.0
@@ -60,6 +64,25 @@ class Dataset:
     settling: torch.Tensor | None = None
     """Samples that are neither trained on nor validated on, (T, R) bool: a recording begins in motion, and its speed
     is not known; ``None`` where there are none."""
+    carried: Carried | None = None
+    """How bases move, and where joints are held; ``None`` where all bases rest."""
+
+    @cached_property
+    def weight(self) -> torch.Tensor | None:
+        """Root of what each sample of each joint counts, (T, R, n); ``None``: all the same.
+
+        A joint counts where it is free: there in proportion to how seldom that is, so that means over all samples are
+        means over those where it is free. What is trained on and what is not is weighed apart.
+        """
+        if self.carried is None:
+            return None
+        free = self.carried.free & self.sampled[..., None]
+        result = torch.zeros(free.shape, dtype=torch.float64)
+        for part in (self.train, self.sampled & ~self.train):
+            own = free & part[..., None]
+            share = own.sum(dim=(0, 1)) / part.sum().clamp(min=1)
+            result += own * (1 / share.clamp(min=1e-9)).sqrt()
+        return result
 
     @property
     def num_recordings(self) -> int:
@@ -91,6 +114,7 @@ class Dataset:
             start_time=self.start_time[chosen],
             start_vel=self.start_vel[chosen],
             settling=None if self.settling is None else self.settling[:, chosen],
+            carried=None if self.carried is None else self.carried.select(chosen),
         )
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Dataset:
@@ -116,6 +140,7 @@ class Dataset:
             measured=self.measured[..., chosen],
             measured_vel=self.measured_vel[..., chosen],
             start_vel=self.start_vel[..., chosen],
+            carried=None if self.carried is None else self.carried.on_joints(chosen),
         )
 
     def trained(self) -> list[int]:
@@ -136,8 +161,10 @@ class Dataset:
                 continue
             whole = validation_only or not parts["validation"]
             share = float(getattr(self, which)[:, r].sum()) / float(self.sampled[:, r].sum())
-            place = "first" if which == "train" else "last"
-            result.append(recording.name if whole else f"{recording.name} ({place} {100 * share:.0f} %)")
+            place = "first " if which == "train" else "last "
+            in_turns = recording.frame is not None
+            part = f"{'' if in_turns else place}{100 * share:.0f} %{' in turns' if in_turns else ''}"
+            result.append(recording.name if whole else f"{recording.name} ({part})")
         return result
 
 
@@ -149,7 +176,8 @@ def make_dataset(
     Args:
         recordings: To train on, conformed to the same joints and control step.
         validation: Never trained on. If there are none, the last part in time of each recording is kept for it.
-        train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing.
+        train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
+            a base that moves, it is that part of every 4 s or so.
 
     Raises:
         ValueError: If there is no recording.
@@ -179,8 +207,11 @@ def make_dataset(
             _hold(enable[:, r], recording.command_torque_enable)
         if r < len(recordings):
             whole = bool(validation) or train_fraction >= 1
-            end = recording.num_samples if whole else validation_start(recording, train_fraction)
-            train[at[:end], r] = True
+            trained = np.arange(recording.num_samples) < validation_start(recording, min(train_fraction, 0.99))
+            if recording.frame is not None:  # what a robot does changes as it walks
+                turns, count = max(1, round(recording.duration / _TURN)), recording.num_samples
+                trained = np.arange(count) * turns / count % 1.0 < train_fraction
+            train[at[torch.from_numpy(trained | whole)], r] = True
         speed, known = start_speed(recording)
         start_vel[r] = torch.as_tensor(speed)
         if not known.all() and recording.duration > _SHORTEST * _SETTLING:
@@ -204,7 +235,33 @@ def make_dataset(
         start_time=torch.zeros(len(every), dtype=torch.float64),
         start_vel=start_vel,
         settling=settling if bool(settling.any()) else None,
+        carried=_carried(every, steps),
     )
+
+
+def _carried(recordings: Sequence[Recording], steps: int) -> Carried | None:
+    """How bases move, laid out like commands; those of recordings that say nothing rest."""
+    if all(recording.frame is None for recording in recordings):
+        return None
+    n, count = recordings[0].num_joints, len(recordings)
+    base, point = torch.zeros(steps, count, 6, dtype=torch.float64), torch.zeros(count, 3, dtype=torch.float64)
+    motion, free = torch.zeros(steps, count, n, 2, dtype=torch.float64), torch.ones(steps, count, n, dtype=torch.bool)
+    std, noise = torch.zeros(count, n, 2, dtype=torch.float64), torch.zeros(steps, count, 3, dtype=torch.float64)
+    base[..., 5] = GRAVITY
+    for r, recording in enumerate(recordings):
+        if recording.frame is None:
+            continue
+        _hold(base[:, r], recording.frame)
+        point[r] = torch.as_tensor(recording.frame_point)
+        measured, deviation = measured_motion(recording)
+        _hold(motion[:, r], measured)
+        std[r] = torch.as_tensor(deviation)
+        _hold(noise[:, r], force_noise(recording.frame[:, 3:], recording.control_dt))
+        if recording.free is not None:
+            free[: len(recording.free), r] = torch.as_tensor(recording.free)
+            free[len(recording.free) :, r] = False
+        free[0, r] = False
+    return Carried(base=base, point=point, measured=motion, free=free, start_std=std, force_std=noise)
 
 
 def _further(commands: Sequence[np.ndarray | None], position: torch.Tensor) -> torch.Tensor | None:

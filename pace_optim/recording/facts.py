@@ -11,7 +11,7 @@ import numpy as np
 from pace_actuators.files import parsed_json
 from pace_actuators.text import listed
 
-from .data import Drive, Load
+from .data import Drive, ImuPose, Load
 from .keys import BENCH_FACTS, DRIVE_FACTS, did_you_mean
 
 _MAY_BE_INFINITE = ("effort_limit", "saturation_effort", "velocity_limit")
@@ -81,6 +81,56 @@ def load_of(fields: Mapping[str, Any], source: str) -> Load:
     """Read the load's facts."""
     bench = {key: _number(key, fields[key], source) for key in BENCH_FACTS if fields.get(key) is not None}
     return Load(added_mass=_added_mass(fields.get("added_mass"), source), **bench)
+
+
+def imu_of(value: Any, source: str) -> ImuPose:
+    """Where the IMU is: a site's name, or ``{body, pos, quat}``.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    if value is None:
+        return ImuPose()
+    if isinstance(value, str) and value.lstrip().startswith("{"):  # in an .npz
+        with suppress(ValueError):
+            value = parsed_json(value)
+    if isinstance(value, str):
+        check_one_line("imu", value, source)
+        return ImuPose(site=value)
+    if not isinstance(value, Mapping) or not {"body"} <= set(value) <= {"body", "pos", "quat"}:
+        raise ValueError(
+            f"{source}: imu is {value!r}; expected the name of a site, or {{body, pos, quat}} (in an .npz as JSON "
+            'text). Write it as {"body": "base", "pos": [0.1, 0, 0.02], "quat": [1, 0, 0, 0]}.'
+        )
+    check_one_line("imu's body", str(value["body"]), source)
+    pose: dict[str, Any] = {}
+    for key, size in (("pos", 3), ("quat", 4)):
+        if key in value:
+            array = as_array(value[key])
+            if array.dtype.kind not in "iuf" or array.shape != (size,) or not np.isfinite(array).all():
+                raise ValueError(f"{source}: imu.{key} is {value[key]!r}; expected {size} numbers. Correct it.")
+            pose[key] = tuple(float(each) for each in array)
+    if "quat" in pose and abs(np.linalg.norm(pose["quat"]) - 1) > 1e-3:
+        raise ValueError(f"{source}: imu.quat is {value['quat']!r}; expected (w, x, y, z) of length 1. Correct it.")
+    return ImuPose(body=str(value["body"]), **pose)
+
+
+def feet_of(value: Any, count: int, source: str) -> tuple[str, ...]:
+    """Names of the feet that contacts are of, () where none are given.
+
+    Raises:
+        ValueError: If there is not one for each column.
+    """
+    if value is None:
+        return ()
+    names = value.tolist() if isinstance(value, np.ndarray) else value
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(n, str) for n in names):
+        raise ValueError(f"{source}: feet is {value!r}; expected a list of names, one per column of contact.")
+    if len(names) != count or len(set(names)) != count:
+        raise ValueError(f"{source}: feet has {listed(names)}; expected {count} different names, one per column.")
+    for name in names:
+        check_one_line("a foot's name", name, source)
+    return tuple(names)
 
 
 def _per_joint(key: str, value: Any, joint_names: tuple[str, ...], commanded: np.ndarray, source: str) -> np.ndarray:

@@ -18,7 +18,7 @@ from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
-from .data import Recording
+from .data import ImuPose, Recording
 from .facts import as_array
 from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean
 
@@ -85,13 +85,12 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> Path:
         with writing(
             {
                 facts_file: lambda file: file.write(text),
-                table: lambda file: write_csv(file, series, recording.joint_names),
+                table: lambda file: write_csv(file, series, recording.joint_names, recording.feet),
             }
         ):
             pass
     elif suffix == ".npz":
-        if "added_mass" in facts:
-            facts["added_mass"] = json.dumps(facts["added_mass"])
+        facts = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in facts.items()}
         write_atomically(path, lambda file: np.savez_compressed(file, **series, **facts))
     else:
         tensors = {key: torch.from_numpy(np.ascontiguousarray(array)) for key, array in series.items()}
@@ -118,6 +117,12 @@ def _facts_of(recording: Recording) -> dict[str, Any]:
     for key in DRIVE_FACTS:
         if (value := getattr(recording.drive, key)) is not None:
             facts[key] = value.tolist()
+    if recording.feet:
+        facts["feet"] = list(recording.feet)
+    if recording.imu != ImuPose():
+        imu = recording.imu
+        pose = {"body": imu.body, "pos": list(imu.pos), "quat": list(imu.quat)}
+        facts["imu"] = pose if imu.body else imu.site
     for field in dataclass_fields(recording.load):
         value = getattr(recording.load, field.name)
         if value is not None and value != {}:

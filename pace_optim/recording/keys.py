@@ -13,15 +13,21 @@ MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
 JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort")
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """Columns of `real_ee_pose`: a position [m], or a position and a quaternion."""
-SAMPLED_SERIES = (*MEASURED_SERIES, "torque_enable", "real_ee_pose")
+BASE_SERIES = ("base_ang_vel", "base_lin_acc", "base_quat")
+"""What an IMU shows of a base that moves, and its orientation."""
+BASE_COLUMNS = {"base_ang_vel": ("x", "y", "z"), "base_lin_acc": ("x", "y", "z"), "base_quat": ("w", "x", "y", "z")}
+"""Columns of these."""
+FEET_SERIES = ("contact", "foot_force")
+"""What feet feel of the ground."""
+SAMPLED_SERIES = (*MEASURED_SERIES, "torque_enable", "real_ee_pose", *BASE_SERIES, *FEET_SERIES)
 """Series with a value at each sample."""
-SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time")
+SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time", *BASE_SERIES, *FEET_SERIES)
 UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
 UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
 """Unit of each series of joints."""
 DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
-FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "comment")
+FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "feet", "imu", "comment")
 
 _OTHER_WORDS = {
     "time": ("t", "timestamp", "timestamps", "stamp"),
@@ -33,6 +39,11 @@ _OTHER_WORDS = {
     "dof_vel": ("qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity", "speed"),
     "dof_effort": ("tau", "effort", "torque", "torques", "joint_effort", "joint_torque"),
     "torque_enable": ("enable", "enabled", "torque_enabled", "torque_on"),
+    "base_ang_vel": ("gyro", "gyroscope", "angular_velocity", "imu_gyro", "base_angular_velocity"),
+    "base_lin_acc": ("accelerometer", "linear_acceleration", "imu_acc", "specific_force", "base_acceleration"),
+    "contact": ("contacts", "foot_contact", "feet_contact", "foot_contacts", "contact_state"),
+    "foot_force": ("foot_forces", "feet_force", "contact_force", "contact_forces"),
+    "base_quat": ("base_orientation", "orientation", "imu_quat", "root_quat"),
     "joint_names": ("joints", "names", "joint_order", "dof_names"),
     "stiffness": ("kp", "p_gain", "p_gains", "gains_p"),
     "damping": ("kd", "d_gain", "d_gains", "gains_d"),

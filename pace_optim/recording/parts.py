@@ -24,6 +24,8 @@ _EVALUATIONS = 200_000_000
 """Times that a joint's acceleration is computed for them: half a minute of two cores."""
 _COPIES = 4
 """Arrays of that size that there are at once."""
+_WALKING = 40.0
+"""Of a robot that walks, so much is used unless it is told otherwise [s]: it does the same again and again."""
 _LENGTH = 5.0
 """Of a part [s]."""
 _SLOPE = 3
@@ -60,7 +62,10 @@ def affordable(
     result: list[list[Recording]] = [[] for _ in recordings]
     for group, kept in zip(recordings, result, strict=True):
         for recording in group:
-            parts = informative_parts(recording, share * recording.duration if max_duration is None else max_duration)
+            longest = share * recording.duration if max_duration is None else max_duration
+            if max_duration is None and recording.frame is not None:
+                longest = min(longest, _WALKING)
+            parts = informative_parts(recording, longest)
             if parts[0].part_of:
                 tell(f"note: {parts[0].notes[-1]}")
             kept += parts
@@ -74,7 +79,7 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
 
         parts = argmax Σ_j log(0.01 + Σ_parts e_j / max e_j),  e_j = mean square of the joint's speed,
 
-    chosen one after another.
+    chosen one after another. Of a robot that walks, only the speed of joints that are free counts.
 
     Args:
         recording: Conformed.
@@ -86,6 +91,8 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
         return [recording]
     number = recording.num_samples // length
     speed = np.diff(recording.dof_pos, axis=0, prepend=recording.dof_pos[:1]) / dt
+    if recording.free is not None:  # what joints do where the ground holds them says nothing
+        speed = speed * recording.free[recording.sample_steps]
     energy = np.square(speed[: number * length]).reshape(number, length, -1).mean(axis=1)
     energy /= energy.max(axis=0) + 1e-300
     chosen: list[int] = []
@@ -97,7 +104,8 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
     many = f"{len(chosen)} part{'s' * (len(chosen) > 1)} of {_LENGTH:g} s"
     note = (
         f"{recording.name}: of {recording.duration:.4g} s the {len(chosen) * _LENGTH:g} s that move the joints most "
-        f"are used, in {many}; --max_duration SECONDS takes more or fewer."
+        f"are used ({100 * len(chosen) * _LENGTH / recording.duration:.2g} %), in {many}; --max_duration SECONDS takes "
+        "more or fewer."
     )
     return [replace(parts[0], notes=(*recording.notes, note)), *parts[1:]]
 
@@ -111,7 +119,7 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
     }
     commands: dict[str, Any] = {
         key: value[grid]
-        for key in ("command", "command_vel", "command_effort", "command_torque_enable")
+        for key in ("command", "command_vel", "command_effort", "command_torque_enable", "frame", "free")
         if (value := getattr(recording, key)) is not None
     }
     own: dict[str, Any] = {  # which joints have which commands is read from these

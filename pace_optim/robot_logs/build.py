@@ -11,6 +11,7 @@ from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, MEASURED_SERIES
 from pace_optim.recording.resample import interpolate_linear, interpolate_smooth
 
+from .base import base_fields
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 
@@ -70,6 +71,7 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
             raise ValueError(_unknown_channel(log, columns.torque_enable))
         at = np.searchsorted(switch.time, time, side="right") - 1
         fields["torque_enable"] = switch.values[np.clip(at, 0, None)]
+    fields |= base_fields(log, columns.base, time)
     fields["time"] = time - first
     if log.time_origin or first:
         fields["time_origin"] = log.time_origin + first
@@ -85,7 +87,7 @@ def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> st
         facts_from: Channels that facts were read from.
     """
     used = {source.channel for by in columns.joints.values() for source in by.values()}
-    used |= {columns.torque_enable, *facts_from}
+    used |= {columns.torque_enable, *facts_from, *columns.base.channels}
     tables = {log.channels[key].table for key in used if key in log.channels}
     left: dict[str, int] = {}
     for key, channel in log.channels.items():

@@ -13,8 +13,10 @@ from pace_actuators.files import file_at, write_atomically
 from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, FACTS, JOINT_SERIES, did_you_mean
 
+from .base import NO_BASE, BaseMap, base_text, read_base
 from .words import CURRENTS, NEED_FACTOR, TIME_UNITS, UNITS
 
+_OF_BASE = ("base", "contact", "foot_force")
 _ENTRY = ("from", "unit", "sign", "offset", "gear_ratio", "factor")
 
 
@@ -58,6 +60,8 @@ class ColumnMap:
     """Rows per second of a log without time [Hz]; 0: it has time."""
     torque_enable: str = ""
     """The column that says whether the drives give torque; "": they always do."""
+    base: BaseMap = NO_BASE
+    """Which columns say how the base moves, and where feet stand."""
     facts: Mapping[str, Any] = field(default_factory=dict)
     """Facts of the recording: stiffness, added_mass, ..."""
     source: str = field(default="", compare=False)
@@ -77,7 +81,9 @@ def read_map(path: Path) -> ColumnMap:
         content = tomllib.loads(file_at(path, _CURE).read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: is not TOML ({error}). Correct it.") from None
-    _check_keys(path, "the map", content, ("time", "torque_enable", "joints", "facts"))
+    _check_keys(path, "the map", content, ("time", "torque_enable", "joints", "facts", *_OF_BASE))
+    for key in _OF_BASE:
+        _table(path, key, content.get(key, {}))
     if not content:
         raise ValueError(f'{path}: is empty; expected [joints."NAME"] with dof_pos = {{from = "COLUMN"}}, or [time].')
     joints = _table(path, "joints", content.get("joints", {}))
@@ -96,6 +102,7 @@ def read_map(path: Path) -> ColumnMap:
         time_unit=unit,
         rate=float(rate),
         torque_enable=str(content.get("torque_enable", "")),
+        base=read_base(content, str(path)),
         facts=facts,
         source=str(path),
     )
@@ -169,6 +176,7 @@ def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
         lines += [f"column = {json.dumps(columns.time)}"] if columns.time else []
         lines += [f'unit = "{columns.time_unit}"'] if columns.time_unit else []
         lines += [f"rate = {columns.rate:g}"] if columns.rate else []
+    lines += base_text(columns.base)
     if columns.facts:
         lines += ["", "[facts]", *(f"{key} = {_value(value)}" for key, value in columns.facts.items())]
     for joint, sources in columns.joints.items():

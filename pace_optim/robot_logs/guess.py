@@ -15,6 +15,7 @@ from pace_actuators.joint_units import JointType
 from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, MEASURED_SERIES
 
+from .base import guess_base
 from .column_map import ColumnMap, Source
 from .joints import match, only_numbers
 from .log import Channel, Log
@@ -129,8 +130,10 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     switches = [c.channel for c in candidates if c.series == "torque_enable"]
     enable, more = _enable(switches)
     facts_from |= {channel.key for channel in switches} if enable else set()
+    base, of_base = guess_base(log)
+    more = [*more, *of_base]
     return Guess(
-        columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable),
+        columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable, base=base),
         notes=(*notes, *more),
         missing=tuple(_missing(sources, robot.wanted or _found(sources, robot, candidates) or names)),
         unit_stated=tuple(name for name, by in picked.items() if "dof_pos" in by and by["dof_pos"].unit),

@@ -103,7 +103,8 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
         if used is None or not used.joints:
             guess = guess_map(log, robot)
             own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
-            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable)
+            base = own.base if used is None or not used.base.channels else used.base
+            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable, base=base)
             notes += guess.notes
             if guess.missing:
                 raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))

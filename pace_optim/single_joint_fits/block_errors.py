@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from pace_optim.single_joint_fits.fitting_cfg import DEFAULT, FittingCfg
@@ -35,7 +37,12 @@ class BlockErrors:
 
 
 def block_errors(
-    error: torch.Tensor, where: torch.Tensor, control_dt: float, *, cfg: FittingCfg = DEFAULT
+    error: torch.Tensor,
+    where: torch.Tensor,
+    control_dt: float,
+    *,
+    weight: torch.Tensor | None = None,
+    cfg: FittingCfg = DEFAULT,
 ) -> BlockErrors:
     """Cut errors into blocks.
 
@@ -43,8 +50,11 @@ def block_errors(
         error: (T, R, n) at every control step.
         where: Which samples count, (T, R) bool.
         control_dt: [s].
+        weight: What errors were multiplied by, (T, R, n), 0 where a joint is held; ``None``: 1.
         cfg: How long blocks are.
     """
+    if weight is not None:
+        return _free_errors(error, where, weight, control_dt, cfg)
     blocks = _blocks(where, control_dt, cfg)
     return BlockErrors(
         square=torch.stack([error[own, r].double().square().mean(dim=0) for r, own in blocks]),
@@ -52,18 +62,51 @@ def block_errors(
     )
 
 
-def check_long_enough(where: torch.Tensor, control_dt: float, fewest: int, *, cfg: FittingCfg = DEFAULT) -> None:
+def _free_errors(
+    error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
+) -> BlockErrors:
+    """Errors of joints that are free at times: the free time of each, in as many blocks; 1 where it has none."""
+    own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
+    count = _free_blocks([len(each) for each in own], control_dt, cfg)
+    square = torch.ones(count, len(own), dtype=torch.float64)
+    for j, places in enumerate(own):
+        if len(places):
+            r, k = places.T
+            errors = (error[k, r, j] / weight[k, r, j]).double().square()
+            square[:, j] = torch.stack([part.mean() for part in errors.tensor_split(count)])
+    return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
+
+
+def _free_blocks(samples: Sequence[int], control_dt: float, cfg: FittingCfg) -> int:
+    """How many blocks the free time of the median joint makes, of those that have any."""
+    usual = float(np.median([count for count in samples if count] or [0])) * control_dt
+    return max(1, int(usual / min(cfg.block_s, max(cfg.swing_s, usual / cfg.blocks)) + 1e-9))
+
+
+def check_long_enough(
+    where: torch.Tensor, control_dt: float, fewest: int, *, free: torch.Tensor | None = None, cfg: FittingCfg = DEFAULT
+) -> None:
     """See that recordings are long enough to judge by.
 
     Args:
         where: Which samples count, (T, R) bool.
         control_dt: [s].
         fewest: How many blocks are needed.
+        free: Where joints are free, (T, R, n) bool; ``None``: everywhere.
         cfg: How long they are.
 
     Raises:
         ValueError: If they are not.
     """
+    if free is not None:
+        samples = (free & where[..., None]).sum(dim=(0, 1)).tolist()
+        if _free_blocks(samples, control_dt, cfg) < fewest:
+            raise ValueError(
+                f"In what was kept for validation, legs swing for {max(samples) * control_dt:.2g} s each, too short to "
+                f"judge a model by; expected {fewest * cfg.swing_s:g} s or more. Walk for longer, or fit again with "
+                "further recordings as --validation."
+            )
+        return
     if len(_blocks(where, control_dt, cfg)) < fewest:
         raise ValueError(
             f"What was kept for validation lasts {sum(_spans(where)) * control_dt:.2g} s, too short to judge a model "

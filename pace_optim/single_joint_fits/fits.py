@@ -115,7 +115,10 @@ class Fits:
         every = torch.zeros_like(where)
         every[: batch.dataset.last_step(where)] = True
         errors = batch.simulate([m.physical[None] for m in models], every).cpu()
-        return [block_errors(error, where[: errors.shape[1]], problem.control_dt, cfg=self.cfg) for error in errors]
+        count, weight = errors.shape[1], batch.dataset.weight
+        weight = None if weight is None else weight[:count]
+        cut = partial(block_errors, where=where[:count], control_dt=problem.control_dt, weight=weight, cfg=self.cfg)
+        return [cut(error) for error in errors]
 
     def on_joints(
         self, problem: TwinProblem, starts: Sequence[Fitted], joints: torch.Tensor, errors: BlockErrors

@@ -55,7 +55,7 @@ class SideBySide:
         self._runs = _runs([slot.model.effects for slot in slots])
         evaluator_problem = problem.with_effects(self._cfgs(problem, training))
         evaluator = evaluator_problem.training_evaluator() if training else evaluator_problem.evaluator()
-        self.dataset = evaluator.dataset
+        self.dataset, self._phases = evaluator.dataset, evaluator.phases
         self._num_candidates = sum(slot.rows for slot in slots)
         self.rollout: Rollout = evaluator.rollout(self._num_candidates)
         self._device = device
@@ -89,7 +89,11 @@ class SideBySide:
             self._kernels = None
             errors = self._errors(self._begin(physical, where), steps)
         errors *= where[steps][:, None, :, None].to(errors.device)
-        return errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
+        errors = errors.nan_to_num_(nan=1e3, posinf=1e3, neginf=-1e3).clamp_(-1e3, 1e3).permute(1, 0, 2, 3)
+        if self._phases is None or self.dataset.weight is None:
+            return errors
+        known = self._phases.taken_out(errors.to("cpu", torch.float64), steps, where)
+        return known.mul_(self.dataset.weight[steps]).to(errors)
 
     def _begin(self, physical: Sequence[torch.Tensor], where: torch.Tensor) -> torch.Tensor:
         """Write all parameter sets and begin; returns the encoders' biases, (candidates, R, n) [rad]."""

@@ -11,6 +11,8 @@ import torch
 
 from pace_envs import ManagerBasedEnv
 from pace_envs.closed_loops import ClosedLoops
+from pace_envs.moving_frame import FrameState, bias_in_frame
+from pace_optim.recording.moving_base import Carried
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,22 +61,30 @@ class Motion:
     """There, (T, R, nv)."""
     qacc: torch.Tensor
     """In it, (T, R, nv)."""
+    frame: torch.Tensor | None = None
+    """How the model's frame moves there, (T, R, 9): see :mod:`pace_envs.moving_frame`; ``None``: it rests."""
+    point: torch.Tensor | None = None
+    """Where its specific force acts, (R, 3) [m]."""
 
     @classmethod
-    def between(cls, qpos: torch.Tensor, qvel: torch.Tensor, dt: float) -> Motion:
+    def between(cls, qpos: torch.Tensor, qvel: torch.Tensor, dt: float, carried: Carried | None = None) -> Motion:
         """The motion between control steps, of positions (T, R, nq) and speeds (T, R, nv) at them.
 
         Args:
             qpos: Positions.
             qvel: Speeds.
             dt: Control step [s].
+            carried: How the base moves; ``None``: it rests.
         """
         middle, speed = 0.5 * (qpos[:-1] + qpos[1:]), 0.5 * (qvel[:-1] + qvel[1:])
-        return cls(qpos=middle, qvel=speed, qacc=(qvel[1:] - qvel[:-1]) / dt)
+        frame = None if carried is None else carried.motion(1, dt)[: len(middle), 0]
+        point = None if carried is None else carried.point
+        return cls(qpos=middle, qvel=speed, qacc=(qvel[1:] - qvel[:-1]) / dt, frame=frame, point=point)
 
     def every(self, steps: int) -> Motion:
         """One interval in so many."""
-        return Motion(qpos=self.qpos[::steps], qvel=self.qvel[::steps], qacc=self.qacc[::steps])
+        frame = None if self.frame is None else self.frame[::steps]
+        return replace(self, qpos=self.qpos[::steps], qvel=self.qvel[::steps], qacc=self.qacc[::steps], frame=frame)
 
     def moved(self, by: torch.Tensor) -> Motion:
         """With other positions, by (T, R, nq)."""
@@ -115,13 +125,15 @@ class Links:
         qpos, qvel, qacc = (each.numpy() for each in (motion.qpos, motion.qvel, motion.qacc))
         for r, model in enumerate(self.models):
             data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+            carried = self._carried(model, motion, r)
             for k in range(shape[0]):
                 data.qpos[:], data.qvel[:] = qpos[k, r], qvel[k, r]
                 mujoco.mj_fwdPosition(model, data)
                 mujoco.mj_fwdVelocity(model, data)
                 mujoco.mj_fullM(model, data, mass)
-                missing = mass @ qacc[k, r] + data.qfrc_bias - data.qfrc_passive
-                load[k, r] = -data.qfrc_bias[self.columns]
+                bias = data.qfrc_bias if carried is None else carried[k]
+                missing = mass @ qacc[k, r] + bias - data.qfrc_passive
+                load[k, r] = -bias[self.columns]
                 if self.loops is None:
                     inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]
                 else:
@@ -131,6 +143,19 @@ class Links:
         return JointLoad(
             inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load)
         )
+
+    def _carried(self, model: mujoco.MjModel, motion: Motion, r: int) -> np.ndarray | None:
+        """Forces of a recording's motion in the frame of a base that moves, (T, nv); ``None`` where it rests."""
+        if motion.frame is None or motion.point is None:
+            return None
+        count, data = len(motion.qpos), mujoco.MjData(model)
+        state = FrameState.empty(model, count)
+        for k in range(count):
+            data.qpos[:], data.qvel[:] = motion.qpos[k, r].numpy(), motion.qvel[k, r].numpy()
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            state.keep(k, data)
+        return bias_in_frame(model, state, motion.frame[:, r].numpy(), motion.point[r].numpy())
 
     def shifts(self, motion: Motion, joints: Sequence[int], by: float) -> torch.Tensor:
         """What moves when some of the driven joints move, one of each tree, (T, R, nq)."""

@@ -18,6 +18,8 @@ from pace_optim.single_joint_model.simulation import TwinSimulation
 if TYPE_CHECKING:
     from pace_optim.problem.rollout import Rollout
 
+HELD = ("held_free", "held_position", "held_speed")
+"""Series that say where joints are held, and where they are free."""
 _SIMULATION = ("qpos", "qvel", "qfrc_applied", "_implicit")
 
 
@@ -68,7 +70,13 @@ def record(rollout: Rollout, actuator: PaceDCMotor, rows: range) -> Recorded:
 
 def _one_step(recorder: Places, rollout: Rollout, actuator: PaceDCMotor) -> tuple[Node, dict[int, Node]]:
     """Do a control step with symbols; returns what the encoders show before it, and what becomes of the leaves."""
-    robot, sim, before = rollout.robot, rollout.env.sim, actuator.flags()
+    robot, sim, before = rollout.robot, cast(TwinSimulation, rollout.env.sim), actuator.flags()
+    if rollout.dataset.carried is not None:
+        free, position, speed = (cast(torch.Tensor, recorder.symbol(name)) for name in HELD)
+        position = position + actuator.encoder_bias
+        for field, held in ((sim.qpos, position), (sim.qvel, speed)):
+            sim._set(field, torch.where(free > 0.5, sim._joints(field), held))
+        robot._refresh()
     shown = cast(Symbol, robot.sensed_joint_pos()).cell.node
     if rollout.dataset.torque_enable is not None:
         actuator.set_torque_enable(cast(torch.Tensor, recorder.symbol("torque_enable")))

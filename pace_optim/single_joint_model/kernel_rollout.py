@@ -12,7 +12,7 @@ import torch
 
 from pace_optim.one_kernel.drive import commands
 from pace_optim.problem.rollout import between_steps
-from pace_optim.single_joint_model.kernel_recorder import Recorded, record
+from pace_optim.single_joint_model.kernel_recorder import HELD, Recorded, record
 
 if TYPE_CHECKING:
     from pace_optim.problem.rollout import Rollout
@@ -85,6 +85,7 @@ class KernelRollout:
             lag = torch.zeros(2, num_envs, n, dtype=torch.float64)
         most = 0.0 if offset is None else float(offset.abs().max())
         ahead = 0 if lag is None else max(0, math.ceil(most - float(lag.min()))) + 2
+        rollout.hold(0)
         first = rollout.robot.sensed_joint_pos().clone()
         result = torch.empty(len(at), num_envs, n, dtype=torch.float64, device=self._device)
         if steps == 1:
@@ -167,6 +168,8 @@ class KernelRollout:
         rollout = self._rollout
         if name in _OF_RECORDINGS:
             value = commands(rollout.env, rollout.dataset, name)
+        elif name in HELD and (carried := rollout.dataset.carried) is not None:
+            value = dict(zip(HELD, (carried.free, *carried.measured.unbind(dim=-1)), strict=True))[name]
         else:
             value = rollout.env.sim.series(name)  # type: ignore[attr-defined]
         return value.double().reshape(len(value), -1)

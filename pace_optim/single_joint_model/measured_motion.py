@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy import fft, optimize
 
+from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset
 from pace_optim.recording.noise import noise_floor
 
@@ -37,12 +38,26 @@ def beside_simulation(dataset: Dataset, shown: torch.Tensor) -> torch.Tensor:
     for r, recording in enumerate(dataset.recordings):
         dt = float(np.median(np.diff(recording.time)))
         last = int(dataset.sampled[:count, r].nonzero()[-1]) + 1
+        if dataset.carried is not None:
+            _smooth_phases(error[:, r], dataset.carried.free[:count, r], recording, dt)
+            continue
         for j in range(error.shape[2]):
             noise = noise_floor(recording.dof_pos[:, j], dt).sigma
             each = error[:last, r, j].numpy()
             error[:last, r, j] = torch.from_numpy(_smooth(each, noise))
             error[last:, r, j] = error[last - 1, r, j]
     return error
+
+
+def _smooth_phases(error: torch.Tensor, free: torch.Tensor, recording: Recording, dt: float) -> None:
+    """Smooth errors (T, n) in each free phase by itself; a joint that is held is where it was measured."""
+    for j in range(error.shape[1]):
+        noise = noise_floor(recording.dof_pos[:, j], dt).sigma
+        own = free[:, j].numpy().astype(int)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], own, [0]])))
+        error[:, j] *= free[:, j]
+        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            error[first:end, j] = torch.from_numpy(_smooth(error[first:end, j].numpy(), noise))
 
 
 def _smooth(values: np.ndarray, noise: float) -> np.ndarray:

@@ -13,7 +13,9 @@ import torch
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
+from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
+from pace_optim.recording.moving_base import Carried
 from pace_optim.single_joint_model.feel import JointLoad, Links, LoadChange, Motion
 from pace_optim.single_joint_model.measured_motion import at_every_step, beside_simulation
 
@@ -43,6 +45,8 @@ class ReferencePath:
     """The joints' degrees of freedom in the model, (n,)."""
     control_dt: float
     """[s]."""
+    phases: FreePhases | None = None
+    """What is not known of the free phases of each joint; ``None`` where all bases rest."""
 
     def typical_effort(self, armature: torch.Tensor) -> torch.Tensor:
         """RMS torque that moves each joint and holds its load, (n,) [N m].
@@ -79,11 +83,13 @@ class ReferencePath:
     def on_joints(self, joints: Sequence[int]) -> ReferencePath:
         """Of some of the joints, by index."""
         chosen = list(joints)
-        return self._part((..., chosen), columns=self.columns[chosen])
+        phases = None if self.phases is None else self.phases.on_joints(chosen)
+        return self._part((..., chosen), columns=self.columns[chosen], phases=phases)
 
     def select(self, recordings: Sequence[int]) -> ReferencePath:
         """Some of the recordings, by index."""
-        return self._part((slice(None), list(recordings)))
+        phases = None if self.phases is None else self.phases.select(recordings)
+        return self._part((slice(None), list(recordings)), phases=phases)
 
     def at(self, step: torch.Tensor, recording: torch.Tensor) -> ReferencePath:
         """Parts of the recordings: of each (W,) those control steps (T', W); where there are none, the last one."""
@@ -145,7 +151,8 @@ def reference_path(
     if problem.joints_stand_alone:
         return _along(problem, values, model_effects, rollout, *motion)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
-    beside *= beside.square().mean(dim=0, keepdim=True).sqrt() <= away
+    share = 1.0 if problem.dataset.carried is None else _share_of_free(problem.dataset.carried, len(beside))
+    beside *= (beside.square().mean(dim=0, keepdim=True) / share).sqrt() <= away
     if late is not None:
         beside[..., late] = 0.0
     return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
@@ -182,6 +189,8 @@ def _taken(
     """A motion with its driven joints moved by (T, R, n) [rad]; those without drives follow."""
     robot = rollout.robot
     faster = torch.gradient(beside, spacing=dt, dim=0)[0]
+    if (carried := rollout.dataset.carried) is not None:
+        faster = _within_phases(beside, faster, carried.free[: len(beside)], dt)
     if robot.closed_loops is None:
         positions[..., robot.qpos_columns] += beside
         speeds[..., robot.dof_columns] += faster
@@ -215,7 +224,13 @@ def _along(
     speeds: torch.Tensor,
 ) -> ReferencePath:
     """What each joint feels along a motion of all, (T, R, nq) and (T, R, nv); closes the rollout's environment."""
-    motion = Motion.between(positions, speeds, problem.control_dt)
+    carried = problem.dataset.carried
+    motion = Motion.between(positions, speeds, problem.control_dt, carried)
+    phases = None
+    if carried is not None:
+        evaluator = problem.evaluator()
+        own = {p.name: {key: values[p.name][key] for key in p.keys} for p in problem.space.parameters}
+        phases = evaluator.free_phases(problem.space.from_dict(own)).of_single_joints()
     links = Links.of(rollout.env)
     whole = feel = links.feel(motion)
     whole_stiffness = torch.zeros_like(whole.torque)
@@ -238,7 +253,24 @@ def _along(
         model_effects=changes,
         columns=rollout.robot.dof_columns,
         control_dt=problem.control_dt,
+        phases=phases,
     )
+
+
+def _share_of_free(carried: Carried, steps: int) -> torch.Tensor:
+    """In which part of the time each joint is free, (R, n)."""
+    return carried.free[:steps].double().mean(dim=0).clamp(min=1e-9)
+
+
+def _within_phases(values: torch.Tensor, slope: torch.Tensor, free: torch.Tensor, dt: float) -> torch.Tensor:
+    """Slopes of values (T, R, n) without what jumps where a free phase begins or ends."""
+    ahead = torch.zeros_like(values)
+    ahead[:-1] = (values[1:] - values[:-1]) / dt
+    begins, ends = torch.ones_like(free), torch.ones_like(free)
+    begins[1:], ends[:-1] = ~free[:-1], ~free[1:]
+    behind = torch.cat([torch.zeros_like(ahead[:1]), ahead[:-1]])
+    result = torch.where(ends, behind, torch.where(begins, ahead, slope))
+    return result * (free & ~(begins & ends))
 
 
 def _on_all_joints(

@@ -53,6 +53,8 @@ class TwinProblem(Problem):
 
     def in_windows(self) -> TwinProblem:
         """The same with recordings cut into windows: some times as fast, to lead a fit, not to judge by."""
+        if self.dataset.carried is not None:  # a free phase is a window already
+            return self
         windows = Windows.of(self.dataset, self.control_dt)
         path = self.path.at(windows.step, windows.recording)
         return replace(self, dataset=windows.cut(self.dataset), path=path)
@@ -65,7 +67,7 @@ class TwinProblem(Problem):
         def make_env(num_envs: int) -> ManagerBasedRLEnv:
             return self.make_env(num_envs, simulation=partial(TwinSimulation, path=path))
 
-        return Evaluator(make_env, dataset, self.space)
+        return Evaluator(make_env, dataset, self.space, self.trees, path.phases)
 
 
 def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:

@@ -103,6 +103,9 @@ class TwinSimulation(Simulation):
         result[:, self._columns] = load.neg_().view(len(result), -1)
         return result
 
+    def move_base(self, motion: torch.Tensor | None, point: np.ndarray | None = None) -> None:
+        """Nothing: what joints feel of it is on the path."""
+
     def bind(self, field: str) -> torch.Tensor:
         """A field of the state, at zero, (num_envs, ...): nobody else holds it."""
         return torch.zeros(self.num_envs, self.model.nq if field == "qpos" else self.model.nv, dtype=self.dtype)

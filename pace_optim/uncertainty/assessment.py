@@ -51,6 +51,7 @@ def assess(
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
     """
     data, recordings = problem.dataset, problem.dataset.trained()
+    evaluator.look_at_phases(problem.space.to_physical(x), anew=True)
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
     for _ in range(2 if hessian is None else 1):
         around = stencil(x, colouring, hessian, noise, score)
@@ -60,12 +61,13 @@ def assess(
         train = data.train[every.step][:, recordings]
         steps = train.any(dim=1)
         error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
-        trained = Residuals(error=error, where=train[steps], step=every.step[steps])
+        weight = None if every.weight is None else every.weight[steps][:, recordings]
+        trained = Residuals(error=error, where=train[steps], step=every.step[steps], weight=weight)
         there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
         hessian, _ = there.normal_equations()
     initial = probes.initial(error)
     uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held)
-    residuals = Residuals(error=every.error[:1], where=every.where, step=every.step)
+    residuals = every.rows(0, 1)
     return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise)
 
 
@@ -129,6 +131,9 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
         at = residuals.where[:, r]
         measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
         enabled = recording.torque_enable
+        error = residuals.error[0, at, r]
+        if residuals.weight is not None:
+            error = error / residuals.weight[at, r].clamp(min=1.0)
         on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
         result.append(
             {
@@ -136,7 +141,7 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
                 "time": torch.as_tensor(recording.time)[: len(measured)],
                 "des_dof_pos": torch.as_tensor(recording.sampled_command)[: len(measured)],
                 "dof_pos": measured,
-                "sim_dof_pos": measured + residuals.error[0, at, r],
+                "sim_dof_pos": measured + error,
                 "train": data.train[residuals.step][at, r],
                 "torque_enable": on[: len(measured)],
             }

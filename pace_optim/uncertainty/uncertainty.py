@@ -195,7 +195,10 @@ def _middle(jacobian: Jacobian) -> np.ndarray:
             own = [entry for entry in row if joint in colouring.joints[entry]]
             columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
-            total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
+            counts = 1.0  # a sample that counts s² times is one all the same: of the mean over all of s², none is new
+            if residuals.weight is not None:
+                counts = float(residuals.weight[at, r, joint].square().max())
+            total[np.ix_(own, own)] += counts * columns @ filtered(columns, autocovariance(error)).T
     return total
 
 

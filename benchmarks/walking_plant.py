@@ -1,0 +1,234 @@
+"""Logs of robots whose base moves, made in plain MuJoCo: nothing of this project is imported.
+
+A walking robot has a free base and feet on the ground. A robot in ropes has a base that swings on a pendulum, and
+touches nothing. Both log encoders, commands, an IMU and, where there are feet, contacts.
+
+    python benchmarks/walking_plant.py assets/anymal_d/anymal_d.xml --swing --output swing.npz
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+STEP, CONTROL = 0.00025, 0.0025
+"""Of the physics, and of the drives and the log [s]."""
+QUADRUPED = """
+<mujoco model="crawler">
+  <compiler angle="radian"/>
+  <option cone="elliptic" impratio="10"/>
+  <default>
+    <joint type="hinge" range="-2.5 2.5"/>
+    <geom contype="0" conaffinity="1" friction="0.9 0.02 0.01"/>
+  </default>
+  <worldbody>
+    <body name="trunk" pos="0 0 0.30">
+      <freejoint name="root"/>
+      <site name="imu" pos="0.05 0.01 0.02"/>
+      <geom type="box" size="0.2 0.1 0.04" mass="6"/>
+      {legs}
+    </body>
+  </worldbody>
+</mujoco>
+"""
+_LEG = """
+      <body name="{leg}_thigh" pos="{x} {y} 0">
+        <joint name="{leg}_hip" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.16" size="0.02" mass="0.7"/>
+        <body name="{leg}_shank" pos="0 0 -0.16">
+          <joint name="{leg}_knee" axis="0 1 0"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.16" size="0.015" mass="0.25"/>
+          <geom name="{leg}_foot" type="sphere" pos="0 0 -0.16" size="0.02" mass="0.05"/>
+        </body>
+      </body>"""
+LEGS = ("fl", "fr", "rl", "rr")
+
+
+def quadruped() -> str:
+    """The MJCF of a small robot with four legs of two joints each."""
+    places = zip(LEGS, (0.18, 0.18, -0.18, -0.18), (0.12, -0.12, 0.12, -0.12), strict=True)
+    return QUADRUPED.format(legs="".join(_LEG.format(leg=leg, x=x, y=y) for leg, x, y in places))
+
+
+def trot(time: float, legs: int = 4) -> np.ndarray:
+    """Targets of the small robot's joints in a trot, (2 legs,) [rad]: diagonal legs lift together."""
+    result = []
+    for leg in range(legs):
+        phase = 2 * np.pi * (1.4 * time + (0.5 if leg in (1, 2) else 0.0))
+        lift = max(0.0, np.sin(phase)) * min(1.0, time)
+        bend = 0.55 + 0.45 * lift + 0.03 * np.sin(2 * np.pi * 0.37 * time + leg)
+        result += [bend + 0.15 * np.cos(phase) * min(1.0, time), -2 * bend]
+    return np.array(result)
+
+
+@dataclass(kw_only=True)
+class Plant:
+    """A robot, its drives as they are, and how its base moves."""
+
+    xml: str
+    joints: tuple[str, ...]
+    truth: Mapping[str, np.ndarray]
+    """``armature`` [kg m²], ``viscous_friction`` [N m s/rad] and ``friction`` [N m] of each joint."""
+    targets: Callable[[float], np.ndarray]
+    """Positions that joints are told at a time, (n,) [rad]."""
+    feet: Mapping[str, str] = field(default_factory=dict)
+    """Geom of each foot, by the foot's name; none: nothing touches the ground."""
+    swing: float | None = None
+    """Length of the pendulum on which the base swings [m]; 0: the base is fixed; ``None``: it is free."""
+    kp: float = 85.0
+    kd: float = 0.6
+    delay: int = 2
+    """Of commands [control steps]."""
+    effort_limit: float = 89.0
+    spring: np.ndarray | float = 0.0
+    """Stiffness of a spring towards 0 at each joint [N m/rad]."""
+    tilt: float = np.radians(5)
+    """Of the pendulum at the beginning [rad]."""
+    noise: tuple[float, float, float] = (1e-4, 2e-3, 0.03)
+    """Of encoders [rad], gyroscope [rad/s] and accelerometer [m/s²]."""
+    seed: int = 0
+
+    def model(self) -> mujoco.MjModel:
+        """Compile it."""
+        spec = mujoco.MjSpec.from_string(self.xml)
+        spec.option.timestep = STEP
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        for element in [*spec.actuators, *spec.keys, *spec.sensors]:
+            spec.delete(element)
+        if self.swing is not None:
+            root = next(joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE)
+            base = root.parent
+            spec.delete(root)
+            if self.swing:
+                base.add_joint(name="rope", type=mujoco.mjtJoint.mjJNT_BALL, pos=[0, 0, self.swing])
+        if self.feet:
+            spec.worldbody.add_geom(
+                name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], contype=1, conaffinity=1
+            )
+        else:
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        for i, name in enumerate(self.joints):
+            joint = spec.joint(name)
+            joint.armature, joint.frictionloss = self.truth["armature"][i], self.truth["friction"][i]
+            joint.damping[0] = self.truth["viscous_friction"][i]
+            joint.solref_friction = [2 * STEP, 1.0]
+            joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
+        for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
+            spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
+        return spec.compile()
+
+    def simulate(self, duration: float) -> dict[str, Any]:
+        """A recording's fields."""
+        model, rng = self.model(), np.random.default_rng(self.seed)
+        data = mujoco.MjData(model)
+        q = np.array([model.joint(name).qposadr[0] for name in self.joints])
+        v = np.array([model.joint(name).dofadr[0] for name in self.joints])
+        data.qpos[q] = self.targets(0.0)
+        if self.swing:
+            at = model.joint("rope").qposadr[0]
+            data.qpos[at : at + 4] = [
+                np.cos(self.tilt / 2),
+                0.6 * np.sin(self.tilt / 2),
+                0.8 * np.sin(self.tilt / 2),
+                0,
+            ]
+        elif self.swing is None:
+            mujoco.mj_kinematics(model, data)
+            lowest = min(data.geom(geom).xpos[2] - model.geom(geom).size[0] for geom in self.feet.values())
+            data.qpos[2] -= lowest
+        count, parts, n = round(duration / CONTROL), round(CONTROL / STEP), len(self.joints)
+        feet = [model.geom(geom).id for geom in self.feet.values()]
+        log: dict[str, Any] = {"time": np.arange(count) * CONTROL}
+        for key, size in (("dof_pos", n), ("des_dof_pos", n), ("base_ang_vel", 3), ("base_lin_acc", 3)):
+            log[key] = np.zeros((count, size))
+        if feet:
+            log["contact"], log["feet"] = np.zeros((count, len(feet)), dtype=bool), list(self.feet)
+        targets = [self.targets(0.0)] * self.delay
+        for k in range(count):
+            mujoco.mj_forward(model, data)
+            sigma = self.noise
+            log["dof_pos"][k] = data.qpos[q] + sigma[0] * rng.standard_normal(n)
+            log["base_ang_vel"][k] = data.sensor("gyro").data + sigma[1] * rng.standard_normal(3)
+            log["base_lin_acc"][k] = data.sensor("acc").data + sigma[2] * rng.standard_normal(3)
+            if feet:
+                pairs = data.contact.geom[: data.ncon] if data.ncon else np.zeros((0, 2), dtype=int)
+                log["contact"][k] = np.isin(feet, pairs)
+            log["des_dof_pos"][k] = self.targets(k * CONTROL)
+            targets.append(log["des_dof_pos"][k])
+            torque = self.kp * (targets[k] - data.qpos[q]) - self.kd * data.qvel[v]
+            held = np.clip(torque, -self.effort_limit, self.effort_limit)
+            for _ in range(parts):
+                data.qfrc_applied[v] = held - self.spring * data.qpos[q]
+                mujoco.mj_step(model, data)
+        return {
+            **log,
+            "joint_names": list(self.joints),
+            "stiffness": self.kp,
+            "damping": self.kd,
+            "effort_limit": self.effort_limit,
+            "saturation_effort": np.inf,  # no torque-speed line
+            "velocity_limit": np.inf,
+        }
+
+
+def drawn(n: int, seed: int, scale: float = 1.0) -> dict[str, np.ndarray]:
+    """Parameters of n drives, drawn; ``scale`` is that of the torques."""
+    rng = np.random.default_rng(seed)
+    ranges = {"armature": (0.05, 0.1), "viscous_friction": (1.2, 3.0), "friction": (0.1, 0.4)}
+    return {name: scale * rng.uniform(low, high, n) for name, (low, high) in ranges.items()}
+
+
+def crawler(seed: int = 0, **changes: Any) -> Plant:
+    """The small robot, trotting."""
+    joints = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee"))
+    feet = {leg: f"{leg}_foot" for leg in LEGS}
+    options = {"kp": 40.0, "kd": 0.5, "effort_limit": 40.0, "truth": drawn(len(joints), seed, 0.2), "feet": feet}
+    return Plant(**{"xml": quadruped(), "joints": joints, "targets": trot, "seed": seed, **options, **changes})
+
+
+def chirps(joints: int, top: float, duration: float) -> Callable[[float], np.ndarray]:
+    """Chirps to a frequency [Hz] of legs of three joints each, as a recording in the air has them."""
+    bias, scale = np.array([0.0, 0.4, 0.8]), np.array([0.25, 0.5, -2.0])
+
+    def targets(time: float) -> np.ndarray:
+        phase = 2 * np.pi * (0.1 * time + (top - 0.1) / (2 * duration) * time**2)
+        legs = joints // 3
+        signs = np.ones((legs, 3))
+        return ((np.sin(phase) * min(1.0, 2 * time) * 0.4 + bias) * scale * signs).reshape(-1)
+
+    return targets
+
+
+def main() -> None:
+    """Write a log and its truth."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("model", type=Path, help="MJCF of ANYmal D")
+    parser.add_argument("--swing", action="store_true", help="swing on a pendulum of 2 m; else the base is fixed")
+    parser.add_argument("--duration", type=float, default=20.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, required=True)
+    args = parser.parse_args()
+    joints = tuple(f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE"))
+    plant = Plant(
+        xml=args.model.read_text(),
+        joints=joints,
+        truth=drawn(len(joints), args.seed),
+        targets=chirps(len(joints), 10.0, args.duration),
+        swing=2.0 if args.swing else 0.0,
+        seed=args.seed,
+    )
+    fields = plant.simulate(args.duration)
+    np.savez_compressed(args.output, **fields)
+    truth = {name: values.tolist() for name, values in plant.truth.items()} | {"delay": plant.delay * CONTROL}
+    args.output.with_suffix(".truth.json").write_text(json.dumps(truth))
+
+
+if __name__ == "__main__":
+    main()

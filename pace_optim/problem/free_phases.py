@@ -1,0 +1,211 @@
+"""What nobody knows of a free phase, taken out of its errors: where it begins, and what the accelerometer misses.
+
+A foot leaves the ground. From there on its leg moves freely, from a position and a speed that encoders tell with an
+error, under a specific force that an accelerometer tells with another. Errors e of the right model then have the
+covariance
+
+    C = σ² + A Aᵀ + B Bᵀ
+
+with σ the encoders' noise, A the derivatives of e by the beginning, each times the standard deviation of that part of
+it, and B those by the specific force in each control step, times its. Least squares of
+
+    e' = σ L⁻¹ e / σ,    C = σ² L Lᵀ
+
+is the estimate that knows of this (Aitken, Proceedings of the Royal Society of Edinburgh 55, 1936). L is lower
+triangular in time: e' is what a sample says beyond all those before it. The beginnings cost no parameter.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from pace_optim.recording.moving_base import Carried
+
+_BLOCK = 160
+"""Control steps of a phase whose errors are looked at together: those further apart are taken for independent."""
+_KEPT = 3
+"""Masks of samples that are remembered."""
+FORCE = 0.1
+"""Change of the specific force for a derivative [m/s²]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Block:
+    """A part of a free phase of joints that move each other."""
+
+    recording: int
+    joints: list[int]
+    begin: int
+    """Control step at which the phase begins: joints are there where they were measured."""
+    first: int
+    """First control step of the part."""
+    end: int
+    """One after its last."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreePhases:
+    """The free phases of a dataset, and the covariance of their errors."""
+
+    blocks: tuple[Block, ...]
+    covariances: tuple[torch.Tensor, ...]
+    """Of each, C / σ², (steps joints, steps joints)."""
+    noise: torch.Tensor
+    """σ, (R, n) [rad]."""
+    _known: list[tuple[torch.Tensor, torch.Tensor, list[tuple[int, int, torch.Tensor]]]] = field(default_factory=list)
+    """Steps, a mask, and L⁻¹ there, of the last few."""
+
+    def of_single_joints(self) -> FreePhases:
+        """The same of each joint by itself: whatever its neighbours show."""
+        blocks, covariances = [], []
+        for block, covariance in zip(self.blocks, self.covariances, strict=True):
+            for i, joint in enumerate(block.joints):
+                own = slice(i, None, len(block.joints))
+                blocks.append(replace(block, joints=[joint]))
+                covariances.append(covariance[own, own])
+        return replace(self, blocks=tuple(blocks), covariances=tuple(covariances), _known=[])
+
+    def select(self, recordings: Sequence[int]) -> FreePhases:
+        """Those of some of the recordings, by index."""
+        chosen = list(recordings)
+        kept = [
+            (replace(block, recording=chosen.index(block.recording)), covariance)
+            for block, covariance in zip(self.blocks, self.covariances, strict=True)
+            if block.recording in chosen
+        ]
+        blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
+        return replace(self, blocks=blocks, covariances=covariances, noise=self.noise[chosen], _known=[])
+
+    def on_joints(self, joints: Sequence[int]) -> FreePhases:
+        """Those of some joints, by index, each by itself."""
+        chosen = list(joints)
+        kept = [
+            (replace(block, joints=[chosen.index(block.joints[0])]), covariance)
+            for block, covariance in zip(self.blocks, self.covariances, strict=True)
+            if block.joints[0] in chosen
+        ]
+        blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
+        return replace(self, blocks=blocks, covariances=covariances, noise=self.noise[:, chosen], _known=[])
+
+    def taken_out(self, error: torch.Tensor, step: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+        """Errors without what beginnings and the specific force explain; changed in place.
+
+        Args:
+            error: (m, K, R, n) [rad].
+            step: Control step of each of the K, ascending, (K,).
+            where: Which samples count, (T, R) bool.
+        """
+        for block, (begin, end, whitening) in zip(self.blocks, self._where(step, where), strict=True):
+            if begin < end:
+                part = error[:, begin:end, block.recording][..., block.joints]
+                sigma = self.noise[block.recording, block.joints]
+                left = ((part / sigma).flatten(1) @ whitening.T).view(part.shape) * sigma
+                error[:, begin:end, block.recording, block.joints] = left
+        return error
+
+    def _where(self, step: torch.Tensor, where: torch.Tensor) -> list[tuple[int, int, torch.Tensor]]:
+        """For each block, its rows among the steps, and L⁻¹ of its samples."""
+        for steps, mask, known in self._known:
+            if (mask is where or torch.equal(mask, where)) and torch.equal(steps, step):
+                return known
+        result = []
+        for block, covariance in zip(self.blocks, self.covariances, strict=True):
+            begin, end = np.searchsorted(step.numpy(), [block.first, block.end])
+            at = step[begin:end]
+            counts = where[at, block.recording][:, None].expand(-1, len(block.joints)).flatten()
+            joints = len(block.joints)
+            own = ((at - block.first)[:, None] * joints + torch.arange(joints)).flatten()
+            part = covariance[own][:, own]
+            part = torch.where(counts[:, None] & counts, part, torch.eye(len(own), dtype=part.dtype))
+            factor = torch.linalg.cholesky(part)
+            whitening = torch.linalg.solve_triangular(factor, torch.eye(len(own), dtype=part.dtype), upper=False)
+            result.append((int(begin), int(end), whitening))
+        self._known.append((step, where, result))
+        del self._known[:-_KEPT]
+        return result
+
+
+def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, ...]:
+    """The free phases of joints that move each other, where all of them are free, in parts.
+
+    Args:
+        carried: R recordings.
+        trees: Groups of joints, by index.
+    """
+    result = []
+    for r in carried.moves.nonzero()[:, 0].tolist():
+        for tree in trees:
+            free = carried.free[:, r, list(tree)].all(dim=1).numpy().astype(int)
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], free, [0]])))
+            for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+                parts = max(1, round((end - first) / _BLOCK))
+                cuts = [first + (end - first) * i // parts for i in range(parts + 1)]
+                result += [
+                    Block(recording=r, joints=list(tree), begin=max(0, first - 1), first=a, end=b)
+                    for a, b in itertools.pairwise(cuts)
+                ]
+    return tuple(result)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PhaseProbes:
+    """What to simulate to see how errors depend on beginnings and on the specific force; a row each."""
+
+    shift: torch.Tensor
+    """Changes of where joints are held: those of one joint of each tree at a time, first of positions, then of speeds;
+    then none, (2 depth + 3, n, 2)."""
+    push: torch.Tensor
+    """Changes of the specific force: none, then along each axis, (2 depth + 3, 3)."""
+
+    @classmethod
+    def of(cls, carried: Carried, trees: Sequence[Sequence[int]]) -> PhaseProbes:
+        """As wide as what is not known of beginnings."""
+        std, depth = carried.start_std.amax(dim=0), max(len(tree) for tree in trees)
+        shift = torch.zeros(2 * depth + 3, *std.shape, dtype=std.dtype)
+        push = torch.zeros(2 * depth + 3, 3, dtype=std.dtype)
+        for kind in range(2):
+            for i in range(depth):
+                own = [tree[i] for tree in trees if i < len(tree)]
+                shift[kind * depth + i, own, kind] = std[own, kind]
+        push[2 * depth :] = FORCE * torch.eye(3, dtype=std.dtype)
+        return cls(shift=shift, push=push)
+
+
+def free_phases(carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor) -> FreePhases:
+    """The phases, and the covariances of their errors.
+
+    A push in a control step moves a joint later as one in the first step of the phase does: a leg changes its posture
+    little while it remembers a push.
+
+    Args:
+        carried: R recordings.
+        trees: Groups of joints, by index.
+        change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 3, T, R, n).
+    """
+    depth, noise = max(len(tree) for tree in trees), carried.start_std[..., 0]
+    most = carried.start_std.amax(dim=0)
+    blocks, covariances = blocks_of(carried, trees), []
+    for block in blocks:
+        r, joints, count = block.recording, block.joints, block.end - block.first
+        sigma = noise[r, joints]
+        rows = [kind * depth + i for kind in range(2) for i in range(len(joints))]
+        scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
+        begun = scale[:, None, None] * change[rows][:, block.first : block.end, r][..., joints] / sigma
+        columns = [begun.flatten(1)]
+        response = change[2 * depth :, block.begin : block.end, r][..., joints] / (FORCE * sigma)
+        kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
+        since = min(block.first - block.begin, 2 * _BLOCK)
+        for i in range(block.first - since, block.end - 1):
+            behind = torch.arange(block.first, block.end) - i - 1
+            felt = (behind >= 0) & (behind < kick.shape[1])
+            own = torch.zeros(3, count, len(joints), dtype=change.dtype)
+            own[:, felt] = kick[:, behind[felt]] * carried.force_std[i, r][:, None, None]
+            columns.append(own.flatten(1))
+        every = torch.cat(columns)
+        covariances.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
+    return FreePhases(blocks=blocks, covariances=tuple(covariances), noise=noise)

@@ -1,0 +1,195 @@
+"""Recordings of robots whose base moves: the legs of a walking robot are identified while they swing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from recordings import conform, recording, says
+from walking import DT, crawler, walking_problem, write_log
+
+from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs.kernels import host
+from pace_optim.optimizers.derivatives import colour, stencil
+from pace_optim.problem.moving_base import imu_pose, joints_of_feet
+from pace_optim.recording.data import ImuPose
+from pace_optim.recording.dataset import make_dataset
+from pace_optim.recording.moving_base import Carried, force_noise, free_phases
+from pace_optim.recording.parts import informative_parts
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A trot."""
+    return walking_problem(tmp_path_factory.mktemp("walk"), duration=1.6)
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch):
+    """Compile at once, however short a recording is."""
+    monkeypatch.setattr(host, "_PATIENCE", 0)
+
+
+def steps_of(problem, x):
+    """Where one Gauss-Newton step from x leads, physical (size,)."""
+    evaluator, space = problem.training_evaluator(), problem.space
+    around = stencil(x, colour(space, problem.trees, problem.joint_names), first=3e-3)
+    residuals = evaluator.residuals(space.to_physical(torch.cat([x[None], around.vectors])))
+    hessian, gradient = around.jacobian(residuals).normal_equations()
+    scale = hessian.diagonal().clamp(min=1e-30).sqrt()
+    whole = torch.linalg.pinv(hessian / scale[:, None] / scale, rtol=1e-7, hermitian=True)
+    return space.to_physical(x - whole @ (gradient / scale) / scale), residuals
+
+
+def test_swinging_legs_have_the_truth_at_the_bottom_of_their_error(walk):
+    problem, truth = walk
+    found, residuals = steps_of(problem, problem.space.to_normalised(truth))
+    assert float(residuals.joint_score[0].sqrt().max()) < 2e-4  # of 1e-4 of noise
+    for name, within in (("armature", 0.03), ("viscous_friction", 0.05)):
+        own = problem.space[name]
+        error = (found[own] / truth[own] - 1).abs()
+        assert float(error.max()) < 2 * within and float(error.median()) < within, name
+    assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 1e-3
+
+
+def test_without_the_motion_of_the_base_the_error_is_many_times_the_noise(walk):
+    problem, truth = walk
+    carried = problem.dataset.carried
+    still = torch.zeros_like(carried.base)
+    still[..., 5] = 9.81
+    resting = replace(problem, dataset=replace(problem.dataset, carried=replace(carried, base=still)))
+    with_base, without = (p.evaluator().residuals(truth[None]).score[0] for p in (problem, resting))
+    assert float(without) > 100 * float(with_base)
+
+
+def test_compiled_drives_move_as_the_environment_does(walk, monkeypatch):
+    problem, truth = walk
+    problem = problem.on_pieces(0.2)
+    shown = []
+    for compiled in (True, False):
+        rollout = problem.evaluator().rollout(2)
+        if not compiled:
+            monkeypatch.setattr(rollout._compiled, "positions", lambda *_: None)
+        shift, push = torch.zeros(2, 8, 2, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
+        shift[1], push[1] = 0.01, 0.2
+        rollout.start(truth.expand(2, -1), problem.dataset.sampled, shift=shift, push=push)
+        shown.append(rollout.positions(torch.arange(60)))
+    assert float((shown[0] - shown[1]).abs().max()) < 1e-9
+    count = problem.dataset.num_recordings
+    assert float((shown[0][:, :count] - shown[0][:, count:]).abs().max()) > 1e-4
+
+
+def test_a_base_that_rests_moves_joints_as_a_fixed_one_does(walk):
+    problem, truth = walk
+    carried = problem.dataset.carried
+    base = torch.zeros_like(carried.base)
+    base[..., 5] = 9.81
+    free = torch.ones_like(carried.free)
+    resting = replace(carried, base=base, free=free)
+    results = []
+    for each in (None, resting):
+        dataset = replace(problem.dataset, carried=each)
+        rollout = replace(problem, dataset=dataset).evaluator().rollout(1)
+        rollout.start(truth[None], dataset.sampled)
+        results.append(rollout.positions(torch.arange(300)))
+    assert float((results[0] - results[1]).abs().max()) < 1e-10
+
+
+def test_a_joint_that_stands_is_where_it_was_measured(walk):
+    problem, truth = walk
+    evaluator = problem.evaluator()
+    residuals = evaluator.residuals(truth[None], problem.dataset.sampled)
+    held = ~problem.dataset.carried.free
+    assert float(residuals.error[0][held].abs().max()) == 0.0
+    share = problem.dataset.carried.free.double().mean(dim=0)
+    assert bool((share > 0.1).all()) and bool((share < 0.9).all())
+
+
+def test_chatter_is_no_swing_and_a_swing_keeps_a_margin():
+    standing = np.ones(400, dtype=bool)
+    standing[100:200] = False
+    standing[210:214] = standing[216:217] = False
+    free = free_phases(standing, DT)
+    assert np.flatnonzero(free).tolist() == list(range(104, 196))
+    standing[150] = True  # one sample of contact cuts it
+    assert not free_phases(standing, DT)[146:155].any()
+
+
+def test_what_happens_between_samples_is_noise_of_the_accelerometer():
+    rng = np.random.default_rng(0)
+    time = np.arange(2000) * DT
+    smooth = np.stack([np.sin(20 * time)] * 3, axis=1)
+    noisy = smooth + 0.05 * rng.standard_normal(smooth.shape)
+    assert np.median(force_noise(noisy, DT)) == pytest.approx(0.05, rel=0.1)
+    noisy[1000:1004] += 5 * rng.standard_normal((4, 3))
+    assert force_noise(noisy, DT)[1000].min() > 0.3
+
+
+def test_the_frame_turns_by_the_slope_of_the_gyroscope():
+    base = torch.zeros(3, 1, 6, dtype=torch.float64)
+    base[:, 0, 0], base[:, 0, 5] = torch.tensor([0.0, 1.0, 1.0]), torch.tensor([9.0, 10.0, 11.0])
+    empty = torch.zeros(3, 1, 1, dtype=torch.float64)
+    carried = Carried(
+        base=base, point=empty[0], measured=empty[..., None], free=empty > 0, start_std=empty, force_std=empty
+    )
+    motion = carried.motion(2, 0.5)
+    assert motion[0, :, 0, 0].tolist() == [0.25, 0.75] and motion[0, :, 0, 3].tolist() == [2.0, 2.0]
+    assert motion[0, :, 0, 8].tolist() == [9.25, 9.75] and motion[2, :, 0, 3].tolist() == [0.0, 0.0]
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robot")
+    write_log(folder, crawler(), 0.1)
+    cfg = load_env_cfg(str(folder / "robot.xml"), DT)
+    return ManagerBasedRLEnv(cfg)
+
+
+@pytest.mark.parametrize("foot", ["fl_foot", "fl_shank", "fl", "FL"])
+def test_a_foot_is_a_geom_a_body_or_a_leg(env, foot):
+    assert joints_of_feet(env, [foot, "rr"], "walk") == [[0, 1], [6, 7]]
+
+
+def test_an_unknown_foot_and_a_wrong_imu_are_refused(env):
+    model = env.sim.model
+    with pytest.raises(ValueError, match=says("feet names 'fl_hoof'", "fl_shank", "Correct the name")):
+        joints_of_feet(env, ["fl_hoof"], "walk")
+    with pytest.raises(ValueError, match=says("no site 'gyro'", "it has imu", "fact imu")):
+        imu_pose(model, ImuPose(site="gyro"), "walk")
+    with pytest.raises(ValueError, match=says("on 'fl_thigh'", "joints move")):
+        imu_pose(model, ImuPose(body="fl_thigh"), "walk")
+    axes, point = imu_pose(model, ImuPose(body="trunk", pos=(0.1, 0, 0), quat=(0, 0, 0, 1)), "walk")
+    site, at = imu_pose(model, ImuPose(), "walk")
+    assert axes == pytest.approx(site @ np.diag([-1, -1, 1])) and point - at == pytest.approx([0.05, -0.01, -0.02])
+
+
+def test_of_minutes_of_walking_the_parts_that_swing_most_are_used():
+    steps = 40 * 400
+    time = DT * np.arange(steps)
+    free = np.zeros((steps, 3), dtype=bool)
+    free[4000:6000] = free[10000:12000] = True
+    frame = np.tile([0, 0, 0, 0, 0, 9.81], (steps, 1))
+    walk = conform(recording(time))
+    walk = replace(walk, frame=frame, frame_point=np.zeros(3), free=free, command=walk.dof_pos)
+    parts = informative_parts(walk, 10.0)
+    assert [part.name for part in parts] == ["leg 10 to 15 s", "leg 25 to 30 s"]
+    assert "10 s that move the joints most are used (25 %)" in parts[0].notes[-1]
+    assert parts[0].free.all() and len(parts[0].frame) == len(parts[0].command) == 2000
+
+
+def test_a_leg_that_stands_throughout_is_named(tmp_path):
+    always = crawler(1).simulate(1.0)["contact"]
+    always[:, 3] = True
+    problem, _ = walking_problem(tmp_path, duration=1.0, contact=always)
+    assert any("rr_hip, rr_knee: always held by the ground" in note for note in problem.dataset.recordings[0].notes)
+
+
+@pytest.mark.parametrize(("duration", "turns"), [(1.0, 1), (12.0, 3)])
+def test_a_walk_is_trained_and_validated_on_in_turns(duration, turns):
+    walk = conform(recording(DT * np.arange(round(duration / DT))))
+    frame = np.tile([0, 0, 0, 0, 0, 9.81], (walk.num_samples, 1))
+    walk = replace(walk, frame=frame, frame_point=np.zeros(3), command=walk.dof_pos)
+    data = make_dataset([walk])
+    assert int((data.train[1:, 0] > data.train[:-1, 0]).sum()) == turns - 1
+    assert float(data.train.double().mean()) == pytest.approx(0.7, abs=0.01)
+    assert bool(data.validation.any()) and not bool((data.validation & data.train).any())
