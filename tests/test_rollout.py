@@ -24,7 +24,7 @@ from problems import PENDULUMS_TRUTH as TWO
 from pace_envs import set_physics_dt
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.rollout import Rollout
-from pace_optim.recording import Load
+from pace_optim.recording import Drive, Load
 from pace_optim.recording.resample import interpolate_smooth
 from pace_optim.recording.windows import Windows
 
@@ -106,6 +106,19 @@ def test_each_recording_is_simulated_with_its_own_facts():
         assert float(error.abs().max()) > 1e-4
         assert torch.equal(every.error[1, : len(error), r], error)
         assert not every.error[1, len(error) :, r].any()  # padding counts for nothing
+
+
+def test_an_infinite_stall_torque_is_no_torque_speed_line_whatever_no_load_speed_is_configured():
+    """Above the configured no-load speed the motor braked with all that it had."""
+    fast, slow = {"velocity_limit": np.inf}, {"velocity_limit": 1.0}
+    drives = [{"saturation_effort": np.inf, "effort_limit": 200.0, **speed} for speed in (fast, slow)]
+    target = chirp(amplitude=1.0)
+    errors = [
+        make_problem(dataclasses.replace(record(target), drive=Drive(**{k: np.array([v]) for k, v in drive.items()})))
+        for drive in drives
+    ]
+    first, second = (problem.evaluator().residuals(physical(problem)[None]).error for problem in errors)
+    assert torch.equal(first, second)
 
 
 def test_facts_are_not_left_over_from_one_recording_to_the_next_rollout():

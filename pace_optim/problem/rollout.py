@@ -420,10 +420,13 @@ class Rollout:
             for name in DRIVE_FIELDS:
                 value = getattr(recording.drive, name)
                 if value is not None:
-                    own = self.env.sim.tensor(value)[actuator.joint_indices]
-                    if name == "saturation_effort":
-                        own = own.clamp(max=torch.finfo(own.dtype).max)  # infinite: no torque-speed line
-                    getattr(actuator, name)[rows] = own
+                    getattr(actuator, name)[rows] = self.env.sim.tensor(value)[actuator.joint_indices]
+            if (
+                recording.drive.saturation_effort is not None
+            ):  # infinite: no torque-speed line, which has a finite slope
+                stall = actuator.saturation_effort[rows]
+                actuator.velocity_limit[rows] = actuator.velocity_limit[rows].where(stall.isfinite(), torch.inf)
+                actuator.saturation_effort[rows] = stall.clamp(max=torch.finfo(stall.dtype).max)
             ids = actuator.joint_indices
             stiffness = np.zeros(recording.num_joints)
             stiffness[ids if isinstance(ids, slice) else torch.as_tensor(ids).cpu().numpy()] = (
