@@ -1,6 +1,5 @@
 """Where an error sits is found on data whose answer is known."""
 
-
 import numpy as np
 import pytest
 from problems import BENCH, env_cfg, make_problem, record
