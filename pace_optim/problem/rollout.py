@@ -423,7 +423,7 @@ class Rollout:
                     getattr(actuator, name)[rows] = self.env.sim.tensor(value)[actuator.joint_indices]
             if (
                 recording.drive.saturation_effort is not None
-            ):  # infinite: no torque-speed line, which has a finite slope
+            ):  # infinite: there is no line
                 stall = actuator.saturation_effort[rows]
                 actuator.velocity_limit[rows] = actuator.velocity_limit[rows].where(stall.isfinite(), torch.inf)
                 actuator.saturation_effort[rows] = stall.clamp(max=torch.finfo(stall.dtype).max)
