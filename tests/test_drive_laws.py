@@ -1,5 +1,6 @@
 """Laws that drives have: closed forms, the heat of a session, combs, and where a diagnosis of a run begins."""
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -9,18 +10,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import FITS, joint_alone
+from diagnoses import FITS, hidden_run, joint_alone
 from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
 from test_effects import Drive
 
 from pace_actuators.effects import EffectCfg, comb_grid, get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis import diagnose
+from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.optimizers.comb_scan import scanned
 from pace_optim.problem.drive_work import drive_reach, with_work
 from pace_optim.recording.dataset import Work
+from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.base_fit import fit_base
 from pace_optim.single_joint_fits.model import JointModel
 
@@ -189,6 +191,27 @@ def test_a_diagnosis_begins_with_the_effects_of_the_run():
     module = sys.modules[diagnose.__module__]
     (cfg,) = module._own_effects(SimpleNamespace(unknown=("stiffness",)), result)
     assert cfg.effect == "torque_offset" and cfg.values == {"effort": {"servo": 0.7}}
+
+
+@pytest.mark.slow
+def test_a_run_that_has_what_is_missing_is_told_so(tmp_path):
+    run = hidden_run(tmp_path, "torque_offset", duration=3.0)
+    result = FitResult.load(run.folder)
+    more = {"torque_offset.effort": {"servo": 0.5}}
+    replace(
+        result,
+        effects=["torque_offset"],
+        parameters={**result.parameters, **more},
+        std={**result.std, **more},
+        units={**result.units, "torque_offset.effort": "N m"},
+    ).save(run.folder / "result.json")
+    settings = json.loads((run.folder / "settings.json").read_text())
+    settings["settings"]["effects"] = ["torque_offset"]
+    (run.folder / "settings.json").write_text(json.dumps(settings))
+    found = diagnose(DiagnosisSettings(run=run.folder, effects=["stribeck_friction"], only=True))
+    assert (found.verdict, found.paying, found.runs) == ("nothing_missing", [], [str(run.folder)])
+    assert found.sizes[0]["effect"] == "torque_offset" and found.ladder[0]["validation_rmse"] < 1.2e-4
+    assert "The search began with what the run has: torque_offset." in found.data
 
 
 # ---- the benchmark -------------------------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def search_effects(
         absorbed=absorbed,
         verdict=decision,
         explained=part_explained(outcome, data.floor),
-        paying=labels(outcome.final.model, problem.joint_names, list(shares)),
+        paying=labels(outcome.final.model, problem.joint_names, list(shares)) if shares else [],
         shares=shares,
         hints=names.hints,
         curves=curves,
