@@ -90,7 +90,8 @@ def check_data(
     )
     sentences += unstamped(data.recordings)
     floor = (noise**2 + numerical**2).sqrt()
-    if run is not None and not math.isclose(run.physics_dt, problem.physics_dt):
+    same = run is not None and bool(run.effects) == bool(base.model.effects)
+    if run is not None and same and not math.isclose(run.physics_dt, problem.physics_dt):
         by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
         left = fits.validation_errors(twins, [base])[0].mse.sqrt()
         at_floor = cfg.alike * floor
