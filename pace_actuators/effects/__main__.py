@@ -36,9 +36,9 @@ Give a joint either `joint_elasticity` or `backlash`: a backlash includes an ela
 and behind it the two springs in series. Friction then acts on the motor, other torques on the link.
 
 The last eleven, `torque_over_…`, `friction_over_…`, `gain_over_…` and `inertia_over_position`, are free-form curves.
-Bounds of torques follow the drive. Curves are straight from knot to knot, at
-`center + reach · knot`, and constant beyond the last knot. They show what is missing, not why. `pace diagnose` compares
-them with the effects that it found, and takes a curve if no effect explains the error.
+Bounds of torques follow the drive. Curves are straight from knot to knot, at `center + reach · knot`, and constant
+beyond the last knot. They show what is missing, not why. `pace diagnose` compares them with the effects that it found,
+and takes a curve if no effect explains the error.
 
 `python -m pace_actuators.effects > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
 
