@@ -64,7 +64,7 @@ def test_a_curve_is_straight_between_its_knots_and_constant_beyond_them():
 def test_no_diagnosis_looks_for_curves():
     assert len(CURVES) == 11 and all(issubclass(get_effect(name), FreeForm) for name in CURVES)
     assert not any(effect.free_form for effect in candidate_effects())
-    with pytest.raises(ValueError, match="a diagnosis holds it against the effects"):
+    with pytest.raises(ValueError, match="which every diagnosis compares with its effects"):
         candidate_effects(["torque_gain", "friction_over_speed"])
 
 

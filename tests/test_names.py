@@ -53,7 +53,7 @@ SURE = Evidence(
         ({}, []),
         ({"left": 60.0}, ["it explains 40 % of what lies above the floor"]),
         ({"harm": 20.0}, ["it explains 40 % of what lies above the floor"]),
-        ({"bars": 4.0}, ["its size is not told from none"]),
+        ({"bars": 4.0}, ["its size is not significant"]),
         ({"uneven": 0.2}, ["its size differs between recordings"]),
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),

@@ -261,7 +261,7 @@ class GravityCompensation(Effect):
     source = "controllers of robot arms (e.g. Sawyer, Panda), which know their own dynamics"
     probes = ({"share": 0.1},)
     reads_load = True
-    separates = "a motion fast enough to tell weight from inertia, and a recording without the feed-forward"
+    separates = "a motion fast enough to separate weight from inertia, and a recording without the feed-forward"
     share: torch.Tensor
 
     def effort_command(self, s: DriveState) -> None:

@@ -54,7 +54,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     if evidence.left + evidence.harm <= near:
         return []
     return [
-        *(["its size is not told from none"] if evidence.bars < cfg.verdict.bars else []),
+        *(["its size is not significant"] if evidence.bars < cfg.verdict.bars else []),
         *(["its size differs between recordings"] if evidence.uneven > cfg.verdict.uneven else []),
         *(["it is at a bound"] if evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),
