@@ -13,6 +13,7 @@ from pace_actuators.dc_motor import clip_to_line, pd_effort
 from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive import ControllerRun, Drive
 from pace_actuators.drive_delays import DriveDelays
+from pace_actuators.effects.effect import Heat
 
 _INVERSION_STEPS = 6
 """Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
@@ -139,6 +140,11 @@ class DriveWithEffects(Drive):
         """Set the time since the session began [s], (num_envs, 1) or (num_envs, num_joints); it goes on from there."""
         if self.effects is not None:
             self.effects.state.time = time.expand_as(self.effects.state.time)
+
+    def remember(self, heat: Heat) -> None:
+        """Tell effects how hard the drive has worked in the session before; once the parameters are known."""
+        for effect in () if self.effects is None else self.effects.effects:
+            effect.remember(heat)
 
 
 class PaceDCMotor(DriveWithEffects):

@@ -120,8 +120,8 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
         return BlockErrors(square=torch.tensor([rmse]).double() ** 2, weight=torch.ones(1).double())
 
     has = torch.ones(len(effects), len(before), dtype=torch.bool) if has is None else torch.tensor(has)
+    has = has.reshape(len(effects), len(before))
     model = SimpleNamespace(effects=tuple(effects), has=has, shared={get_effect("torque_gain")})
-    model.at_bounds = lambda *_: torch.zeros_like(has)
     model.is_wide = lambda _: torch.zeros(has.shape[1], dtype=torch.bool)
     final = SimpleNamespace(model=model, x=None)
     return Outcome(
@@ -130,7 +130,6 @@ def outcome_of(before, after, effects=(), has=None, rounds=()):
         base_errors=errors(before),
         final=final,
         final_errors=errors(after),
-        unevenness=torch.zeros(has.shape),
         rounds=list(rounds),
     )
 

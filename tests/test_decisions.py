@@ -41,7 +41,7 @@ def test_every_move_of_a_search_is_logged_and_comes_out_as_it_did(tmp_path):
     path = tmp_path / "decisions.jsonl"
     path.write_bytes(as_lines(log))
     read = read_decisions(path.read_text(encoding="utf-8"))
-    assert {decision.rule for decision in read} == {"look_ahead", "idle"}
+    assert {decision.rule for decision in read} == {"look_ahead"}
     for decision in read:
         assert [bool(name) for name in decided(decision)] == [bool(name) for name in decision.taken]
 

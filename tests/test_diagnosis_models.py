@@ -42,7 +42,12 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
     base = replace(
-        one, has=none, lower=one.lower.repeat(2, 1), upper=one.upper.repeat(2, 1), ranges=one.ranges.repeat(2, 1)
+        one,
+        has=none,
+        lower=one.lower.repeat(2, 1),
+        upper=one.upper.repeat(2, 1),
+        ranges=one.ranges.repeat(2, 1),
+        efforts=one.efforts.repeat(2),
     )
     values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
     model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
@@ -55,10 +60,16 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
     base = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
     model = replace(
-        base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1), ranges=base.ranges.repeat(2, 1)
+        base,
+        has=none,
+        lower=base.lower.repeat(2, 1),
+        upper=base.upper.repeat(2, 1),
+        ranges=base.ranges.repeat(2, 1),
+        efforts=base.efforts.repeat(2),
     )
     both = torch.tensor([True, True])
     found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
+    plain = Fitted.start(model, bench.truth_values.repeat(2, 1))
     model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, found)
     jacobian = torch.randn(model.size, 40, 3, 2, generator=torch.Generator().manual_seed(0))
     jacobian[..., 0] *= 10  # the first joint knows its values better
@@ -69,11 +80,10 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
         after = BlockErrors(square=cost * errors.square, weight=weights)
         outcome = Outcome(
             problem=None,
-            base=final,
+            base=plain,
             base_errors=errors,
             final=final,
             final_errors=errors,
-            unevenness=torch.zeros(final.model.has.shape),
         )
         outcome = pool(FakeFits(lambda _, after=after: after), outcome)
         assert (STRIBECK in outcome.final.model.shared) is shared

@@ -16,10 +16,8 @@ from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
 from pace_optim.diagnosis.search.search import add_effects
-from pace_optim.diagnosis.search.state import Branch, Outcome
+from pace_optim.diagnosis.search.state import Branch
 from pace_optim.diagnosis.telling.advice import advise, rivals
-from pace_optim.diagnosis.verdict.proxy_effects import proxies
-from pace_optim.diagnosis.verdict.verdict import explained_joints, verdict
 from pace_optim.experiment_design import telling_apart
 from pace_optim.experiment_design.telling_apart import MenuCfg, Rivals, distances, menu, next_experiments
 from pace_optim.single_joint_fits.fitted import Fitted
@@ -34,56 +32,6 @@ CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elas
 def bench():
     """A short chirp of one joint."""
     return joint_alone()
-
-
-def test_the_effects_of_joints_that_they_do_not_explain_are_not_kept():
-    outcome = outcome_of([1.0, 1.0, 1.0], [0.1, 0.9, 1.0], [STRIBECK], [[True, True, False]])
-    floor = torch.full((3,), 0.05, dtype=torch.float64)
-    assert verdict(outcome, floor)[0] == "effect"
-    assert explained_joints(outcome, floor).tolist() == [True, False, False]
-    assert verdict(outcome_of([0.1, 1.0], [0.06, 1.0], [STRIBECK], [[True, False]]), floor[:2])[0] == "unknown"
-
-
-@pytest.mark.parametrize(("trees", "expected"), [([[0, 1]], "unknown"), ([[0], [1]], "effect")])
-def test_an_effect_that_harms_another_joint_as_much_is_not_what_is_missing(trees, expected):
-    """A backlash stood in for a filter of commands, and took the joint beside it from 0.07 to 0.36 mrad."""
-    outcome = replace(outcome_of([0.56, 0.07], [0.38, 0.36], [STRIBECK], [[True, False]]), trees=trees)
-    assert verdict(outcome, torch.full((2,), 0.05, dtype=torch.float64))[0] == expected
-
-
-@pytest.mark.parametrize(
-    ("effect", "own", "stuck"),
-    [
-        ("payload", [-0.6], True),
-        ("payload", [0.5], False),
-        ("stribeck_friction", [1.0, 0.01], False),  # the speed is no size
-        ("stribeck_friction", [4.0, 0.1], True),
-        ("stribeck_friction", [0.0, 0.1], False),  # nothing, and not at an end
-        ("torque_limit", [get_effect("torque_limit").parameters[0].upper], False),  # next to no limit
-        ("torque_limit", [get_effect("torque_limit").parameters[0].lower], True),
-    ],
-)
-def test_an_effect_that_has_run_into_a_bound_is_not_what_is_missing(bench, effect, own, stuck):
-    effect = get_effect(effect)
-    now = with_effects(JointModel.base(bench.problem), bench.truth_values, (effect, [True], own))
-    assert now.model.at_bounds(now.x).tolist() == [[stuck]]
-    floor = torch.tensor([1e-4])
-    even = torch.zeros(1, 1)
-    far = Outcome(
-        problem=None,
-        base=now,
-        base_errors=errors_of(1e-2),
-        final=now,
-        final_errors=errors_of(2e-3),
-        unevenness=even,
-    )
-    assert verdict(far, floor)[0] == ("unknown" if stuck else "effect")
-    stuck_one = f"{effect.name} (servo) is at a bound, so it is probably a proxy for another effect."
-    assert proxies(far, ["servo"], floor) == ([stuck_one] if stuck else [])
-    assert verdict(replace(far, final_errors=errors_of(2e-4)), floor)[0] == "effect"  # it explains everything
-    two = with_effects(now.model, now.model.to_physical(now.x), (GAIN, [True], [0.8]))
-    two = replace(far, final=two, unevenness=even.repeat(2, 1))
-    assert verdict(two, floor)[0] == "effect"  # beside another that is inside its bounds
 
 
 def test_a_search_ends_where_no_effect_gains_anything(bench):
@@ -192,7 +140,7 @@ def two_joints(bench):
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
     bounds = {side: getattr(one, side).repeat(2, 1) for side in ("lower", "upper", "ranges")}
-    return replace(one, has=none, slides=one.slides.repeat(2), **bounds)
+    return replace(one, has=none, slides=one.slides.repeat(2), efforts=one.efforts.repeat(2), **bounds)
 
 
 @pytest.mark.parametrize("stood_out", [True, False])  # beside neighbours that moved wrongly

@@ -18,7 +18,8 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.telling.findings import summary_of
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
-from pace_optim.diagnosis.verdict.verdict import verdict
+from pace_optim.diagnosis.verdict.names import Names
+from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.base_fit import fit_base
@@ -61,9 +62,9 @@ def test_a_curve_is_straight_between_its_knots_and_constant_beyond_them():
 
 
 def test_no_diagnosis_looks_for_curves():
-    assert len(CURVES) == 6 and all(issubclass(get_effect(name), FreeForm) for name in CURVES)
+    assert len(CURVES) == 11 and all(issubclass(get_effect(name), FreeForm) for name in CURVES)
     assert not any(effect.free_form for effect in candidate_effects())
-    with pytest.raises(ValueError, match="a diagnosis holds it against the effects"):
+    with pytest.raises(ValueError, match="which every diagnosis compares with its effects"):
         candidate_effects(["torque_gain", "friction_over_speed"])
 
 
@@ -93,13 +94,12 @@ def ended(fitted, part, effect="quadratic_friction"):
         base_errors=errors,
         final=final,
         final_errors=replace(errors, square=part * errors.square),
-        unevenness=torch.zeros(len(final.model.effects), 1),
     )
 
 
 @pytest.fixture(scope="module")
 def curves(fitted):
-    return fit_curves(FITS, ended(fitted, 1.0), FLOOR)
+    return fit_curves(FITS, ended(fitted, 1.0), FLOOR, ~YES)
 
 
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
@@ -123,52 +123,50 @@ def test_it_takes_the_place_of_effects_that_leave_more_than_twice_as_much(fitted
         outcome = replace(outcome, final_errors=replace(best, square=times * best.square))
     fits = [outcome.base, *curves.models], [outcome.base_errors, *curves.errors]
     monkeypatch.setattr(Fits, "on_joints", lambda *_: fits)
-    found = fit_curves(FITS, outcome, FLOOR)
+    found = fit_curves(FITS, outcome, FLOOR, YES & (times is not None))
     assert found.instead.tolist() == [instead]
     outcome = take_curves(outcome, found)
     if not instead:
         assert labels(outcome.final.model, ["servo"]) == ["quadratic_friction"]
-        assert verdict(outcome, FLOOR)[0] == "effect"
+        assert verdict(outcome, FLOOR, YES)[0] == "effect"
         assert torch.equal(outcome.final.x, before.x)
         return
     assert labels(outcome.final.model, ["servo"]) == ["friction_over_position"]
-    decision, explained = verdict(outcome, FLOOR)
-    assert decision == "unknown" and explained == pytest.approx(1 - left, abs=0.01)
+    assert verdict(outcome, FLOOR, YES)[0] == "unknown"
+    assert part_explained(outcome, FLOOR) == pytest.approx(1 - left, abs=0.01)
     at_floor = replace(outcome, final_errors=replace(outcome.final_errors, square=0.0 * outcome.final_errors.square))
-    assert verdict(at_floor, FLOOR)[0] == "unknown"
+    assert verdict(at_floor, FLOOR, YES)[0] == "unknown"
     # what it says of its errors is what its model leaves
     assert FITS.validation_errors(fitted[0], [outcome.final])[0].mse.tolist() == pytest.approx(
         outcome.final_errors.mse.tolist(), rel=1e-3
     )
 
 
-@pytest.mark.parametrize(("left", "instead"), [(0.6, True), (0.4, False)])
-def test_effects_that_explain_less_than_half_do_not_keep_a_curve_away(fitted, curves, monkeypatch, left, instead):
-    """The verdict takes them out again: the joint ended with neither, on a robot of which other joints were known."""
-    outcome, (_, _, base) = ended(fitted, left), fitted
+@pytest.mark.parametrize(("named", "instead"), [(False, True), (True, False)])
+def test_effects_that_are_not_named_do_not_keep_a_curve_away(fitted, curves, monkeypatch, named, instead):
+    outcome, (_, _, base) = ended(fitted, 0.6), fitted
     after = [replace(base, square=(0.35 if k == curves.best(0) else 0.9) * base.square) for k in range(len(CURVES))]
     monkeypatch.setattr(Fits, "on_joints", lambda *_: ([outcome.base, *curves.models], [base, *after]))
-    assert fit_curves(FITS, outcome, FLOOR).instead.tolist() == [instead]
+    assert fit_curves(FITS, outcome, FLOOR, YES & named).instead.tolist() == [instead]
 
 
 def test_a_curve_takes_the_place_of_several_effects(fitted, curves):
     one, spring = ended(fitted, 0.9), get_effect("parallel_spring")
     values = torch.tensor([[p.start for p in spring.parameters]], dtype=torch.float64)
     two = Fitted.start(*one.final.model.extended(one.final.physical, spring, YES, values))
-    outcome = replace(one, final=two, unevenness=torch.tensor([[0.7], [0.8]], dtype=torch.float64))
+    outcome = replace(one, final=two)
     taken = take_curves(outcome, replace(curves, instead=YES))
     assert labels(taken.final.model, ["servo"]) == ["friction_over_position"]
-    assert taken.unevenness.tolist() == [[0.0]]
-    assert take_curves(outcome, replace(curves, instead=~YES)).unevenness.tolist() == [[0.7], [0.8]]
+    assert take_curves(outcome, replace(curves, instead=~YES)).final is two
 
 
 def test_no_curve_is_fitted_near_the_floor(fitted):
     near = (fitted[2].mse.sqrt() / 2.5).double()
-    assert fit_curves(FITS, ended(fitted, 1.0), near) is None
+    assert fit_curves(FITS, ended(fitted, 1.0), near, YES) is None
 
 
 def test_a_joint_keeps_what_the_whole_robot_shares(fitted):
-    assert fit_curves(FITS, ended(fitted, 0.9, "clock_skew"), FLOOR) is None
+    assert fit_curves(FITS, ended(fitted, 0.9, "clock_skew"), FLOOR, YES) is None
 
 
 def errors_of(*rmse):
@@ -180,6 +178,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     spring, curve = get_effect("parallel_spring"), get_effect("friction_over_speed")
     one, four = JointModel.base(run.problem), torch.arange(4)
     all_of_them = {side: getattr(one, side).expand(4, -1) for side in ("lower", "upper", "ranges")}
+    all_of_them["efforts"] = one.efforts.expand(4)
     all_of_them["slides"] = one.slides.expand(4)
     model = replace(one, has=torch.zeros(0, 4, dtype=torch.bool), **all_of_them)
     values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)
@@ -193,7 +192,6 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         base_errors=errors_of(6e-3, 3e-3, 3e-3, 1e-4),
         final=Fitted.start(*with_spring),
         final_errors=errors_of(1e-4, 3e-3, 2.4e-3, 1e-4),
-        unevenness=torch.zeros(1, 4),
     )
     curves = Curves(
         joints=(four == 1) | (four == 2),
@@ -212,7 +210,10 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         ("add_effects", outcome),
         ("pool", outcome),
         ("fit_curves", curves),
-        ("contributions", {spring: 0.8, curve: 0.2}),
+        (
+            "earned_names",
+            Names(outcome=outcome, named=four == 0, hints=[], rises={(spring, 0): 36e-6, (spring, 2): 1e-6}),
+        ),
     ):
         monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result, **__: result)
     robot = SimpleNamespace(
@@ -235,12 +236,11 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     monkeypatch.setattr("pace_optim.diagnosis.telling.advice.drive_in_force", lambda _: {})
     advice = advise(robot, found.outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
-    told = error_map(curves, robot.joint_names, curves.errors[0])
+    told = error_map(curves, robot.joint_names, outcome.base_errors)
     assert list(told) == ["b", "c"]
     first, last = (told["b"]["curve"]["torque"][i] for i in (0, -1))  # all friction, at 0 and 0.1 rad/s
     assert first == pytest.approx(CALM["friction"])
-    curves.explained[0, 2] = 0.05
-    weak = error_map(curves, robot.joint_names, curves.errors[0])["c"]
+    weak = told["c"]
     assert weak["curve"] is None and weak["sentence"].startswith("no curve")
     assert last == pytest.approx(CALM["friction"] + 0.1 + 0.1 * CALM["viscous_friction"])
 

@@ -54,6 +54,7 @@ def fitted():
             log=torch.zeros(len(BASE), dtype=torch.bool),
             slides=torch.zeros(1, dtype=torch.bool),
             ranges=torch.zeros(1, 2),
+            efforts=torch.full((1,), torch.inf),
         )
         start = Fitted.start(model, 0 * bounds)
         result = Fits(batch=landscape).side_by_side(None, [start], 25, rough=rough)[0]

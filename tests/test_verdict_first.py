@@ -110,7 +110,12 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all():
     base, both = JointModel.base(robot.problem), torch.tensor([True, True])
     none = torch.zeros(0, 2, dtype=torch.bool)
     base = replace(
-        base, has=none, lower=base.lower.repeat(2, 1), upper=base.upper.repeat(2, 1), ranges=base.ranges.repeat(2, 1)
+        base,
+        has=none,
+        lower=base.lower.repeat(2, 1),
+        upper=base.upper.repeat(2, 1),
+        ranges=base.ranges.repeat(2, 1),
+        efforts=base.efforts.repeat(2),
     )
     model, physical = base.extended(robot.truth_values.repeat(2, 1), GAIN, both, torch.ones(2, 1).double())
     generator = torch.Generator().manual_seed(0)

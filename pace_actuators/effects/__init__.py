@@ -16,7 +16,7 @@ from pace_actuators.effects import (
     two_mass,
 )
 from pace_actuators.effects.drive_state import DriveState
-from pace_actuators.effects.effect import PROBED_EFFORT, Effect, EffectParameter, probe_points
+from pace_actuators.effects.effect import PROBED_EFFORT, Effect, EffectParameter, comb_grid, probe_points
 from pace_actuators.effects.effect_cfg import SHARED, WIDE, EffectCfg, effect_cfgs
 from pace_actuators.effects.registry import (
     available_effects,
@@ -38,6 +38,7 @@ __all__ = [
     "EffectParameter",
     "EffectStack",
     "available_effects",
+    "comb_grid",
     "command",
     "drive",
     "effect_cfgs",

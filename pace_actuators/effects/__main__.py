@@ -29,15 +29,16 @@ Within the drive, effects act in this order:
 
 1. The requested torque is limited (`effort_limit`, `torque_limit`).
 2. The current follows (`drive_bandwidth`).
-3. Torque comes from the current (`torque_gain`, `torque_ripple`).
+3. Torque comes from the current (`torque_gain`, `torque_fade`, `supply_sag`, `torque_ripple`).
 4. The supply limits the result (`torque_speed_limit`, the torque-speed line).
 
 Give a joint either `joint_elasticity` or `backlash`: a backlash includes an elasticity. A joint with both has one gap,
 and behind it the two springs in series. Friction then acts on the motor, other torques on the link.
 
-The last six, `torque_over_…` and `friction_over_…`, are free-form curves. They are straight from knot to knot, at
-`center + reach · knot`, and constant beyond the last knot. They show what is missing, not why. `pace diagnose` compares
-them with the effects that it found, and takes a curve if no effect explains the error.
+The last eleven, `torque_over_…`, `friction_over_…`, `gain_over_…` and `inertia_over_position`, are free-form curves.
+Bounds of torques follow the drive. Curves are straight from knot to knot, at `center + reach · knot`, and constant
+beyond the last knot. They show what is missing, not why. `pace diagnose` compares them with the effects that it found,
+and takes a curve if no effect explains the error.
 
 `python -m pace_actuators.effects > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
 
@@ -112,7 +113,7 @@ def _parameter(effect: type[Effect], p: EffectParameter) -> str:
     name, meaning = f"`{p.name}`", p.meaning
     if effect.free_form and p is effect.parameters[0]:
         last = sum(q.null is not None for q in effect.parameters) - 1
-        name, meaning = f"`{p.name}` … `effort_{last}`", "f at each knot"
+        name, meaning = f"`{p.name}` … `{p.name[:-1]}{last}`", "f at each knot"
     return _row(f"`{effect.name}`", name, meaning, p.unit, bounds, null)
 
 

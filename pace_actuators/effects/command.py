@@ -119,6 +119,36 @@ class CommandAccelerationLimit(Effect):
 
 
 @register_effect
+class CommandFilter(Effect):
+    """The drive's firmware smooths its target by a first-order low-pass: T dx/dt + x = q*, exact for a held command."""
+
+    name = "command_filter"
+    stage = "command"
+    parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
+    equation = "T dx/dt + x = q*, the controller follows x"
+    looks = "late and too small in the fast parts; rounded steps"
+    source = "interpolation and input filters of servo and joint drives"
+    probes = ({"time_constant": 0.003}, {"time_constant": 0.01}, {"time_constant": 0.04})
+    two_sided = False
+    separates = "steps, whose rounding a pure delay does not have"
+    time_constant: torch.Tensor
+
+    def prepare(self) -> None:
+        """Weight of a command in the target, one control step after it."""
+        self._weight = -torch.expm1(-self.control_dt / self.time_constant)
+        if not hasattr(self, "_target"):
+            self._target = self.zeros()
+
+    def command(self, s: DriveState) -> None:
+        """Follow the command; the first counts as reached."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._target = torch.where(new, s.joint_pos_target, self._target)
+        self._target = torch.lerp(self._target, s.joint_pos_target, self._weight)
+        s.joint_pos_target = self._target
+
+
+@register_effect
 class OtherDelay(Effect):
     """The delay path that the base model does not have.
 
@@ -212,6 +242,31 @@ class DerivativeGain(Effect):
     def controller(self, s: DriveState) -> None:
         """Scale kd."""
         s.damping *= self.gain
+
+
+@register_effect
+class GravityCompensation(Effect):
+    """The drive feeds a part of gravity's torque forward, which the recording does not say: τ - c τ_g.
+
+    τ_g is the torque of gravity and load on the joint, which pulls the other way than what holds it.
+    """
+
+    name = "gravity_compensation"
+    stage = "controller"
+    parameters = (
+        EffectParameter(name="share", unit="1", lower=-0.5, upper=2.0, null=0.0, start=0.1, plausible=(0.0, 1.5)),
+    )
+    equation = "τ - c τ_g, τ_g the torque of gravity and load on the joint"
+    looks = "the joint leans less than its load and gains say; at c = 1 it does not lean at all"
+    source = "controllers of robot arms (e.g. Sawyer, Panda), which know their own dynamics"
+    probes = ({"share": 0.1},)
+    reads_load = True
+    separates = "a motion fast enough to separate weight from inertia, and a recording without the feed-forward"
+    share: torch.Tensor
+
+    def effort_command(self, s: DriveState) -> None:
+        """Add what holds that part of the load."""
+        s.effort -= self.share * s.load_effort
 
 
 @register_effect

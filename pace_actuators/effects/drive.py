@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
-from pace_actuators.effects.effect import Effect, EffectParameter
+from pace_actuators.effects.effect import Effect, EffectParameter, Heat
 from pace_actuators.effects.registry import register_effect
 
 _INFINITE = float("inf")
-_RIPPLE_PERIODS = sorted({round(5 * 40 ** (i / 26)) for i in range(27)})
-"""From 5 to 200 per revolution, each about 15 % more than the one before."""
 
 
 @register_effect
@@ -33,6 +33,98 @@ class TorqueGain(Effect):
         """Scale the torque."""
         s.effort *= self.gain
         s.speed_slope *= self.gain
+
+
+@register_effect
+class TorqueFade(Effect):
+    """The torque constant falls as the motor heats up: τ -> τ (1 - h / E²), T dh/dt + h = τ², τ what is asked.
+
+    A session begins cold; a recording begins with the heat that those before it have left.
+    """
+
+    name = "torque_fade"
+    stage = "drive"
+    parameters = (
+        EffectParameter(
+            name="effort",
+            unit="N m",
+            lower=0.3,
+            upper=3000.0,
+            null=_INFINITE,
+            start=100.0,
+            scale="log",
+            meaning="E: held for long, it would leave nothing",
+        ),
+        EffectParameter(name="time_constant", unit="s", lower=2.0, upper=2000.0, null=None, start=30.0, scale="log"),
+    )
+    equation = "τ -> τ (1 - h / E^2), T dh/dt + h = τ^2"
+    looks = "the joint sags and slows down more and more, the more it has worked"
+    source = "magnets and windings lose torque with their temperature; I²t models of motor drives"
+    probes = tuple({"effort": e, "time_constant": t} for t in (10.0, 100.0) for e in (300.0, 80.0, 25.0, 8.0, 2.0))
+    two_sided = False
+    separates = "the same motion again after much work, and after a pause"
+    least: ClassVar[float] = 0.1
+    """What is left of the torque in any case."""
+    effort: torch.Tensor
+    time_constant: torch.Tensor
+
+    def prepare(self) -> None:
+        """What the heat takes, and how fast it follows."""
+        self._per_heat = 1.0 / self.effort.square()
+        self._weight = -torch.expm1(-self.dt / self.time_constant)
+        if not hasattr(self, "_heat"):
+            self._heat, self._first = self.zeros(), self.zeros()
+
+    def remember(self, heat: Heat) -> None:
+        """Begin as warm as the session has made the motor."""
+        self._first = heat(self.time_constant, self.rows).to(self._first)
+
+    def drive(self, s: DriveState) -> None:
+        """Scale the torque, and heat up by it."""
+        new = self.take_new_rows()
+        if new is not None:
+            self._heat = torch.where(new, self._first, self._heat)
+        asked = s.effort.clone()
+        left = (1.0 - self._heat * self._per_heat).clamp(min=self.least)
+        s.effort *= left
+        s.speed_slope *= left
+        self._heat = torch.lerp(self._heat, asked.square(), self._weight)
+
+
+@register_effect
+class SupplySag(Effect):
+    """The supply gives way under load, so that the torque falls behind what is asked: τ -> τ (1 - |τ| / E).
+
+    Beyond E/2 it rises no more.
+    """
+
+    name = "supply_sag"
+    stage = "drive"
+    parameters = (
+        EffectParameter(
+            name="effort",
+            unit="N m",
+            lower=0.5,
+            upper=5000.0,
+            null=_INFINITE,
+            start=200.0,
+            scale="log",
+            meaning="E: four times the largest torque",
+        ),
+    )
+    equation = "τ -> τ (1 - |τ| / E), at most E / 4"
+    looks = "large torques fall short, small ones do not"
+    source = "internal resistance of batteries and cables; saturation of magnetic circuits"
+    probes = tuple({"effort": e} for e in (2000.0, 600.0, 200.0, 60.0, 20.0, 6.0, 2.0))
+    two_sided = False
+    separates = "another load; the supply's voltage in the log"
+    effort: torch.Tensor
+
+    def drive(self, s: DriveState) -> None:
+        """Give what is left."""
+        share = (s.effort.abs() / self.effort).clamp(max=0.5)
+        s.speed_slope *= 1.0 - 2.0 * share
+        s.effort = torch.copysign(torch.minimum(s.effort.abs(), 0.5 * self.effort), s.effort) * (1.0 - share)
 
 
 @register_effect
@@ -86,9 +178,8 @@ class TorqueRipple(Effect):
     equation = "τ + a sin(N q) + b cos(N q)"
     looks = "a comb over position"
     source = "cogging and commutation of a motor, seen through its gear"
-    probes = tuple(
-        {"sine": a, "cosine": b, "periods": float(n)} for n in _RIPPLE_PERIODS for a, b in ((0.1, 0.0), (0.0, 0.1))
-    )
+    probes = tuple({"sine": a, "cosine": b} for a, b in ((0.1, 0.0), (0.0, 0.1)))
+    comb = ("periods", "sine", "cosine")
     separates = "a slow motion over a wide range"
     sine: torch.Tensor
     cosine: torch.Tensor

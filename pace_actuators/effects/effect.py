@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 _WIDER = 4.0
 
+Heat = Callable[[torch.Tensor, slice], torch.Tensor]
+"""By time constants T [s], (rows, num_joints), of environments ``rows``: h of T dh/dt + h = τ² when a recording begins,
+τ the torque that was asked in its session before [N² m²]."""
 Stage = Literal["command", "measurement", "controller", "drive", "friction", "transmission", "model", "recording"]
 
 
@@ -51,11 +54,25 @@ class EffectParameter:
     possible: tuple[float, float] = (-math.inf, math.inf)
     """Between what physics allows it: a bound that a search runs into is widened within."""
 
+    plausible: tuple[float, float] = (-math.inf, math.inf)
+    """Between what a drive can have it: with a value beyond, a diagnosis does not name the effect."""
+
     is_position: bool = False
     """Whether it is a position of the joint, which is sought in all of the joint's range."""
 
-    def reaching(self, low: float, high: float) -> tuple[float, float]:
-        """Its bounds, of a position of the joint as far as the joint's range [rad] too."""
+    follows_drive: bool = False
+    """Whether it is a torque whose bounds are the largest that the joint's drive gives, where that is known."""
+
+    def reaching(self, low: float, high: float, effort: float = math.inf) -> tuple[float, float]:
+        """Its bounds: of a position of the joint as far as its range too, of a torque as far as the drive goes.
+
+        Args:
+            low: Lower end of the joint's range [rad].
+            high: Upper end of it [rad].
+            effort: The largest torque of its drive [N m]; infinite where it is not known.
+        """
+        if self.follows_drive and math.isfinite(effort):
+            return -effort, effort
         return (min(self.lower, low), max(self.upper, high)) if self.is_position else (self.lower, self.upper)
 
     def widest(self, friction: float = 0.0) -> tuple[float, float]:
@@ -122,6 +139,9 @@ class Effect:
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
     """Parameter of which every probed value starts a fit of its own: no descent leads from one to the other."""
+    comb: ClassVar[tuple[str, str, str] | None] = None
+    """A frequency over the position [1/rev], and the amplitudes of its sine and cosine: the frequency is scanned over
+    the range of motion, where the error has a valley for each of its periods."""
     two_sided: ClassVar[bool] = True
     """Whether it can also act with the opposite sign of its probes."""
     shared: ClassVar[bool] = False
@@ -145,6 +165,8 @@ class Effect:
     """A more general effect that can be it: a diagnosis looks for that one."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
+    needs_loads: ClassVar[bool] = False
+    """Whether it only shows where loads differ: there it is tried whatever a screening says."""
     acts_while_off: ClassVar[bool] = False
     """Whether it acts only while the drive is switched off: it is tried only where a recording has that."""
     absorbed_by: ClassVar[str] = ""
@@ -199,6 +221,9 @@ class Effect:
         if self.new_rows is None:
             self.new_rows = self._no_rows()
         self.new_rows[rows] = True
+
+    def remember(self, heat: Heat) -> None:
+        """When a recording begins: take over what the drive did in its session before."""
 
     def advance(self, s: DriveState) -> None:
         """Once per physics step, before all else: bring the own state to the present joint state."""
@@ -332,6 +357,15 @@ class Effect:
             unknown = sorted(set(probe) - {p.name for p in cls.parameters})
             if unknown:
                 raise ValueError(f"A probe of the effect {cls.name!r} names {unknown[0]!r}, which is no parameter.")
+
+
+def comb_grid(effect: type[Effect], span: float) -> torch.Tensor:
+    """Frequencies of an effect with a comb, (points,) [1/rev], half a period over the span of motion [rad] apart."""
+    if effect.comb is None:
+        raise ValueError(f"The effect {effect.name!r} has no frequency to scan.")
+    own = next(p for p in effect.parameters if p.name == effect.comb[0])
+    step = math.pi / max(span, 1e-3)
+    return torch.arange(own.lower, own.upper, step, dtype=torch.float64)
 
 
 PROBED_EFFORT = 5.0

@@ -5,6 +5,8 @@ The simulator applies Coulomb friction itself, so that a stuck joint sticks; an 
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -83,6 +85,7 @@ class LoadDependentFriction(Effect):
     probes = ({"coefficient": 0.01},)
     two_sided = False
     reads_load = True
+    needs_loads = True
     separates = "recordings at two loads"
     coefficient: torch.Tensor
 
@@ -129,7 +132,15 @@ class QuadraticFriction(Effect):
     name = "quadratic_friction"
     stage = "friction"
     parameters = (
-        EffectParameter(name="coefficient", unit="N m s^2/rad^2", lower=-1.0, upper=3.0, null=0.0, start=0.02),
+        EffectParameter(
+            name="coefficient",
+            unit="N m s^2/rad^2",
+            lower=-1.0,
+            upper=3.0,
+            null=0.0,
+            start=0.02,
+            plausible=(0.0, math.inf),
+        ),
     )
     equation = "τ - b2 v |v|"
     looks = "the error grows with speed, in both directions"

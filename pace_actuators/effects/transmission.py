@@ -42,9 +42,17 @@ class ParallelSpring(Effect):
     name = "parallel_spring"
     stage = "transmission"
     parameters = (
-        EffectParameter(name="stiffness", unit="N m/rad", lower=-2.0, upper=20.0, null=0.0, start=0.2),
         EffectParameter(
-            name="rest", unit="rad", lower=-1.5, upper=1.5, null=None, start=0.0, meaning="q_0", is_position=True
+            name="stiffness",
+            unit="N m/rad",
+            lower=-2.0,
+            upper=20.0,
+            null=0.0,
+            start=0.2,
+            plausible=(0.0, math.inf),
+        ),
+        EffectParameter(
+            name="rest", unit="rad", lower=-6.3, upper=6.3, null=None, start=0.0, meaning="q_0", is_position=True
         ),
     )
     equation = "τ - k (q - q_0)"

@@ -8,6 +8,7 @@ from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.telling.text import lines_of
 from pace_optim.run.result import FitResult
 from pace_optim.run.summary import errors_of
+from pace_optim.terminal.choices import MEASURED_FACTS
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
 
@@ -24,6 +25,13 @@ def main() -> None:
         "--effects", nargs="+", default=[], metavar="NAME", help="more candidates: your own as module:Class"
     )
     parser.add_argument("--only", action="store_true", help="try nothing but --effects")
+    parser.add_argument(
+        "--measured",
+        nargs="+",
+        default=[],
+        metavar="FACT",
+        help=f"facts that you measured ({', '.join(MEASURED_FACTS)}): effects that contradict them are not tried",
+    )
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
     parser.add_argument("--physics_dt", type=number, metavar="S", help="physics step (default: half a control step)")
     refit = parser.add_mutually_exclusive_group()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
 from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
@@ -23,7 +24,9 @@ from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.fits import fits_on
+from pace_optim.single_joint_fits.labels import labels
 from pace_optim.single_joint_fits.model import whole_values
+from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
 
@@ -65,6 +68,8 @@ def diagnose(
         settings.max_effects,
         progress.say,
         result,
+        own=_own_effects(problem, result),
+        measured=settings.measured,
         log=decisions.append,
         cfg=settings.cfg,
         fits=fits,
@@ -90,6 +95,23 @@ def _as_found(problem: Problem, result: FitResult) -> Problem:
     return replace(problem, dataset=replace(problem.dataset, recordings=tuple(told)))
 
 
+def _own_effects(problem: Problem, result: FitResult) -> list[EffectCfg]:
+    """The run's effects with its values, but those that found facts which nobody knew: the problem has these."""
+    found = {UNKNOWN_FACTS[fact] for fact in problem.unknown}
+    cfgs = [EffectCfg.parse(effect) for effect in result.effects]
+    return [
+        replace(cfg, values={p.name: _by_joint(result, cfg, p.name) for p in cfg.effect_class.parameters})
+        for cfg in cfgs
+        if cfg.effect_class.name not in found
+    ]
+
+
+def _by_joint(result: FitResult, cfg: EffectCfg, parameter: str) -> dict[str, float]:
+    """A run's values of an effect's parameter, by joint."""
+    own = result.parameters[f"{cfg.effect_class.name}.{parameter}"]
+    return {joint: own[joint] if joint in own else own["all"] for joint in cfg.joints(result.joint_names)}
+
+
 def _save(diagnosis: Diagnosis, decisions: Sequence[Decision]) -> None:
     """Write the diagnosis, its decisions, and the report of each of its runs, all or nothing."""
     files: dict[Path, bytes] = {Path(diagnosis.run) / DECISIONS: as_lines(decisions)}
@@ -108,7 +130,7 @@ def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, pr
     final = found.outcome.final
     settings = replace(
         run.settings,
-        effects=found.paying,
+        effects=labels(final.model, problem.joint_names),
         optimizer="least_squares",
         physics_dt=problem.physics_dt,
         start=started_from(

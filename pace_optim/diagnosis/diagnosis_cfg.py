@@ -18,6 +18,10 @@ class CandidatesCfg:
     """and the length of its blocks [s]."""
     explains: float = 0.03
     """An effect that would explain less than this part of what is left is not refitted."""
+    valleys: int = 3
+    """Frequencies of a comb that a refit begins at."""
+    at_once: int = 64
+    """Frequencies of a comb that are simulated side by side. Changes memory alone."""
     of_robot: int = 6
     """Effects refitted because they would explain most of the whole robot's error."""
     of_joint: int = 4
@@ -58,28 +62,24 @@ class JudgingCfg:
     value, and a way with fewer parameters is taken."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
-    to this ratio apart."""
+    to this ratio apart. A joint is held at the robot's delay where one of its own leaves an error this many times
+    lower."""
     in_place: int = 3
     """So many of those that came near are tried in place of a joint's effects."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictCfg:
-    """What is made of where the search ended."""
+    """Whether a name is earned (``judging.naming``), and what a curve must show."""
 
     most: float = 0.5
-    """Effects that explain less than this part of the error above the floor are not what is missing. A curve says more
-    where it leaves less than this part of what they leave, an effect dominates above this share, and its size depends
-    on something more where this part of what is left would go with a size for each recording."""
-    nearly_all: float = 0.9
-    """Of effects that explain more than this part, sizes do not matter. A joint is held at the robot's delay where a
-    delay of its own takes away more than this part. A curve that leaves more than this part is not told of, nor
-    drawn."""
+    """An effect must explain this part of what lies above the floor without it. A curve says more where it leaves less
+    than this part of what effects leave, and an effect dominates above this share."""
+    bars: float = 5.0
+    """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15
-    """Above this unevenness an effect is a proxy. Measured: up to 0.08 for the evenest effect among many others as
-    large together, 0.18 to 0.36 for proxies."""
-    share: float = 0.2
-    """Joints with effects that are what is missing must hold this part of the robot's error above the floor."""
+    """and a size for each recording would explain no more than this part of what is left. Measured: up to 0.08 for the
+    evenest effect among many others as large together, 0.18 to 0.36 for proxies."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
 
@@ -87,7 +87,7 @@ class VerdictCfg:
 RULES = (
     "look_ahead",
     "replace",
-    "idle",
+    "echo",
     "pool",
     "trim",
     "wide_steps",

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import torch
 
-from pace_actuators.effects import Effect
+from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.beginning.data_check import check_data
 from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
+from pace_optim.diagnosis.beginning.stated_facts import excluded_effects
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
@@ -18,9 +19,9 @@ from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Search
 from pace_optim.diagnosis.telling.findings import Findings
-from pace_optim.diagnosis.verdict.contributions import contributions
 from pace_optim.diagnosis.verdict.free_curves import fit_curves, take_curves
-from pace_optim.diagnosis.verdict.verdict import final_verdict
+from pace_optim.diagnosis.verdict.names import earned_names, shares_of
+from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.base_fit import fit_base
@@ -40,6 +41,8 @@ def search_effects(
     say: Callable[[str], None] = lambda _: None,
     run: FitResult | None = None,
     *,
+    own: Sequence[EffectCfg] = (),
+    measured: Sequence[str] = (),
     log: Log = unlogged,
     cfg: DiagnosisCfg = DEFAULT,
     fits: Fits | None = None,
@@ -48,11 +51,13 @@ def search_effects(
 
     Args:
         problem: The whole robot with the base model.
-        physical: A first guess of its parameters, (size,).
+        physical: A first guess of its base parameters, (size,).
         candidates: What is tried.
         max_effects: Most effects of a joint.
         say: Shows how far it is.
         run: The whole robot's own fit, if there is one.
+        own: Effects of the run, with its values: the search begins with them.
+        measured: Facts that the user measured, of ``MEASURED_FACTS``.
         log: Gets every decision.
         cfg: By what numbers it is decided.
         fits: Fits models; ``None``: on the processor.
@@ -66,12 +71,14 @@ def search_effects(
     check_long_enough(problem.dataset.validation, problem.control_dt, cfg.judging.fewest, free=free, cfg=cfg.fitting)
 
     # the base model of each joint, and what these recordings can show beside it
-    twins, base, effort = fit_base(fits, problem, physical, candidates, say)
+    twins, base, effort = fit_base(fits, problem, physical, candidates, say, own)
     data = check_data(fits, problem, twins, base, run, cfg=cfg.judging)
     base, late = hold_late_joints(fits, twins, base, cfg=cfg)
     coarse = twins.with_physics_dt(twins.coarsest_dt)
     absorbed = absorbed_effects(fits, coarse, base, candidates, effort, cfg.candidates)
-    base = replace(base, model=replace(base.model, barred=absorbed))
+    n, recordings = base.model.num_joints, problem.dataset.recordings
+    excluded, why = excluded_effects(recordings, candidates, measured, n)
+    base = replace(base, model=replace(base.model, barred=absorbed | excluded))
 
     # one effect after another, as long as they pay on held-out recordings
     enough = cfg.judging.alike * data.floor
@@ -84,26 +91,30 @@ def search_effects(
         fits=fits,
         try_effects=try_effects,
         cfg=cfg,
+        own=frozenset(base.model.effects),
+        begun=[effect for effect in candidates if effect.needs_loads and data.loads > 1],
         trees=[[problem.joint_names.index(name) for name in tree] for tree in problem.trees],
         follow=reference.follow,
         say=say,
         log=log,
     )
-    outcome = pool(fits, add_effects(search, twins, base), log)
+    outcome = add_effects(search, twins, base)
 
-    # where no effect is it, a curve
-    curves = fit_curves(fits, outcome, data.floor, say, log)
-    outcome = take_curves(outcome, curves)
-
-    verdict, explained, outcome = final_verdict(outcome, data.floor)
-    shares = contributions(fits, outcome)
+    # which of them have earned their names; where none has, a curve
+    say("leaving out each effect in turn")
+    names = earned_names(fits, outcome, data.floor, log)
+    outcome = pool(fits, names.outcome, log)
+    curves = fit_curves(fits, outcome, data.floor, names.named, say, log)
+    decision, outcome = verdict(take_curves(outcome, curves), data.floor, names.named)
+    shares = shares_of(names, outcome)
     return Findings(
         outcome=outcome,
-        data=replace(data, sentences=[*data.sentences, *late]),
+        data=replace(data, sentences=[*data.sentences, *late, *why]),
         absorbed=absorbed,
-        verdict=verdict,
-        explained=explained,
-        paying=labels(outcome.final.model, problem.joint_names, list(shares)),
+        verdict=decision,
+        explained=part_explained(outcome, data.floor),
+        paying=labels(outcome.final.model, problem.joint_names, list(shares)) if shares else [],
         shares=shares,
+        hints=names.hints,
         curves=curves,
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
+from pace_optim.terminal.choices import MEASURED_FACTS
 
 
 @dataclass(kw_only=True)
@@ -23,6 +24,9 @@ class DiagnosisSettings:
 
     only: bool = False
     """Whether nothing but ``effects`` is tried."""
+
+    measured: list[str] = field(default_factory=list)
+    """Facts that were measured, of ``MEASURED_FACTS``: effects that would contradict them are not tried."""
 
     max_effects: int = 3
     """Most effects that are added to a joint."""
@@ -48,5 +52,7 @@ class DiagnosisSettings:
         """
         if self.max_effects < 1:
             raise ValueError(f"max_effects is {self.max_effects}, expected at least 1.")
+        if wrong := [fact for fact in self.measured if fact not in MEASURED_FACTS]:
+            raise ValueError(f"--measured {wrong[0]} is not understood. Available: {', '.join(MEASURED_FACTS)}.")
         if self.only and not self.effects:
             raise ValueError("--only needs the effects to try: name them with --effects.")

@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from pace_actuators.effects import effect_cfgs
 from pace_optim.identification.beginning import make_optimizer, make_searcher
 from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+from pace_optim.optimizers.comb_scan import scanned
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg
 from pace_optim.optimizers.search import agree_to_stop, search
@@ -217,7 +219,7 @@ class Optimization:
         if self.settings.start is not None:
             end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
-            end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within)
+            end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within, self._scan)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
@@ -227,6 +229,12 @@ class Optimization:
         space = self.problem.space
         added = [label for label in space.labels if "." in label]
         return [space.start, at_prior(self.problem, space.start, added)] if added else [space.start]
+
+    def _scan(self, x: torch.Tensor) -> torch.Tensor | None:
+        """The best end of the first descents with frequencies of combs that explain more."""
+        problem = self.problem
+        effects = effect_cfgs(problem.env_cfg.sim2real.effects)
+        return scanned(problem.space, self.way.pieces, x, effects, problem.joint_names)
 
     def _search_within(self, budget: int) -> torch.Tensor:
         """The best of a search of the pieces with a budget of simulations."""

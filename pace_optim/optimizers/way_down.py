@@ -86,21 +86,32 @@ class WayDown:
         self.stages = f"{name}{PIECES}", f"{name}{FINE}", f"{name}{WHOLE}"
         self._on_iteration = on_iteration or (lambda _: None)
 
-    def run(self, starts: Sequence[torch.Tensor], search: Callable[[int], torch.Tensor] | None = None) -> Descent:
+    def run(
+        self,
+        starts: Sequence[torch.Tensor],
+        search: Callable[[int], torch.Tensor] | None = None,
+        scan: Callable[[torch.Tensor], torch.Tensor | None] = lambda _: None,
+    ) -> Descent:
         """Go all the way; returns the best descent on the whole recordings.
 
         Args:
             starts: Normalised vectors, (size,).
+            scan: Gives another start by the best end so far, or none.
             search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
         """
         whole = self.stages[-1]
         if not self._of(whole):
             starts = list(starts)
-            best = self._on_pieces(starts, 1)
+            rounds = 1
+            best = self._on_pieces(starts, rounds)
+            if (found := scan(best.x)) is not None:
+                starts.append(found)
+                rounds += 1
+                best = self._on_pieces(starts, rounds)
             if search is not None and self.is_far(best.score):
                 spent = sum(d.simulations for d in self._of(self.stages[0])[: len(starts)])
                 starts.append(search(round(self.cfg.search_budget * spent)))
-                self._on_pieces(starts, 2)
+                self._on_pieces(starts, rounds + 1)
             self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])
 

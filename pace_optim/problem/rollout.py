@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.one_kernel.robot_kernel import CompiledRobot
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
-from pace_optim.recording.dataset import Dataset
+from pace_optim.recording.dataset import Dataset, Work
 from pace_optim.recording.moving_base import Course
 
 if TYPE_CHECKING:
@@ -406,12 +407,18 @@ class Rollout:
             ids = actuator.joint_indices
             shown[:, ids] += actuator.encoder_bias
             actuator.set_session_time(self._session_start[:, ids])
+            if self.dataset.work is not None:
+                actuator.remember(partial(self._heat, self.dataset.work, ids))
         speed = self._rows(self.dataset.start_vel)
         needs_load = any(actuator.needs_load for actuator in self.robot.actuators.values())
         for _ in range(_LOAD_STEPS if needs_load else 1):  # the load bends what an encoder on the motor shows
             self.robot.write_joint_state_to_sim(self.robot.joint_pos_that_shows(shown) + offset, speed)
             if needs_load:
                 self.env.sim.forward()
+
+    def _heat(self, work: Work, joints: Any, time_constant: torch.Tensor, rows: slice) -> torch.Tensor:
+        """Heat of a group of joints when the recordings of some environments begin: see :data:`Heat`."""
+        return work.heat(self._session_start[rows, :1], time_constant, joints)
 
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]
@@ -421,9 +428,7 @@ class Rollout:
                 value = getattr(recording.drive, name)
                 if value is not None:
                     getattr(actuator, name)[rows] = self.env.sim.tensor(value)[actuator.joint_indices]
-            if (
-                recording.drive.saturation_effort is not None
-            ):  # infinite: there is no line
+            if recording.drive.saturation_effort is not None:  # infinite: there is no line
                 stall = actuator.saturation_effort[rows]
                 actuator.velocity_limit[rows] = actuator.velocity_limit[rows].where(stall.isfinite(), torch.inf)
                 actuator.saturation_effort[rows] = stall.clamp(max=torch.finfo(stall.dtype).max)

@@ -91,7 +91,7 @@ def _scale(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> n
     asked = np.zeros(len(length))
     if stated:
         kp = of_joints(env, "stiffness") if drive.stiffness is None else drive.stiffness
-        asked = np.maximum(0.5 * kp * length, np.abs(_torque(env, recording)).max(axis=0))
+        asked = np.maximum(0.5 * kp * length, np.abs(asked_torque(env, recording)).max(axis=0))
     return np.where(np.isfinite(limit), 0.0 if drive.effort_limit is None else limit, asked)
 
 
@@ -100,7 +100,7 @@ def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     time, half = recording.time, _half(recording)
     speed = np.gradient(_smooth(recording.dof_pos, half), time, axis=0)
     inner = slice(half + 2, -half - 2)
-    parts = (_torque(env, recording), speed, np.gradient(speed, time, axis=0))
+    parts = (asked_torque(env, recording), speed, np.gradient(speed, time, axis=0))
     return np.array([np.var(each[inner], axis=0) for each in parts])
 
 
@@ -109,7 +109,7 @@ def _half(recording: Recording) -> int:
     return max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
 
 
-def _torque(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+def asked_torque(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     """What the drives were asked for, within the configured limits, (T, n) [N m]."""
     speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
     kp, kd = (

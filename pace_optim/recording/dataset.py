@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,34 @@ _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
 _SHORTEST = 3.0
 """A recording that is no longer than this many times that keeps its beginning."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Work:
+    """How hard drives worked in a session, bin by bin."""
+
+    begin: torch.Tensor
+    """Of each bin since the session began, (B,) [s]."""
+    end: torch.Tensor
+    """The same, (B,) [s]."""
+    square: torch.Tensor
+    """Mean square of the torque that was asked, (B, n) [N² m²]."""
+
+    def on_joints(self, joints: Sequence[int]) -> Work:
+        """That of some joints, by index."""
+        return replace(self, square=self.square[:, list(joints)])
+
+    def heat(self, time: torch.Tensor, time_constant: torch.Tensor, joints: Any = slice(None)) -> torch.Tensor:
+        """What it has made of the heat h by an instant, T dh/dt + h = τ², h = 0 at first, (rows, joints) [N² m²].
+
+        Args:
+            time: Since the session began, (rows, 1) [s].
+            time_constant: T, (rows, joints) [s].
+            joints: Which joints.
+        """
+        edges = (each.to(time_constant) for each in (self.begin, self.end))
+        first, last = (torch.exp(-(time - edge).clamp(min=0.0)[:, :, None] / time_constant[:, None]) for edge in edges)
+        return ((last - first) * self.square.to(time_constant)[:, joints]).sum(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,6 +90,8 @@ class Dataset:
     """When its first sample was taken, since the recording began, (R,) [s]; not zero of a window."""
     start_vel: torch.Tensor
     """Speed at the first sample, (R, n) [rad/s]: as recorded, else the slope where it stands out of the noise."""
+    work: Work | None = None
+    """How hard the drives worked in the session; ``None`` where that is not known."""
     settling: torch.Tensor | None = None
     """Samples that are neither trained on nor validated on, (T, R) bool: a recording begins in motion, and its speed
     is not known; ``None`` where there are none."""
@@ -113,6 +144,7 @@ class Dataset:
             session_start=self.session_start[chosen],
             start_time=self.start_time[chosen],
             start_vel=self.start_vel[chosen],
+            work=self.work,
             settling=None if self.settling is None else self.settling[:, chosen],
             carried=None if self.carried is None else self.carried.select(chosen),
         )
@@ -141,6 +173,7 @@ class Dataset:
             measured_vel=self.measured_vel[..., chosen],
             start_vel=self.start_vel[..., chosen],
             carried=None if self.carried is None else self.carried.on_joints(chosen),
+            work=None if self.work is None else self.work.on_joints(chosen),
         )
 
     def trained(self) -> list[int]:

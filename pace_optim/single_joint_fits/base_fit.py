@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
-from pace_actuators.effects import Effect
+from pace_actuators import resolve_joint_values
+from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.problem.problem import Problem
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_fits.fitting_cfg import DEFAULT, FittingCfg
-from pace_optim.single_joint_fits.model import BASE, COLUMN, JointModel
+from pace_optim.single_joint_fits.labels import found_effects
+from pace_optim.single_joint_fits.model import BASE, COLUMN, JointModel, whole_values
 from pace_optim.single_joint_model import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.single_joint_model.problem import TwinProblem
 
@@ -22,6 +25,7 @@ def fit_base(
     physical: torch.Tensor,
     effects: Sequence[type[Effect]] = (),
     say: Callable[[str], None] = lambda _: None,
+    own: Sequence[EffectCfg] = (),
 ) -> tuple[TwinProblem, Fitted, torch.Tensor]:
     """Fit the base model from a first guess; the reference that the joints move along follows.
 
@@ -31,13 +35,15 @@ def fit_base(
         physical: First guess of its parameters, (size,).
         effects: Effects whose influence on the rigid bodies is wanted.
         say: Shows how far it is.
+        own: Effects with values that the base model has too.
 
     Returns:
         The problem of single joints, the fitted model with its Jacobian, and the typical torque of each joint
         (n,) [N m].
     """
-    fitted = Fitted.start(JointModel.base(problem), joint_vectors(problem, physical))
-    names = [effect.name for effect in effects if effect.overrides("write_model")]
+    fitted = _with_own_effects(problem, physical, own)
+    every = dict.fromkeys([*effects, *(cfg.effect_class for cfg in own)])
+    names = [effect.name for effect in every if effect.overrides("write_model")]
     along = measured_path if problem.joints_stand_alone else reference_path
     twins, fitted = _fit_along(fits, problem, fitted, along, names, say)
     if along is measured_path and float(fitted.score.max()) > fits.cfg.away**2:
@@ -67,8 +73,9 @@ def _fit_along(
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:
         late = later_than_most(fitted.physical[:, COLUMN["delay"]], cfg=fits.cfg)
-        more = {"late": late, "away": fits.cfg.away} if along is reference_path else {}
-        return along(of, whole_vector(of, fitted.physical), model_effects, **more)
+        if along is measured_path:
+            return measured_path(of, whole_vector(of, fitted.physical), model_effects)
+        return reference_path(*whole_robot(of, fitted), model_effects, late=late, away=fits.cfg.away)
 
     cfg = fits.cfg
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
@@ -94,10 +101,32 @@ def later_than_most(delay: torch.Tensor, *, cfg: FittingCfg = DEFAULT) -> torch.
     return (behind > max(cfg.late, cfg.scatters * float(scatter))) & (len(delay) > 2)
 
 
+def _with_own_effects(problem: Problem, physical: torch.Tensor, own: Sequence[EffectCfg]) -> Fitted:
+    """A model of each joint with the base parameters and effects of the whole robot."""
+    model, values, names = JointModel.base(problem), joint_vectors(problem, physical), problem.joint_names
+    for cfg in own:
+        effect, joints = cfg.effect_class, cfg.joints(names)
+        null = [p.start if p.null is None else p.null for p in effect.parameters]
+        known = {p.name: resolve_joint_values(cfg.values[p.name], joints, field=p.name) for p in effect.parameters}
+        rows = torch.tensor([null] * len(names), dtype=torch.float64)
+        has = torch.tensor([name in joints for name in names])
+        rows[has] = torch.stack([known[p.name].double() for p in effect.parameters], dim=1)
+        model, values = model.extended(values, effect, has, rows)
+        if cfg.shared:
+            model = replace(model, shared=model.shared | {effect})
+    return Fitted.start(model, values)
+
+
 def joint_vectors(problem: Problem, physical: torch.Tensor) -> torch.Tensor:
     """The base parameters of each joint, (n, 5), of a vector of the whole robot."""
     n, space = len(problem.joint_names), problem.space
     return torch.stack([physical[space[name]].expand(n) for name in BASE], dim=1)
+
+
+def whole_robot(problem: Problem, fitted: Fitted) -> tuple[Problem, torch.Tensor]:
+    """The whole robot with the effects of a model of its joints, and its parameters, (size,)."""
+    problem = problem.with_effects(found_effects(fitted.model, problem.joint_names))
+    return problem, problem.space.from_dict(whole_values(fitted.model, fitted.x, problem.joint_names))
 
 
 def whole_vector(problem: Problem, joints: torch.Tensor) -> torch.Tensor:

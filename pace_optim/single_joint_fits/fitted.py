@@ -52,6 +52,11 @@ class Fitted:
         moves = self.model.free & (self.x.abs() <= 1 - AT_BOUND)
         return self.jacobian * moves.T[:, None, None]
 
+    @property
+    def moves(self) -> torch.Tensor | None:
+        """Which entries move their joint, (n, P) bool; ``None`` without a Jacobian."""
+        return None if self.jacobian is None else (self.jacobian != 0).any(dim=1).any(dim=1).T
+
     def on_joints(self, joints: torch.Tensor) -> Fitted:
         """The fit of some joints, (n,) bool, with the effects that any of them has."""
         if bool(joints.all()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -38,6 +39,8 @@ class JointModel:
     """Which joints slide, (n,) bool: effects that mean nothing there are not tried."""
     ranges: torch.Tensor
     """Between which positions each joint moves, (n, 2) [rad]: effects' positions are sought there."""
+    efforts: torch.Tensor
+    """The largest torque of each joint's drive, (n,) [N m]; infinite where it is not known."""
     barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
     """Effects that some joints cannot get, (n,) bool."""
     shared: frozenset[type[Effect]] = frozenset()
@@ -58,6 +61,9 @@ class JointModel:
             slides=torch.tensor([joint in sim2real.slide_joints for joint in problem.joint_names]),
             ranges=torch.tensor(
                 [sim2real.joint_ranges.get(joint, (0.0, 0.0)) for joint in problem.joint_names], dtype=torch.float64
+            ),
+            efforts=torch.tensor(
+                [sim2real.joint_efforts.get(joint, math.inf) for joint in problem.joint_names], dtype=torch.float64
             ),
         )
 
@@ -116,6 +122,7 @@ class JointModel:
             log=self.log[entries],
             slides=self.slides[joints],
             ranges=self.ranges[joints],
+            efforts=self.efforts[joints],
             barred={effect: barred[joints] for effect, barred in self.barred.items()},
         )
         return model, entries
@@ -194,7 +201,8 @@ class JointModel:
 
     def _declared(self, effect: type[Effect]) -> tuple[torch.Tensor, torch.Tensor]:
         """The bounds of an effect on each joint, as it declares them, (n, parameters) each."""
-        bounds = [[p.reaching(low, high) for p in effect.parameters] for low, high in self.ranges.tolist()]
+        places = zip(*self.ranges.T.tolist(), self.efforts.tolist(), strict=True)
+        bounds = [[p.reaching(*place) for p in effect.parameters] for place in places]
         own = torch.tensor(bounds, dtype=torch.float64).reshape(self.num_joints, -1, 2)
         return own[..., 0], own[..., 1]
 
@@ -202,8 +210,8 @@ class JointModel:
         """The widest bounds of an effect's parameter on some joints, (n,) bool; physical, one for each of them."""
         friction = self.upper[joints, COLUMN["friction"]].tolist()
         bounds = torch.tensor([parameter.widest(each) for each in friction], dtype=torch.float64).reshape(-1, 2)
-        ranges = self.ranges[joints].tolist()
-        own = torch.tensor([parameter.reaching(*each) for each in ranges], dtype=torch.float64).reshape(-1, 2)
+        places = zip(*self.ranges[joints].T.tolist(), self.efforts[joints].tolist(), strict=True)
+        own = torch.tensor([parameter.reaching(*place) for place in places], dtype=torch.float64).reshape(-1, 2)
         return torch.minimum(bounds[:, 0], own[:, 0]), torch.maximum(bounds[:, 1], own[:, 1])
 
     def is_wide(self, effect: type[Effect]) -> torch.Tensor:
@@ -249,21 +257,41 @@ class JointModel:
                 excluded |= those
         return ~excluded
 
-    def at_bounds(self, x: torch.Tensor) -> torch.Tensor:
-        """Joints with an effect whose size has run into a bound, (effects, n) bool.
+    def at_bounds(self, x: torch.Tensor, moves: torch.Tensor | None = None) -> torch.Tensor:
+        """Entries of effects that have run into a bound, (n, P) bool.
 
-        A size is what vanishes at a null; the bound that is the null, or next to an infinite one, does not count.
+        A bound that is the null, or next to an infinite one, does not count; nor does one of a parameter that shapes an
+        effect (it has no null) where the parameter moves nothing.
 
         Args:
             x: Normalised, (n, P).
+            moves: Which entries move their joint, (n, P) bool; ``None``: not known, and only sizes count.
         """
+        result = torch.zeros_like(x, dtype=torch.bool)
+        low, high = x < AT_BOUND - 1, x > 1 - AT_BOUND
+        for effect, has in zip(self.effects, self.has, strict=True):
+            for column, parameter in enumerate(effect.parameters, start=self.columns(effect).start):
+                if parameter.null is None:
+                    stuck = torch.zeros_like(has) if moves is None else (low | high)[:, column] & moves[:, column]
+                else:
+                    stuck = low[:, column] & (parameter.null > parameter.lower)
+                    stuck = stuck | (high[:, column] & (parameter.null < parameter.upper))
+                result[:, column] = has & stuck
+        return result & self.free
+
+    def has_at_bounds(self, x: torch.Tensor, moves: torch.Tensor | None = None) -> torch.Tensor:
+        """Joints with an effect that has run into a bound, (effects, n) bool; arguments as for :meth:`at_bounds`."""
+        stuck = self.at_bounds(x, moves)
+        own = [stuck[:, self.columns(effect)].any(dim=1) for effect in self.effects]
+        return torch.stack(own) if own else torch.zeros_like(self.has)
+
+    def implausible(self, physical: torch.Tensor) -> torch.Tensor:
+        """Joints with an effect of a value that no drive has, (effects, n) bool, of physical values (n, P)."""
         result = torch.zeros_like(self.has)
         for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
-            for parameter, value in zip(effect.parameters, x[:, self.columns(effect)].unbind(dim=1), strict=True):
-                if parameter.null is not None and parameter.null > parameter.lower:
-                    result[row] |= has & (value < AT_BOUND - 1)
-                if parameter.null is not None and parameter.null < parameter.upper:
-                    result[row] |= has & (value > 1 - AT_BOUND)
+            for column, parameter in enumerate(effect.parameters, start=self.columns(effect).start):
+                least, most = parameter.plausible
+                result[row] |= has & ((physical[:, column] < least) | (physical[:, column] > most))
         return result
 
     @property

@@ -10,10 +10,10 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.problem.problem import Problem
+from pace_optim.single_joint_fits.base_fit import whole_robot
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.labels import found_effects
-from pace_optim.single_joint_fits.model import COLUMN, whole_values
+from pace_optim.single_joint_fits.model import COLUMN
 from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.single_joint_model.path import ReferencePath
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -62,12 +62,12 @@ class ReferenceUpdate:
 
     def away(self, twins: TwinProblem, now: Fitted) -> float:
         """RMS distance of joints from their reference with a model [rad]; as in windows at the control step."""
-        problem = twins.coarse().with_effects(found_effects(now.model, twins.joint_names))
+        problem, values = whole_robot(twins.coarse(), now)
         rollout, sampled = problem.evaluator().rollout(1), problem.dataset.sampled
-        rollout.start(self._values(problem, now)[None], sampled)
+        rollout.start(values[None], sampled)
         square = torch.zeros(())
         for k, _ in enumerate(rollout.simulated(rollout.duration_steps)):
-            away = rollout.robot.data.joint_pos - problem.path.position[k]
+            away = rollout.robot.data.joint_pos - problem.path.position[k]  # type: ignore[attr-defined]
             square = square + away[sampled[k]].square().sum()
         rollout.env.close()
         return math.sqrt(float(square) / (int(sampled.sum()) * len(problem.joint_names)))
@@ -78,11 +78,7 @@ class ReferenceUpdate:
 
     def path(self, now: Fitted) -> ReferencePath:
         """The motion of the whole robot with a model."""
-        problem = self.problem.with_effects(found_effects(now.model, self.problem.joint_names))
-        changing = [effect.name for effect in self.candidates if effect.overrides("write_model")]
+        every = dict.fromkeys([*self.candidates, *now.model.effects])
+        changing = [effect.name for effect in every if effect.overrides("write_model")]
         held = ~now.model.free[:, COLUMN["delay"]]
-        return reference_path(problem, self._values(problem, now), changing, late=held, away=self.fits.cfg.away)
-
-    @staticmethod
-    def _values(problem: Problem, now: Fitted) -> torch.Tensor:
-        return problem.space.from_dict(whole_values(now.model, now.x, problem.joint_names))
+        return reference_path(*whole_robot(self.problem, now), changing, late=held, away=self.fits.cfg.away)

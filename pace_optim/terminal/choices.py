@@ -13,3 +13,5 @@ UNKNOWN_FACTS = {
 }
 """Fact (field of a drive's configuration) -> the effect whose parameter finds it: gains as factors of what is stated,
 limits themselves."""
+MEASURED_FACTS = {**UNKNOWN_FACTS, "torque": "torque_gain", "load": "payload"}
+"""Fact that a user can have measured -> the effect that would contradict it."""

@@ -95,6 +95,9 @@ class PaceCfg(Config):
     joint_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Between which positions each joint moves [rad, of slides m]: its limits, else where recordings have it."""
 
+    joint_efforts: Mapping[str, float] = field(default_factory=dict)
+    """The largest torque of each joint's drive [N m, of slides N]: its limit, else by what recordings ask of it."""
+
     assumed_gains: tuple[str, ...] = ()
     """Joints whose gains nobody has stated: those of their drives are assumed."""
 
@@ -165,6 +168,7 @@ class PaceCfg(Config):
             effect_bounds=_of_joints(self.effect_bounds, names),
             slide_joints=tuple(name for name in self.slide_joints if name in names),
             joint_ranges={name: each for name, each in self.joint_ranges.items() if name in names},
+            joint_efforts={name: each for name, each in self.joint_efforts.items() if name in names},
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             extra_parameters=(),

@@ -128,7 +128,8 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             given = cfg.effect_bounds.get(f"{kind.name}.{parameter.name}", {})
             each = []
             for joint, i in zip(own, ids, strict=True):
-                lower, upper = parameter.reaching(*cfg.joint_ranges.get(joint, (0.0, 0.0)))
+                low, high = cfg.joint_ranges.get(joint, (0.0, 0.0))
+                lower, upper = parameter.reaching(low, high, cfg.joint_efforts.get(joint, math.inf))
                 if kind is DynamicFriction:
                     lower, upper = cfg.friction_ratio_bounds
                 elif effect.wide:

@@ -18,7 +18,7 @@ from pace_optim.recording import Recording
 from pace_optim.recording.noise import lattice_step, noise_floor
 from pace_optim.recording.sessions import session_starts
 from pace_optim.run.result import FitResult
-from pace_optim.single_joint_fits.base_fit import whole_vector
+from pace_optim.single_joint_fits.base_fit import whole_robot
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
@@ -72,7 +72,7 @@ def check_data(
             if step is not None:
                 steps[name] = step
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
-    numerical = step_error(problem, whole_vector(problem, base.physical), data.validation)
+    numerical = step_error(*whole_robot(problem, base), data.validation)
     sentences = [
         f"Measurement noise: {_by_type(noise, types, _span)}; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
@@ -90,7 +90,8 @@ def check_data(
     )
     sentences += unstamped(data.recordings)
     floor = (noise**2 + numerical**2).sqrt()
-    if run is not None and not run.effects and not math.isclose(run.physics_dt, problem.physics_dt):
+    same = run is not None and bool(run.effects) == bool(base.model.effects)
+    if run is not None and same and not math.isclose(run.physics_dt, problem.physics_dt):
         by_run = torch.tensor([run.rmse["validation"].get(name, math.inf) for name in names])
         left = fits.validation_errors(twins, [base])[0].mse.sqrt()
         at_floor = cfg.alike * floor

@@ -40,7 +40,7 @@ def hold_late_joints(
     while bool(late.any()):
         held = _held(fits, twins, base, late, delay.median())
         with_one, with_own = (errors.mse for errors in fits.validation_errors(twins, [held, base]))
-        if (only_late := late & (with_own < (1 - cfg.verdict.nearly_all) * with_one)).equal(late):
+        if (only_late := late & (cfg.judging.far**2 * with_own < with_one)).equal(late):
             return held, [_sentence(twins, delay, late)]
         late = only_late
     return base, []

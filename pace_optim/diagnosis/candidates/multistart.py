@@ -31,6 +31,7 @@ def multistart(
         effects: What is tried.
         cfg: From which base parameters.
     """
+    effects = [effect for effect in effects if effect.comb is None]  # a screening has scanned it
     starts = fits.shared_out(lambda own: _best_points(fits, problem, now, own, cfg), effects, effects)
     return [start for of_effect in starts for start in of_effect]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 
-from pace_actuators.effects import PROBED_EFFORT, Effect, probe_points
+from pace_actuators.effects import PROBED_EFFORT, Effect, comb_grid, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
@@ -62,16 +63,25 @@ def screen(
     if error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
 
-    def look_at(own: Sequence[type[Effect]]) -> list[list[Probe]]:
-        probes, changes, where = simulated_probes(fits, problem, now, own, effort)
+    def explained(
+        own: Sequence[tuple[type[Effect], torch.Tensor]], parts: int = 1
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        changes, where = simulated_changes(fits, problem, now, own)
         steps = where.any(dim=1).nonzero()[:, 0][:: fits.cfg.stride]
         fold = torch.where(where[steps], _folds(steps * problem.control_dt, where.shape[1], cfg), -1)
-        scores, sizes = _explained(error, now.free_jacobian, changes, fold, cfg.folds)
+        return _explained(error, now.free_jacobian, changes.unflatten(0, (-1, parts)), fold, cfg.folds)
+
+    def look_at(own: Sequence[type[Effect]]) -> list[list[Probe]]:
         result: dict[type[Effect], list[Probe]] = {effect: [] for effect in own}
-        for (effect, values), score, size in zip(probes, scores, sizes, strict=True):
-            allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
-            probe = Probe(effect=effect, values=values, score=torch.where(allowed, score, 0.0), size=size)
-            result[effect].append(probe)
+        points = [each for effect in own if effect.comb is None for each in probe_values(effect, effort)]
+        if points:
+            scores, sizes = explained(points)
+            for (effect, values), score, size in zip(points, scores, sizes[:, 0], strict=True):
+                allowed = now.model.allowed_joints(effect) & ((size > 0) | effect.two_sided)
+                probe = Probe(effect=effect, values=values, score=torch.where(allowed, score, 0.0), size=size)
+                result[effect].append(probe)
+        for effect in (each for each in own if each.comb is not None):
+            result[effect] = _comb_probes(effect, problem, now, effort, explained, cfg)
         return list(result.values())
 
     each = fits.shared_out(look_at, effects, effects)
@@ -104,7 +114,8 @@ def absorbed_effects(
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
-    probes, changes, _ = simulated_probes(fits, problem, now, suspects, effort, beside)
+    probes = [each for effect in suspects for each in probe_values(effect, effort)]
+    changes, _ = simulated_changes(fits, problem, now, probes, beside)
     jacobian = now.free_jacobian
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
         at_bound = (jacobian[taker] == 0).all(dim=0).all(dim=0)  # there it absorbs nothing
@@ -120,31 +131,78 @@ def absorbed_effects(
     return {effect: joints for effect, joints in result.items() if bool(joints.any())}
 
 
-def simulated_probes(
+def _comb_probes(
+    effect: type[Effect],
+    problem: TwinProblem,
+    now: Fitted,
+    effort: torch.Tensor,
+    explained: Callable[..., tuple[torch.Tensor, torch.Tensor]],
+    cfg: CandidatesCfg,
+) -> list[Probe]:
+    """Of all frequencies of a comb those that explain most, each with the sine and the cosine that do, best first.
+
+    Neighbouring points of the grid are of one valley: the better one is kept.
+    """
+    assert effect.comb is not None
+    data, n = problem.dataset, now.model.num_joints
+    seen = data.measured[data.train]
+    grids = [comb_grid(effect, float(span)) for span in seen.amax(dim=0) - seen.amin(dim=0)]
+    count = max(map(len, grids))
+    frequency = torch.stack([torch.cat([own, own[-1:].expand(count - len(own))]) for own in grids], dim=1)
+    names = [p.name for p in effect.parameters]
+    place, *amplitudes = (names.index(name) for name in effect.comb)
+    (_, first), (_, second) = probe_values(effect, effort)
+    scores, sizes = [], []
+    for part in frequency.split(cfg.at_once):
+        pairs = [(effect, each.index_fill(1, torch.tensor([place]), 0.0)) for _ in part for each in (first, second)]
+        for k, (_, values) in enumerate(pairs):
+            values[:, place] = part[k // 2]
+        score, size = explained(pairs, 2)
+        scores.append(score)
+        sizes.append(size)
+    score, size = torch.cat(scores), torch.cat(sizes)
+    beside = torch.maximum(score.roll(1, dims=0), score.roll(-1, dims=0))
+    peaks = torch.where(score >= beside, score, -1.0)
+    best = peaks.argsort(dim=0, descending=True)[: cfg.valleys]
+    probes, joints = [], torch.arange(n)
+    allowed = now.model.allowed_joints(effect)
+    for row in best:
+        values = first.clone()
+        values[:, place] = frequency[row, joints]
+        for k, (column, probe) in enumerate(zip(amplitudes, (first, second), strict=True)):
+            values[:, column] = size[row, k, joints] * probe[:, column]
+        own = torch.where(allowed, score[row, joints], 0.0)
+        probes.append(Probe(effect=effect, values=values, score=own, size=torch.ones(n, dtype=torch.float64)))
+    return probes
+
+
+def simulated_changes(
     fits: Fits,
     problem: TwinProblem,
     now: Fitted,
-    effects: Sequence[type[Effect]],
-    effort: torch.Tensor,
+    points: Sequence[tuple[type[Effect], torch.Tensor]],
     beside: torch.Tensor | None = None,
-) -> tuple[list[tuple[type[Effect], torch.Tensor]], torch.Tensor, torch.Tensor]:
-    """All probes with their values, what they change (probes, K, R, n), and where the samples are (T, R).
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What effects at values (n, parameters) change, (points, K, R, n), and where the samples are (T, R).
 
-    ``beside``, (b, n, P) normalised, are more values of the model itself; what those change comes first.
+    ``beside``, (b, n, P) normalised, are more values of the model itself; what those change comes first. Points of one
+    effect follow each other.
     """
     model, physical = now.model, now.physical
     own = now.x[None] if beside is None else torch.cat([now.x[None], beside])
     slots, values = [Slot(model=model, rows=len(own))], [model.to_physical(own)]
-    probes: list[tuple[type[Effect], torch.Tensor]] = []
-    for effect in effects:
-        points = [_probe_values(effect, point, effort / PROBED_EFFORT) for point in probe_points(effect)]
-        extended = [model.extended(physical, effect, model.allowed_joints(effect), each) for each in points]
-        slots.append(Slot(model=extended[0][0], rows=len(points)))
+    for effect, each in itertools.groupby(points, key=lambda point: point[0]):
+        extended = [model.extended(physical, effect, model.allowed_joints(effect), point) for _, point in each]
+        slots.append(Slot(model=extended[0][0], rows=len(extended)))
         values.append(torch.stack([each for _, each in extended]))
-        probes += [(effect, each) for each in points]
     batch = fits.batch(problem, slots, training=True)
     errors = batch.simulate(values, batch.dataset.train, fits.cfg.stride).cpu()
-    return probes, errors[1:] - errors[:1], batch.dataset.train
+    return errors[1:] - errors[:1], batch.dataset.train
+
+
+def probe_values(effect: type[Effect], effort: torch.Tensor) -> list[tuple[type[Effect], torch.Tensor]]:
+    """An effect's probes on joints with a typical torque, (n,) [N m]: physical values, (n, parameters) each."""
+    return [(effect, _probe_values(effect, point, effort / PROBED_EFFORT)) for point in probe_points(effect)]
 
 
 def _probe_values(effect: type[Effect], point: dict[str, float], size: torch.Tensor) -> torch.Tensor:
@@ -178,32 +236,33 @@ def _folds(time: torch.Tensor, recordings: int, cfg: CandidatesCfg) -> torch.Ten
 def _explained(
     error: torch.Tensor, jacobian: torch.Tensor, changes: torch.Tensor, fold: torch.Tensor, folds: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Score and coefficient of every change, (probes, n) each.
+    """Score, (probes, n), and coefficients, (probes, parts, n), of every change.
 
     Args:
         error: (K, R, n).
         jacobian: (P, K, R, n).
-        changes: (probes, K, R, n).
+        changes: (probes, parts, K, R, n): parts are regressed on together.
         fold: Of each sample, (K, R).
         folds: How many there are.
     """
-    n, size = error.shape[-1], len(jacobian)
-    scores = torch.zeros(len(changes), n, dtype=torch.float64)
-    sizes = torch.zeros_like(scores)
+    n, size, (count, parts) = error.shape[-1], len(jacobian), changes.shape[:2]
+    scores = torch.zeros(count, n, dtype=torch.float64)
+    sizes = torch.zeros(count, parts, n, dtype=torch.float64)
     for j in range(n):
-        columns = torch.cat([jacobian[..., j], changes[..., j], error[None, ..., j]])
+        columns = torch.cat([jacobian[..., j], changes[..., j].flatten(0, 1), error[None, ..., j]])
         scale = columns.flatten(1).norm(dim=1).clamp(min=1e-12)
         columns = columns / scale[:, None, None]
         grams = torch.stack([_gram(columns[:, fold == f]) for f in range(folds)])
         own = [*range(size), len(columns) - 1]
         base = _cross_validated(grams[:, own][:, :, own])
-        for i in range(size, size + len(changes)):
-            if float(scale[i]) < 1e-9:
+        for i in range(count):
+            added = [*range(size + i * parts, size + (i + 1) * parts)]
+            if float(scale[added].min()) < 1e-9:
                 continue
-            own = [*range(size), i, len(columns) - 1]
+            own = [*range(size), *added, len(columns) - 1]
             with_it = grams[:, own][:, :, own]
-            scores[i - size, j] = 1 - _cross_validated(with_it) / base
-            sizes[i - size, j] = -float(_solve(with_it.sum(dim=0))[size] * scale[-1] / scale[i])
+            scores[i, j] = 1 - _cross_validated(with_it) / base
+            sizes[i, :, j] = -_solve(with_it.sum(dim=0))[size:] * scale[-1] / scale[added]
     return scores, sizes
 
 

@@ -16,6 +16,7 @@ from pace_optim.diagnosis.judging.candidate_results import Trial
 from pace_optim.diagnosis.judging.choice import choose
 from pace_optim.diagnosis.judging.comparison import judge, within
 from pace_optim.diagnosis.judging.decisions import Decision, Log, Taken
+from pace_optim.diagnosis.judging.naming import Evidence, doubts
 from pace_optim.single_joint_fits.block_errors import BlockErrors
 
 
@@ -78,8 +79,8 @@ def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if taken else None for _ in decision.joints]
 
 
-def _idle(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """An effect that a joint can do without."""
+def _echo(decision: Decision, cfg: DiagnosisCfg) -> Taken:
+    """An effect that a joint can do without, as another joint of its tree has it."""
     ((name, after),) = decision.after.items()
     errors = zip(after.mse.tolist(), decision.before.mse.tolist(), strict=True)
     return [name if within(without, having, cfg.judging.as_good) else None for without, having in errors]
@@ -112,6 +113,12 @@ def beats(way: Mapping[str, Any], other: Mapping[str, Any], *, cfg: JudgingCfg =
     return within(way["mse"], other["mse"], cfg.as_good) if own < others else way["mse"] < other["mse"]
 
 
+def _name(decision: Decision, cfg: DiagnosisCfg) -> Taken:
+    """An effect whose name is earned."""
+    (name,) = decision.after
+    return [None if doubts(Evidence(**own), cfg=cfg) else name for own in decision.facts["evidence"]]
+
+
 def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """A curve in place of a joint's effects, where it explains enough, and leaves much less than they do."""
     ((name, after),), facts = decision.after.items(), decision.facts
@@ -125,8 +132,9 @@ _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "add": _add,
     "replace": _replace,
     "look_ahead": _look_ahead,
-    "idle": _idle,
+    "echo": _echo,
     "pool": _pool,
     "trim": _trim,
+    "name": _name,
     "curves": _curves,
 }

@@ -22,7 +22,8 @@ def unevenness(now: Fitted) -> torch.Tensor:
         now: A model, fitted, with its Jacobian.
 
     Returns:
-        (effects, n); zero where a joint does not have the effect, and where there are fewer than three recordings.
+        (effects, n); zero where a joint does not have the effect. Halves of recordings stand for recordings where
+        there are one or two: of two sizes nothing says which is right.
 
     Raises:
         ValueError: If there is no Jacobian.
@@ -33,17 +34,25 @@ def unevenness(now: Fitted) -> torch.Tensor:
     columns = now.free_jacobian
     if now.error is None:
         raise ValueError("The sizes in each recording need a model that was fitted with keep_jacobian.")
-    if now.error.shape[1] <= 2:
-        return result
+    columns, errors = _in_parts(columns), _in_parts(now.error)
     for i, effect in enumerate(now.model.effects):
         own = torch.arange(now.model.size)[now.model.columns(effect)].tolist()
         others = [p for p in range(now.model.size) if p not in own]
         for j in now.model.has[i].nonzero()[:, 0].tolist():
-            jacobian, error = columns[..., j].double(), now.error[..., j].double().flatten()
+            jacobian, error = columns[..., j].double(), errors[..., j].double().flatten()
             alone = torch.diag_embed(jacobian[own]).permute(0, 3, 1, 2)  # (own, R, K, R)
             together = torch.cat([jacobian[others].flatten(1), alone.flatten(2).flatten(0, 1)])
             result[i, j] = 1 - _left(together, error) / max(_left(jacobian.flatten(1), error), 1e-300)
     return result
+
+
+def _in_parts(values: torch.Tensor) -> torch.Tensor:
+    """Values (…, K, R, n) with halves of recordings in place of them, as long as there are no more than two."""
+    while values.shape[-2] <= 2:
+        *_, samples, _, _ = values.shape
+        half = samples // 2
+        values = torch.cat([values[..., :half, :, :], values[..., half : 2 * half, :, :]], dim=-2)
+    return values
 
 
 def _left(columns: torch.Tensor, error: torch.Tensor) -> float:

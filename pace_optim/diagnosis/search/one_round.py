@@ -32,7 +32,7 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
     if not begun:
         return None
     fits, problem, now, errors = search.fits, branch.problem, branch.now, branch.errors
-    cfg, first = search.cfg, not now.model.effects
+    cfg, first = search.cfg, search.own.issuperset(now.model.effects)
     search.say(f"refitting with {_names(list(begun))}")
     fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
     if cfg.has("widen_bounds"):
@@ -94,14 +94,16 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
     excess = (errors.mse - search.at_floor**2).clamp(min=0.0)
     listed = with_likes(_short_list(_promising(probes, excess, cfg.explains), excess, cfg), effects)
     far = bool((errors.mse.sqrt() > cfg.beyond_screening * search.floor).any())
-    wide = not now.model.effects or far
-    begin = list(dict.fromkeys([*listed, *(effects if wide else ())]))
+    wide = search.own.issuperset(now.model.effects) or far
+    always = [effect for effect in search.begun if effect in effects]
+    begin = list(dict.fromkeys([*listed, *always, *(effects if wide else ())]))
     if not begin:
         return {}, probes
     search.say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
     begun = _begun(search, branch, probes, begin, far and search.cfg.has("multistart"))
     if wide:
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
+    listed = list(dict.fromkeys([*listed, *always]))
     # where nothing is listed no effect does better than the base parameters alone
     return {effect: begun[effect] for effect in listed}, probes
 
@@ -129,7 +131,7 @@ def beyond_bounds(
         effect = each.tried
         if effect is None or effect not in each.model.effects:
             continue
-        joints = each.model.at_bounds(each.x)[each.model.effects.index(effect)]
+        joints = each.model.has_at_bounds(each.x)[each.model.effects.index(effect)]
         model = each.model.widened(effect, joints)
         if torch.equal(model.lower, each.model.lower) and torch.equal(model.upper, each.model.upper):
             continue
@@ -198,11 +200,11 @@ def _neighbours_together(starts: Sequence[Fitted]) -> list[Fitted]:
 
 
 def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
-    """A joint's best two probes of an effect, or the best of each structure."""
+    """A joint's best two probes of an effect, all of a comb, or the best of each structure."""
     ranked = sorted(probes, key=lambda probe: -float(probe.score[joint]))
     structural = probes[0].effect.structural
     if not structural:
-        return ranked[:2]
+        return ranked if probes[0].effect.comb else ranked[:2]
     place = [parameter.name for parameter in probes[0].effect.parameters].index(structural)
     best: dict[float, Probe] = {}
     for probe in ranked:

@@ -22,8 +22,10 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
     The value is the joints' mean, weighted by how well each is known beside its other parameters (the Schur
     complement of the Gauss–Newton matrix); the other parameters are fitted again with it held.
     """
+    if outcome.final.jacobian is None and outcome.cfg.has("pool"):
+        outcome = replace(outcome, final=fits.looked_at(outcome.problem, [outcome.final])[0])
     for effect, has in zip(outcome.final.model.effects, outcome.final.model.has, strict=True):
-        if not outcome.cfg.has("pool") or effect.shared or int(has.sum()) < 2:
+        if not outcome.cfg.has("pool") or effect.shared or effect in outcome.base.model.effects or int(has.sum()) < 2:
             continue
         held = _held(outcome.final, effect, has)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import torch
 
 from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
@@ -18,19 +14,13 @@ from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.single_joint_model.problem import TwinProblem
 
 
-def add_effects(
-    search: Search,
-    problem: TwinProblem,
-    base: Fitted,
-    size_consistency: Callable[[Fitted], torch.Tensor] = unevenness,
-) -> Outcome:
+def add_effects(search: Search, problem: TwinProblem, base: Fitted) -> Outcome:
     """Look for the effects that are missing.
 
     Args:
         search: What is looked for, and with what.
         problem: The joints simulated alone.
         base: The base model, fitted, with its Jacobian.
-        size_consistency: Tells how much the sizes of a model's effects differ between recordings.
     """
     cfg = search.cfg
     errors = search.fits.validation_errors(problem, [base])[0]
@@ -38,14 +28,13 @@ def add_effects(
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
-    branch = without_idle(search, without_echoes(search, branch, errors))
+    branch = without_echoes(search, branch, errors)
     return Outcome(
         problem=branch.problem,
         base=base,
         base_errors=errors,
         final=branch.now,
         final_errors=branch.errors,
-        unevenness=size_consistency(branch.now),
         trees=search.trees,
         rounds=[*branch.rounds, *([] if found is None else [found])],
         cfg=cfg,
@@ -71,13 +60,13 @@ def without_echoes(search: Search, branch: Branch, base: BlockErrors) -> Branch:
         branch: Where the search ended.
         base: Errors of the base model.
     """
-    for effect in branch.now.model.effects:
+    for effect in (each for each in branch.now.model.effects if each not in search.own):
         has = branch.now.model.has[branch.now.model.effects.index(effect)]
         echoes = torch.zeros_like(has)
         for tree in map(list, search.trees):
             own = [j for j in tree if bool(has[j])]
             echoes[[j for j in own if j != max(own, key=lambda j: float(base.mse[j]))]] = True
-        if effect.shared or not bool(echoes.any()) or not search.cfg.has("idle"):
+        if effect.shared or not bool(echoes.any()) or not search.cfg.has("echo"):
             continue
         now = branch.now
         start = Fitted.start(now.model.without_effect(effect, echoes), now.physical, tried=effect)
@@ -85,29 +74,6 @@ def without_echoes(search: Search, branch: Branch, base: BlockErrors) -> Branch:
         without = search.along_own_motion(branch, start)
         joints = [j for tree in search.trees for j in tree if bool(echoes[list(tree)].any())]
         after = {effect.name: without.errors}
-        if len(decide("idle", joints, branch.errors, after, cfg=search.cfg, log=search.log)) == len(joints):
+        if len(decide("echo", joints, branch.errors, after, cfg=search.cfg, log=search.log)) == len(joints):
             branch = without
     return branch
-
-
-def without_idle(search: Search, branch: Branch) -> Branch:
-    """The branch without effects that their joints can do without, if others are left.
-
-    What paid there is another end of the base model: fitted again from where the effect led, it is as good.
-    """
-    fits, now, errors, cfg = search.fits, branch.now, branch.errors, search.cfg
-    for row, (effect, has) in enumerate(zip(branch.now.model.effects, branch.now.model.has, strict=True)):
-        if effect.shared or not bool(has.any()) or not cfg.has("idle"):
-            continue
-        start = Fitted.start(now.model.without_effect(effect, has), now.physical, tried=effect)
-        (without,), (after,) = fits.on_joints(branch.problem, [start], has, errors)
-        joints = has.nonzero()[:, 0].tolist()
-        taken = decide("idle", joints, errors, {effect.name: after}, cfg=cfg, log=search.log)
-        idle = torch.tensor([j in taken for j in range(len(has))])
-        left = now.model.has.clone()
-        left[row] &= ~idle
-        if bool(idle.any()) and bool(left.any()):
-            now, errors = now.with_joints(idle, without), errors.with_joints(idle, after)
-    if now is not branch.now and now.jacobian is None:
-        now = fits.looked_at(branch.problem, [now])[0]
-    return replace(branch, now=now, errors=errors)

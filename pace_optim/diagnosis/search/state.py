@@ -56,6 +56,10 @@ class Search:
     """Shows how far it is."""
     log: Log = unlogged
     """Gets every decision."""
+    own: frozenset[type[Effect]] = frozenset()
+    """Effects that the base model has."""
+    begun: Sequence[type[Effect]] = ()
+    """Candidates that are refitted in every round."""
     trees: Sequence[Sequence[int]] = ()
     """Joints that move each other, by index; none: each moves itself alone."""
     follow: Callable[[TwinProblem, Fitted], tuple[TwinProblem, Fitted]] = lambda problem, now: (problem, now)
@@ -85,7 +89,11 @@ class Search:
         open_joints = missed <= (far & cfg.has("second_try"))
         # beside a joint that is far from the floor, another's last tenths may come from how that one moves
         alone = depth == 0 and not bool(far.any())
-        open_joints &= branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.next_effect) * self.at_floor
+        above = branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.next_effect) * self.at_floor
+        has = torch.zeros_like(far)
+        for effect, own in zip(branch.now.model.effects, branch.now.model.has, strict=True):
+            has |= own & (effect not in self.own)
+        open_joints &= torch.where(has, far, above)
         untried = [e for e in self.effects if bool((branch.now.model.allowed_joints(e) & open_joints).any())]
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
             return None
@@ -145,8 +153,6 @@ class Outcome:
     base_errors: BlockErrors
     final: Fitted
     final_errors: BlockErrors
-    unevenness: torch.Tensor
-    """Of the final model's effects, before joints share values, (effects, n)."""
     trees: Sequence[Sequence[int]] = ()
     """Joints that move each other, by index; none: each moves itself alone."""
     rounds: Sequence[Round] = ()

@@ -8,7 +8,7 @@ from functools import cache
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.beginning.data_check import DataCheck
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import curves_in
+from pace_optim.diagnosis.verdict.names import curves_in
 from pace_optim.diagnosis.verdict.verdict import confounded
 from pace_optim.experiment_design.telling_apart import Rivals, RobotModel, next_experiments
 from pace_optim.problem.problem import Problem

@@ -19,13 +19,12 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.telling.advice import advise
 from pace_optim.diagnosis.telling.result import Diagnosis
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
-from pace_optim.diagnosis.verdict.proxy_effects import proxies, varying
+from pace_optim.diagnosis.verdict.names import Hint
 from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import likes, ranking
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.terminal.choices import UNKNOWN_FACTS
 
 _LEAST_TOLD = 0.1
 """Smaller shares are said to be below this [%]."""
@@ -47,6 +46,8 @@ class Findings:
     ``unknown`` all that lower the error, though they are not what is missing."""
     shares: dict[type[Effect], float]
     """How much of what they explain is due to each, in the same order."""
+    hints: Sequence[Hint] = ()
+    """Effects that lower the error of joints and have not earned their names."""
     curves: Curves | None = None
     """Which variable carries what is missing; ``None`` where the effects found leave little."""
 
@@ -84,6 +85,7 @@ def told(
         ranking=ranking(
             found.outcome, problem.joint_names, found.verdict, list(found.shares), joint_types=problem.joint_types
         ),
+        hints=[asdict(hint) | {"joint": problem.joint_names[hint.joint]} for hint in found.hints],
         sizes=sizes(fits, found.outcome, problem.joint_names),
         likes=likes(found.outcome),
         joints=by_joint(found, problem),
@@ -99,7 +101,7 @@ def told(
             problem.joint_names,
             found.outcome.base_errors,
             joint_types=problem.joint_types,
-            cfg=cfg.verdict,
+            cfg=cfg.judging,
         ),
         cfg=json.loads(json_text(asdict(cfg))),
     )
@@ -107,38 +109,30 @@ def told(
 
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     """What the run has, and why it tells another error of the same model, where it does."""
+    said = []
     if run.effects:
-        unknown = {UNKNOWN_FACTS[fact] for fact in problem.unknown}
-        others = [effect for effect in run.effects if effect.split("@")[0] not in unknown]
-        said = []
-        if unknown:
-            said.append(f"The search began with {', '.join(problem.unknown)} as the run found it.")
-        if others:
-            said.append(
-                f"The run has {', '.join(others)}: the search started from the base model, and looked for it again."
-            )
-        return said
+        said.append(f"The search began with what the run has: {', '.join(run.effects)}.")
     own, here = run.rmse["validation"].get("all"), float(found.outcome.base_errors.mse.mean().sqrt())
     if own is None or f"{1e3 * own:.3g}" == f"{1e3 * here:.3g}":
-        return []
+        return said
     ways = []
     if not math.isclose(run.physics_dt, problem.physics_dt):
         ways.append(f"the physics step is {1e3 * problem.physics_dt:g} instead of {1e3 * run.physics_dt:g} ms")
     ways.append("each joint is simulated alone with a separate delay, in blocks of up to one second")
     unit = units_for("mrad", problem.joint_types)
     return [
-        f"The run's own validation error of the base model is {1e3 * own:.3g} {unit}, here it is "
-        f"{1e3 * here:.3g} {unit}: {', and '.join(ways)}."
+        *said,
+        f"The run's own validation error is {1e3 * own:.3g} {unit}, here it is {1e3 * here:.3g} {unit}: "
+        f"{', and '.join(ways)}.",
     ]
 
 
 def summary_of(found: Findings, problem: Problem) -> str:
-    """The verdict in a sentence or two."""
+    """The verdict in a few sentences."""
     unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
     after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
-    about = (found.outcome, problem.joint_names, found.data.floor)
     if found.verdict == "nothing_missing":
         return (
             f"Nothing is missing that these recordings could show: the validation error is {before:.3g} {unit}, the "
@@ -146,11 +140,14 @@ def summary_of(found: Findings, problem: Problem) -> str:
         )
     if found.verdict == "unknown":
         text = (
-            f"Something is missing, and none of the known effects explains it: the validation error is {before:.3g} "
-            f"{unit}, the floor {floor:.3g} {unit}, and {_what_pays(found)} {100 * max(0.0, found.explained):.0f} % of "
-            "what lies between."
+            f"Something is missing, and no known effect has earned its name: the validation error is {before:.3g} "
+            f"{unit}, the floor {floor:.3g} {unit}."
         )
-        return " ".join([text, *proxies(*about), *varying(*about)])
+        if found.paying:
+            what = "A curve" if len(found.free_form) == len(found.paying) else "What lowers it"
+            part = 100 * max(0.0, found.explained)
+            text += f" {what}, {', '.join(found.paying)}, explains {part:.0f} % of what lies between."
+        return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
     all_of_it = "all of it" if found.free_form else "it"
     summary = (
         f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} {unit} "
@@ -158,17 +155,15 @@ def summary_of(found: Findings, problem: Problem) -> str:
     )
     if after > found.outcome.cfg.judging.far * floor and not found.free_form:
         summary += " Something else is missing too, which no known effect explains."
-    return " ".join([summary, *varying(*about)])
+    return " ".join([summary, *hint_sentences(found.hints, problem.joint_names)])
 
 
-def _what_pays(found: Findings) -> str:
-    """What lowers the error without being what is missing."""
-    if not found.paying:
-        return "the effects tried explain"
-    if len(found.free_form) == len(found.paying):
-        return f"a curve in its place, {', '.join(found.paying)}, explains"
-    curves = ", with a curve where none is known" if found.free_form else ""
-    return f"what pays{curves}, {', '.join(found.paying)}, explains"
+def hint_sentences(hints: Sequence[Hint], joint_names: Sequence[str]) -> list[str]:
+    """What comes nearest on joints where no effect has earned its name, and what speaks against it."""
+    return [
+        f"Nearest to it on {joint_names[hint.joint]} is {hint.effect}, but {' and '.join(hint.doubts)}."
+        for hint in hints
+    ]
 
 
 def _missing(found: Findings) -> str:

@@ -38,6 +38,9 @@ class Diagnosis:
     """How much of what the effects in ``paying`` explain is due to each, by name; they add up to 1."""
     ranking: list[dict[str, Any]]
     """Every effect that was refitted: those added first, as in ``added``, then round by round by what they explain."""
+    hints: list[dict[str, Any]] = field(default_factory=list)
+    """On each joint where no effect has earned its name the one that comes nearest: ``effect``, ``joint``, the part
+    ``explained`` of what lies above the floor, and the ``doubts``."""
     sizes: list[dict[str, Any]] = field(default_factory=list)
     """Every parameter of the effects found, on each joint: value, standard deviation, unit, the factor of what was
     stated where it is one, and whether it is at a bound."""

@@ -11,11 +11,12 @@ import torch
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.joint_units import JointType, units_for
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, VerdictCfg
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
+from pace_optim.diagnosis.judging.comparison import within
 from pace_optim.diagnosis.judging.decisions import Log, unlogged
 from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import above_floor, near_floor
+from pace_optim.diagnosis.verdict.names import above_floor
 from pace_optim.single_joint_fits.block_errors import BlockErrors
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
@@ -49,25 +50,26 @@ def fit_curves(
     fits: Fits,
     outcome: Outcome,
     floor: torch.Tensor,
+    named: torch.Tensor,
     say: Callable[[str], None] = lambda _: None,
     log: Log = unlogged,
 ) -> Curves | None:
     """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
-    one variable that leaves less than half of what all effects found leave says that those are not it. Effects that
-    explain less than half themselves are not it in any case, and a curve is held against the base model there. Joints
-    with an effect that the whole robot shares are left out.
+    one variable that leaves less than half of what named effects leave says that those are not it. Where no effect is
+    named a curve is held against the base model. Joints with an effect that the whole robot shares are left out.
 
     Args:
         fits: Fits models.
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
+        named: Joints with effects that are named, (n,) bool.
         say: Shows how far it is.
         log: Gets the decision.
     """
     model = outcome.final.model
-    joints = ~near_floor(outcome, floor)
+    joints = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.far * floor
     for effect, has in zip(model.effects, model.has, strict=True):
         joints &= ~(has & effect.shared)
     if not bool(joints.any()) or not outcome.cfg.has("curves"):
@@ -84,10 +86,9 @@ def fit_curves(
     best = explained.argmax(dim=0)
     _, left = above_floor(outcome, floor)
     tried, cfg, instead = len(effects) * int(joints.sum()), outcome.cfg, torch.zeros_like(joints)
-    first = ~model.has.any(dim=0) | (left > (1 - cfg.verdict.most) * above[0])
     for j in joints.nonzero()[:, 0].tolist():
-        k, now = int(best[j]), errors[0] if bool(first[j]) else outcome.final_errors
-        facts: dict[str, Any] = {"candidates": tried, "first": bool(first[j]), "base": float(errors[0].mse[j])}
+        k, now = int(best[j]), outcome.final_errors if bool(named[j]) else errors[0]
+        facts: dict[str, Any] = {"candidates": tried, "first": not named[j], "base": float(errors[0].mse[j])}
         facts |= {"floor": float(floor[j]), "left": float(left[j])}
         instead[j] = bool(decide("curves", [j], now, {effects[k].name: errors[1 + k]}, cfg=cfg, log=log, **facts))
     return Curves(
@@ -108,11 +109,7 @@ def take_curves(outcome: Outcome, curves: Curves | None) -> Outcome:
     for j in curves.instead.nonzero()[:, 0].tolist():
         here, k = torch.arange(len(curves.instead)) == j, curves.best(j)
         final, errors = final.with_joints(here, curves.models[k]), errors.with_joints(here, curves.errors[k])
-    known = dict(zip(outcome.final.model.effects, outcome.unevenness, strict=True))
-    unevenness = torch.zeros(final.model.has.shape, dtype=torch.float64)
-    for row, effect in zip(unevenness, final.model.effects, strict=True):  # of a curve it is not known
-        row += torch.where(curves.instead, 0.0, known.get(effect, 0.0))
-    return replace(outcome, unevenness=unevenness, final=final, final_errors=errors)
+    return replace(outcome, final=final, final_errors=errors)
 
 
 def error_map(
@@ -121,7 +118,7 @@ def error_map(
     base_errors: BlockErrors,
     *,
     joint_types: Sequence[JointType] = (),
-    cfg: VerdictCfg = DEFAULT.verdict,
+    cfg: JudgingCfg = DEFAULT.judging,
 ) -> dict[str, dict[str, Any]]:
     """Which variable carries what is missing, joint by joint, for ``diagnosis.json``; empty without curves.
 
@@ -130,7 +127,7 @@ def error_map(
         joint_names: The joints.
         base_errors: Of the base model, as everything else in the diagnosis tells them.
         joint_types: Whether each joint turns or slides; none: all turn.
-        cfg: What part explained is worth a word.
+        cfg: What fall of the error is worth a word.
     """
     if curves is None:
         return {}
@@ -139,12 +136,12 @@ def error_map(
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
         before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
-        types, told = joint_types[j : j + 1], part >= 1 - cfg.nearly_all
+        types, told = joint_types[j : j + 1], not within(before**2, after**2, cfg.alike)
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,
             "best_label": units_for(f"{effect.variable} [{effect.parameters[-1].unit}]", types),
-            "kind": "friction" if effect.resists else "missing torque",
+            "kind": {"torque": "missing torque"}.get(effect.kind, effect.kind),
             "validation_rmse_before": before,
             "validation_rmse_after": after,
             "sentence": units_for(_sentence(effect, part, 1e3 * before, 1e3 * after), types) if told else _NONE,
@@ -157,19 +154,22 @@ _NONE = "no curve over a single variable carries the error."
 
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
-    kind = "friction" if effect.resists else "torque"
     return (
-        f"a curve of {kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the floor "
-        f"({before:.3g} to {after:.3g} mrad)."
+        f"a curve of {effect.kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the "
+        f"floor ({before:.3g} to {after:.3g} mrad)."
     )
 
 
 def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list[float]]:
-    """Where the knots are, and the torque that is missing there, or all friction that there is [N m]."""
+    """Where the knots are, and the torque that is missing there, or all friction that there is [N m].
+
+    Of what multiplies: the part by which it changes.
+    """
     physical = fitted.physical[joint]
     names = [p.name for p in effect.parameters]
     curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
-    if effect.resists:  # what the base model has of it and what the curve has cannot be told apart everywhere
+    if effect.kind == "friction" and effect.parameters[0].unit == "N m":
+        # what the base model has of it and what the curve has cannot be told apart everywhere
         level, viscous = (float(physical[COLUMN[name]]) for name in ("friction", "viscous_friction"))
         slope = viscous if effect.variable == "speed" else 0.0
         total = (max(0.0, level + more) for more in curve["torque"])

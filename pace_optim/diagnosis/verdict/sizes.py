@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import curves_in
 from pace_optim.single_joint_fits.fits import Fits
 from pace_optim.single_joint_fits.fitted import Fitted
 from pace_optim.uncertainty.uncertainty import ANYWHERE, sandwich
@@ -28,19 +28,19 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
         was stated is multiplied by, if it is that.
     """
     now = outcome.final
-    found = now.model.has & ~curves_in(now.model)
+    found = now.model.has & torch.tensor([not effect.free_form for effect in now.model.effects]).bool()[:, None]
     if not bool(found.any()):
         return []
     if now.jacobian is None or now.error is None or now.model.shared:  # a common value was held while it was fitted
         now = fits.looked_at(outcome.problem, [now])[0]
-    std, stuck = standard_deviations(now), now.model.at_bounds(now.x)
+    std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
     result = []
-    for effect, has, held_back in zip(now.model.effects, found, stuck, strict=True):
+    for effect, has in zip(now.model.effects, found, strict=True):
         columns = now.model.columns(effect)
         if effect in now.model.shared:
             std[has, columns] = std[has, columns].pow(-2).sum(dim=0).pow(-0.5)
         for j in has.nonzero()[:, 0].tolist():
-            own = zip(effect.parameters, now.physical[j, columns].tolist(), std[j, columns].tolist(), strict=True)
+            values = (each[j, columns].tolist() for each in (now.physical, std, stuck))
             result += [
                 {
                     "effect": effect.name,
@@ -50,9 +50,9 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
                     "std": error if error > 0 else None,
                     "unit": parameter.unit,
                     "factor": factor_of(effect, parameter, value),
-                    "at_bound": bool(held_back[j]),
+                    "at_bound": held_back,
                 }
-                for parameter, value, error in own
+                for parameter, value, error, held_back in zip(effect.parameters, *values, strict=True)
             ]
     return result
 
@@ -81,4 +81,30 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
         if len(free):
             covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), ANYWHERE)
             result[j, free] = torch.as_tensor(covariance.diagonal().copy()).clamp(min=0.0).sqrt() * slope[j, free]
+    return result
+
+
+def error_bars_from_none(now: Fitted) -> torch.Tensor:
+    """How many of its error bars each effect's size is away from none, (effects, n); zero without the effect.
+
+    Of a parameter p with the null p₀ it is |p - p₀| / σ, on a logarithmic scale |ln p - ln p₀| p / σ, and p / σ where
+    the null is infinite; of several the largest. One at a bound has no error bar, and tells nothing.
+
+    Args:
+        now: A model, fitted, with its Jacobian.
+    """
+    std, physical = standard_deviations(now), now.physical
+    result = torch.zeros(now.model.has.shape, dtype=torch.float64)
+    for row, (effect, has) in enumerate(zip(now.model.effects, now.model.has, strict=True)):
+        for column, p in enumerate(effect.parameters, start=now.model.columns(effect).start):
+            value, error = physical[:, column], std[:, column]
+            if p.null is None:
+                continue
+            away = (value - p.null).abs()
+            if math.isinf(p.null):
+                away = value
+            elif p.scale == "log":
+                away = (value / p.null).log().abs() * value
+            known = has & (error > 0)
+            result[row] = torch.maximum(result[row], torch.where(known, away / error.clamp(min=1e-300), 0.0))
     return result

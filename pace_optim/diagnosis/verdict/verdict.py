@@ -14,75 +14,37 @@ from pace_actuators.joint_units import JointType, all_hinges, units_for
 from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.judging.comparison import least_ratio
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.proxy_effects import (
-    above_floor,
-    counts_as_missing,
-    curves_in,
-    near_floor,
-    real_effects,
-)
+from pace_optim.diagnosis.verdict.names import above_floor, curves_in, new_effects
 from pace_optim.single_joint_fits.fitted import Fitted
 
 
-def verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float]:
-    """The verdict, and the part of the error above the floor that the effects found explain.
+def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple[str, Outcome]:
+    """The verdict, and the outcome with the effects and curves that stand.
+
+    ``effect`` where effects are named on some joints; others then have the base model, or a curve. Else ``unknown``
+    where a joint is far from the floor or has something that lowers its error, which stays; else ``nothing_missing``.
 
     Args:
         outcome: Where the search ended.
         floor: Of each joint, (n,) [rad].
+        named: Joints with effects that are named, (n,) bool.
     """
-    excess, left = above_floor(outcome, floor)
-    explained = 1 - float(left.sum() / excess.sum().clamp(min=1e-30))
-    if bool(outcome.final.model.has.any()):
-        good = explained_joints(outcome, floor)
-        if float(excess[good].sum()) >= outcome.cfg.verdict.share * float(excess.sum()):
-            return "effect", explained
-    far = float((outcome.final_errors.mse.sqrt() / floor).max()) > outcome.cfg.judging.far
-    if far or bool(curves_in(outcome.final.model).any()):
-        return "unknown", explained
-    return "nothing_missing", explained
-
-
-def final_verdict(outcome: Outcome, floor: torch.Tensor) -> tuple[str, float, Outcome]:
-    """The verdict, the part explained, and the outcome with the effects and curves that stand.
-
-    Where something is known to be missing, joints whose effects do not explain it go back to the base model.
-    """
-    decision, explained = verdict(outcome, floor)
-    if decision == "unknown":
-        return decision, explained, outcome
     with_curve = curves_in(outcome.final.model).any(dim=0)
-    known = explained_joints(outcome, floor) & (decision == "effect")
-    outcome = restrict_to(outcome, with_curve | known)
-    return decision, verdict(outcome, floor)[1], outcome
+    named = named & ~with_curve
+    if bool(named.any()):
+        return "effect", _restricted(outcome, named | with_curve)
+    far = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.far * floor
+    hinted = new_effects(outcome, outcome.final.model).any(dim=0)
+    return "unknown" if bool((far | with_curve | hinted).any()) else "nothing_missing", outcome
 
 
-def explained_joints(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
-    """Joints on which the effects found are what is missing, (n,) bool.
-
-    They explain at least half of the error above the floor, less what they do to other joints of their tree, and not
-    all of them are proxies. Near the floor it does not matter how. How friction is smoothed at standstill is not
-    missing where it makes less of an error than would be a finding of its own.
-
-    Args:
-        outcome: Where the search ended.
-        floor: Of each joint, (n,) [rad].
-    """
-    excess, left = above_floor(outcome, floor)
-    left = left + _done_to_others(outcome, (left - excess).clamp(min=0.0))
-    enough = (left <= (1 - outcome.cfg.verdict.most) * excess) & real_effects(outcome, floor).any(dim=0)
-    return counts_as_missing(outcome, floor).any(dim=0) & (enough | near_floor(outcome, floor))
+def part_explained(outcome: Outcome, floor: torch.Tensor) -> float:
+    """The part of the error above the floor that the effects and curves explain, of all joints together."""
+    before, after = above_floor(outcome, floor)
+    return 1 - float(after.sum() / before.sum().clamp(min=1e-30))
 
 
-def _done_to_others(outcome: Outcome, worse: torch.Tensor) -> torch.Tensor:
-    """By how much the other joints of each joint's tree are worse, (n,), of each joint's own, (n,) [rad²]."""
-    result = torch.zeros_like(worse)
-    for tree in map(list, outcome.trees):
-        result[tree] = worse[tree].sum() - worse[tree]
-    return result
-
-
-def restrict_to(outcome: Outcome, joints: torch.Tensor) -> Outcome:
+def _restricted(outcome: Outcome, joints: torch.Tensor) -> Outcome:
     """The outcome with the base model on all joints but these, (n,) bool."""
     others = ~joints & outcome.final.model.has.any(dim=0)
     return replace(

@@ -1,0 +1,61 @@
+"""The one rule for a name: what an effect must show before a diagnosis says that it is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What is known of one effect on one joint; errors are squared and of validation [rad²]."""
+
+    without: float
+    """The joint's error without it, all else fitted again."""
+    left: float
+    """With it."""
+    floor: float
+    """Below this there is nothing to explain."""
+    harm: float
+    """What the joint's effects add to the errors of other joints of its tree."""
+    beside: bool
+    """Whether it counts only where the joint is far from the floor without it: beside others, or if it only smooths
+    friction."""
+    bars: float
+    """How many of its error bars its size is away from none."""
+    uneven: float
+    """What a size for each recording would explain of what is left (``unevenness``)."""
+    at_bound: bool
+    """Whether a parameter of it has run into a bound."""
+    implausible: bool
+    """Whether its size is one that no drive has."""
+
+    @property
+    def explained(self) -> float:
+        """Part that it explains of what lies above the floor without it."""
+        before, after = (max(0.0, each - self.floor) for each in (self.without, self.left))
+        return 1 - (after + self.harm) / max(before, 1e-30)
+
+
+def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
+    """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
+
+    An effect is named where it explains most of what lies above the floor without it, and leads near the floor. Where
+    it does not lead near the floor, its size must be far from none in its own error bars, alike in every recording,
+    away from its bounds, and one that drives have. Beside other effects it counts only on what they leave far from the
+    floor.
+    """
+    near = cfg.judging.far**2 * evidence.floor
+    if evidence.beside and evidence.without <= near:
+        return ["the error is near the floor without it"]
+    if evidence.explained < cfg.verdict.most:
+        return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
+    if evidence.left + evidence.harm <= near:
+        return []
+    return [
+        *(["its size is not significant"] if evidence.bars < cfg.verdict.bars else []),
+        *(["its size differs between recordings"] if evidence.uneven > cfg.verdict.uneven else []),
+        *(["it is at a bound"] if evidence.at_bound else []),
+        *(["no drive has such a value"] if evidence.implausible else []),
+    ]

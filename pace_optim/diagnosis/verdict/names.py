@@ -1,0 +1,230 @@
+"""Which of the effects that a search ended with have earned their names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import torch
+
+from pace_actuators.effects import Effect
+from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.judging.naming import Evidence, doubts
+from pace_optim.diagnosis.judging.rules import decide
+from pace_optim.diagnosis.judging.size_consistency import unevenness
+from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
+from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.single_joint_fits.fits import Fits
+from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.single_joint_fits.model import JointModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hint:
+    """An effect that lowers a joint's error and has not earned its name."""
+
+    effect: str
+    joint: int
+    explained: float
+    """Part that it explains of what lies above the floor without it."""
+    doubts: list[str]
+    """What speaks against it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Names:
+    """What is named, and what is not."""
+
+    outcome: Outcome
+    """With the effects that are named; on joints without, those that lower an error which is far from the floor."""
+    named: torch.Tensor
+    """Joints with effects that are named, (n,) bool."""
+    hints: list[Hint]
+    """Effects of the others."""
+    rises: Mapping[tuple[type[Effect], int], float]
+    """By how much a joint's squared error rises without an effect [rad²]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LeftOut:
+    """A model without an effect, fitted again, and what that says of the effect on each joint."""
+
+    fitted: Fitted
+    errors: BlockErrors
+    evidence: Mapping[int, Evidence]
+
+
+def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = unlogged) -> Names:
+    """Tell effects whose names are earned from those that only lower the error.
+
+    Each effect is left out in turn and the rest fitted again; what is lost is the evidence (:func:`doubts`). On a joint
+    the weakest one that has not earned its name goes, until all that are left have. A joint on which none has keeps its
+    effects as hints where it is far from the floor without them, and loses them otherwise.
+
+    Args:
+        fits: Fits models.
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+        log: Gets every decision.
+    """
+    now, errors = outcome.final, outcome.final_errors
+    open_, failed = new_effects(outcome, now.model).any(dim=0), torch.zeros(len(floor), dtype=torch.bool)
+    hints: dict[int, Hint] = {}
+    rises: dict[tuple[type[Effect], int], float] = {}
+    while bool(open_.any()):
+        if now.jacobian is None or now.error is None:
+            now = fits.looked_at(outcome.problem, [now])[0]
+        every = _left_out(fits, outcome, now, errors, open_, floor)
+        count = new_effects(outcome, now.model).sum(dim=0)
+        earned = {effect: _earned(effect, own, outcome, errors, log) for effect, own in every.items()}
+        for j in open_.nonzero()[:, 0].tolist():
+            here = torch.arange(len(floor)) == j
+            evidence = {effect: own.evidence[j] for effect, own in every.items() if j in own.evidence}
+            rises |= {(effect, j): each.without - each.left for effect, each in evidence.items()}
+            weak = [effect for effect in evidence if j not in earned[effect]]
+            weakest = min(weak, key=lambda effect: evidence[effect].without, default=None)
+            if weakest is None or int(count[j]) == 1:
+                open_ = open_ & ~here
+            if weakest is None:
+                continue
+            model, own = every[weakest].fitted, every[weakest].errors
+            if int(count[j]) == 1:
+                if own.mse[j] > outcome.base_errors.mse[j]:
+                    model, own = outcome.base, outcome.base_errors
+                if float(own.mse[j]) > (outcome.cfg.judging.far * float(floor[j])) ** 2:
+                    failed = failed | here
+                    hints[j] = _hint(weakest, j, evidence[weakest], outcome)
+                    model, own = outcome.final, outcome.final_errors
+            now, errors = now.with_joints(here, model), errors.with_joints(here, own)
+    return Names(
+        outcome=replace(outcome, final=now, final_errors=errors),
+        named=new_effects(outcome, now.model).any(dim=0) & ~failed,
+        hints=list(hints.values()),
+        rises=rises,
+    )
+
+
+def new_effects(outcome: Outcome, model: JointModel) -> torch.Tensor:
+    """Effects of a model that were found, (effects, n) bool: no curves, and none that the run had."""
+    result = model.has & ~curves_in(model)
+    base = outcome.base.model
+    for effect, has in zip(base.effects, base.has, strict=True):
+        if effect in model.effects:
+            result[model.effects.index(effect)] &= ~has
+    return result
+
+
+def curves_in(model: JointModel) -> torch.Tensor:
+    """Curves of any form that stand where an effect is not known, (effects, n) bool."""
+    return model.has & torch.tensor([effect.free_form for effect in model.effects], dtype=torch.bool)[:, None]
+
+
+def above_floor(outcome: Outcome, floor: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Squared error above the floor before and after, (n,) each [rad²].
+
+    Args:
+        outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
+    """
+    before, after = ((errors.mse - floor**2).clamp(min=0.0) for errors in (outcome.base_errors, outcome.final_errors))
+    return before, after
+
+
+def shares_of(names: Names, outcome: Outcome) -> dict[type[Effect], float]:
+    """How much of what was found explains together is due to each effect and curve, the largest first; in all 1.
+
+    Of an effect it is what the squared error rises by without it; effects that can take each other's place share
+    little.
+
+    Args:
+        names: What is named.
+        outcome: The same, with curves on the joints where these say more.
+    """
+    model, rise = outcome.final.model, {}
+    fall = (outcome.base_errors.mse - outcome.final_errors.mse).tolist()
+    for effect, has in zip(model.effects, new_effects(outcome, model) | curves_in(model), strict=True):
+        joints = has.nonzero()[:, 0].tolist()
+        own = [fall[j] if effect.free_form else names.rises.get((effect, j), 0.0) for j in joints]
+        if joints:
+            rise[effect] = sum(max(0.0, each) for each in own)
+    whole = max(sum(rise.values()), 1e-30)
+    return {effect: rise[effect] / whole for effect in sorted(rise, key=rise.__getitem__, reverse=True)}
+
+
+def _left_out(
+    fits: Fits, outcome: Outcome, now: Fitted, errors: BlockErrors, joints: torch.Tensor, floor: torch.Tensor
+) -> dict[type[Effect], _LeftOut]:
+    """Each effect left out of a model on some joints, (n,) bool, and the rest fitted again."""
+    model = now.model
+    found = [(e, has & joints) for e, has in zip(model.effects, new_effects(outcome, model), strict=True)]
+    found = [(effect, has) for effect, has in found if bool(has.any())]
+
+    def fitted(some: Sequence[tuple[type[Effect], torch.Tensor]]) -> list[tuple[Fitted, BlockErrors]]:
+        result = []
+        for effect, has in some:
+            start = Fitted.start(model.without_effect(effect, has), now.physical, tried=effect)
+            models, after = fits.on_joints(outcome.problem, [start], has, errors)
+            result.append((models[0], after[0]))
+        return result
+
+    after = fits.shared_out(fitted, found, [effect for effect, _ in found])
+    count, bars, uneven = new_effects(outcome, model).sum(dim=0), error_bars_from_none(now), unevenness(now)
+    stuck, implausible = model.has_at_bounds(now.x, now.moves), model.implausible(now.physical)
+    harm, hardly_shows = _harm(outcome, errors), outcome.base_errors.mse.sqrt() <= outcome.cfg.judging.far * floor
+    result = {}
+    for (effect, has), (without, own) in zip(found, after, strict=True):
+        row, places = model.effects.index(effect), has.nonzero()[:, 0].tolist()
+        evidence = {
+            j: Evidence(
+                without=float(own.mse[j] if count[j] > 1 else min(own.mse[j], outcome.base_errors.mse[j])),
+                left=float(errors.mse[j]),
+                floor=float(floor[j] ** 2),
+                harm=float(harm[j]),
+                beside=bool(count[j] > 1 or (effect.smooths_friction and hardly_shows[j])),
+                bars=float(bars[row, j]),
+                uneven=float(uneven[row, j]),
+                at_bound=bool(stuck[row, j]),
+                implausible=bool(implausible[row, j]),
+            )
+            for j in places
+        }
+        if effect.shared:
+            evidence = dict.fromkeys(evidence, _together(list(evidence.values())))
+        result[effect] = _LeftOut(fitted=without, errors=own, evidence=evidence)
+    return result
+
+
+def _together(own: Sequence[Evidence]) -> Evidence:
+    """The evidence of all joints that share an effect, as that of one joint."""
+    return Evidence(
+        without=sum(each.without for each in own),
+        left=sum(each.left for each in own),
+        floor=sum(each.floor for each in own),
+        harm=0.0,
+        beside=all(each.beside for each in own),
+        bars=max(each.bars for each in own),
+        uneven=max(each.uneven for each in own),
+        at_bound=any(each.at_bound for each in own),
+        implausible=any(each.implausible for each in own),
+    )
+
+
+def _harm(outcome: Outcome, errors: BlockErrors) -> torch.Tensor:
+    """By how much the other joints of each joint's tree are worse than with the base model, (n,) [rad²]."""
+    worse = (errors.mse - outcome.base_errors.mse).clamp(min=0.0)
+    result = torch.zeros_like(worse)
+    for tree in map(list, outcome.trees):
+        result[tree] = worse[tree].sum() - worse[tree]
+    return result
+
+
+def _earned(effect: type[Effect], own: _LeftOut, outcome: Outcome, errors: BlockErrors, log: Log) -> dict[int, str]:
+    """Joints on which an effect has earned its name."""
+    evidence = [asdict(each) for each in own.evidence.values()]
+    without = {effect.name: own.errors}
+    return decide("name", list(own.evidence), errors, without, cfg=outcome.cfg, log=log, evidence=evidence)
+
+
+def _hint(effect: type[Effect], joint: int, evidence: Evidence, outcome: Outcome) -> Hint:
+    return Hint(effect=effect.name, joint=joint, explained=evidence.explained, doubts=doubts(evidence, cfg=outcome.cfg))
