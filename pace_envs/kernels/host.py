@@ -24,7 +24,7 @@ _COMPILERS = ("c++", "g++", "clang++")
 _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
 """A multiplication and an addition are rounded one by one, as everywhere else."""
 _PATIENCE = 3000
-"""Control steps in Python that take as long as a compiler."""
+"""Steps in Python that take as long as a compiler."""
 _LONGEST_S = 180.0
 """Longest time of a compiler on one kernel [s]; the largest take some 10 s of a free processor."""
 _FIRST = 'extern "C" void simulate() {}'
@@ -92,11 +92,11 @@ class HostKernels:
         self._functions[source](*map(as_argument, arguments))
 
     def pays(self, source: str, steps: int) -> bool:
-        """Whether a source is compiled before so many control steps: it was before, or they are many with those before.
+        """Whether a source is compiled before so many steps: it was before, or they are many with those before.
 
         Args:
             source: The source.
-            steps: Control steps that are simulated now.
+            steps: Steps that are simulated now: of the physics for a robot, of control for single joints.
         """
         if source in self._functions or self._is_kept(self._name_of(source)):
             return True

@@ -102,7 +102,7 @@ class RobotKernel:
 
     def pays(self, steps: int) -> bool:
         """Whether it is worth compiling for so many control steps more."""
-        return self._kernels.pays(self._source.source, steps)
+        return self._kernels.pays(self._source.source, steps * self._env.cfg.decimation)
 
     def record(self) -> None:
         """Record what the drives do, unless that was recorded with the same flags."""
