@@ -13,18 +13,19 @@ from pace_optim.optimizers.way_down import WayDown
 def main() -> None:
     """Compare; the argument is the number of threads."""
     torch.set_num_threads(int(sys.argv[1]))
-    problem = make_problem(record(chirp(1.0), noise=1e-4))
+    coarse = make_problem(record(chirp(1.0), noise=1e-4))
+    problem = coarse.with_physics_dt(coarse.physics_dt / 2)
     colouring = colour(problem.space, problem.trees, problem.joint_names)
 
     def way(**options):
-        pieces = problem.on_pieces(0.5).training_evaluator()
-        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
+        pieces, fine = (each.on_pieces(0.5).training_evaluator() for each in (coarse, problem))
+        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, fine=fine, **options)
 
     kept: list = []
     whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))
     first = whole
     end = whole.run([problem.space.start])
-    for checkpoint in kept[1::4]:
+    for checkpoint in kept[1::3]:
         again = way()
         again.descents = Descent.restore(checkpoint)
         other = again.run([problem.space.start])
