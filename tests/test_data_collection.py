@@ -434,7 +434,7 @@ def test_joints_that_are_named_are_told_speeds_beside_others_with_positions(cart
         (["--velocity_joints", "arm"], "'arm' fits no joint. Available: left, right."),
         (["--velocity_joints", "("], "is no regular expression"),
         (["--stiffness", "0", "--excitation", "steps"], "steps jumps from target to target, and left, right follow"),
-        (["--stiffness", "0", "--effect", "backlash"], "Leave --effect out"),
+        (["--stiffness", "0", "--effect", "backlash"], "Omit --effect"),
     ],
 )
 def test_what_speeds_cannot_tell_is_refused(cart, tmp_path, capsys, given, told):

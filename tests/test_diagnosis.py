@@ -176,7 +176,7 @@ def test_a_search_flushes_denormal_numbers_and_puts_the_processors_setting_back(
     module = sys.modules[search_effects.__module__]
     monkeypatch.setattr(module, "check_long_enough", lambda *_, **__: None)
     monkeypatch.setattr(module, "fit_base", first_step)
-    problem = SimpleNamespace(dataset=SimpleNamespace(validation=None), control_dt=DT)
+    problem = SimpleNamespace(dataset=SimpleNamespace(validation=None, carried=None), control_dt=DT)
     try:
         torch.set_flush_denormal(before)
         with pytest.raises(KeyboardInterrupt):

@@ -189,7 +189,8 @@ def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     monkeypatch.setattr(processes, "available_processors", lambda: 1)
     probes_alone, fits_alone, far_alone = found()
     assert [p.effect for p in probes] == [p.effect for p in probes_alone]
-    assert [float(p.score) for p in probes] == pytest.approx([float(p.score) for p in probes_alone], abs=1e-6)
+    # effects that are simulated side by side share the loop of the one with the fastest dynamics
+    assert [float(p.score) for p in probes] == pytest.approx([float(p.score) for p in probes_alone], abs=1e-5)
     for several, alone in ((fits, fits_alone), (far, far_alone)):
         assert list(dict.fromkeys(fit.tried for fit in several)) == effects
         for one, other in zip(several, alone, strict=True):
