@@ -349,7 +349,7 @@ def test_commands_come_at_the_rate_that_is_asked_for(tmp_path):
     for wrong in (0.0, -0.001, 0.2):
         with pytest.raises(ValueError, match=r"control_dt is .* expected a time above 0 and up to 0.05 s"):
             load_env_cfg(task, wrong)
-    with pytest.raises(ValueError, match=r"only a model file .* Leave --control_dt out"):
+    with pytest.raises(ValueError, match=r"only a model file .* Omit --control_dt"):
         load_env_cfg("Pace-AnymalD-v0", 0.001)
 
 
