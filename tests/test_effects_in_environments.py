@@ -47,8 +47,10 @@ def bounds_corners(name):
     parameters = get_effect(name).parameters
     corners = list(itertools.product(*((p.lower, p.upper) for p in parameters if not at_knot(name, p))))
     if get_effect(name).free_form:
-        count = sum(at_knot(name, p) for p in parameters)
-        curves = [[10.0 * sign * (-1) ** (i * jagged) for i in range(count)] for sign in (-1, 1) for jagged in (0, 1)]
+        ends = [(p.lower, p.upper) for p in parameters if at_knot(name, p)]
+        curves = [
+            [end[(first + i * jagged) % 2] for i, end in enumerate(ends)] for first in (0, 1) for jagged in (0, 1)
+        ]
         corners = [(*curve, *shape) for curve in curves for shape in corners]
     return {f"{name}.{p.name}": [c[i] for c in corners] for i, p in enumerate(parameters)}, len(corners)
 

@@ -250,7 +250,7 @@ def test_an_unknown_effect_gets_a_curve_and_the_robot_is_fitted_with_it(run):
     found = diagnose(DiagnosisSettings(run=run.folder, effects=["torque_gain"], only=True))
     assert found.verdict == "unknown" and found.added == []
     assert found.paying == found.free_form == ["friction_over_position"]
-    assert "a curve in its place, friction_over_position," in found.summary
+    assert "A curve, friction_over_position, explains" in found.summary
     refit = FitResult.load(found.runs[-1])
     assert refit.task == BENCH and refit.effects == ["friction_over_position"]
     before, after = (step["validation_rmse"] for step in found.ladder)

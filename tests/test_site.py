@@ -50,7 +50,7 @@ def test_the_site_has_a_page_for_each_effect_and_the_reference(site):
     gallery = (site / "effects" / "index.html").read_text("utf-8")
     assert gallery.count("images/effects/") == len(drawn_effects())
     reference = (site / "reference.html").read_text("utf-8")
-    for name in ("PaceDCMotor", "ManagerBasedRLEnv", "Recording", "write_report"):
+    for name in ("PaceDCMotor", "ManagerBasedRLEnv", "Recording", "load_problem"):
         assert f">{name}<" in reference or f"{name}</" in reference, f"the reference has no {name}"
 
 

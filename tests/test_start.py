@@ -99,9 +99,9 @@ def test_a_springs_rest_is_sought_in_all_of_its_joints_range(tmp_path):
     bounds_of(tmp_path, limit, stiffness=KP, damping=KD)
     problem = load_problem(str(tmp_path / "light.urdf"), data=[tmp_path / "log.npz"], effects=["parallel_spring"])
     rest = problem.space["parallel_spring.rest"]
-    assert problem.space.lower[rest].tolist() == [-1.5] and problem.space.upper[rest].tolist() == pytest.approx([2.6])
+    assert problem.space.lower[rest].tolist() == [-6.3] and problem.space.upper[rest].tolist() == [6.3]
     model = JointModel.base(problem).with_effect(get_effect("parallel_spring"), torch.tensor([True]))
-    assert model.upper[0, -1] == pytest.approx(2.6) and not model.is_wide(get_effect("parallel_spring")).any()
+    assert model.upper[0, -1] == pytest.approx(6.3) and not model.is_wide(get_effect("parallel_spring")).any()
 
 
 def test_other_recordings_of_a_run_leave_its_values_within_the_bounds(tmp_path):

@@ -54,7 +54,7 @@ def block_errors(
         cfg: How long blocks are.
     """
     if weight is not None:
-        return _free_errors(error, where, weight, control_dt, cfg)
+        return _free_errors(error, where, weight, cfg)
     blocks = _blocks(where, control_dt, cfg)
     return BlockErrors(
         square=torch.stack([error[own, r].double().square().mean(dim=0) for r, own in blocks]),
@@ -62,12 +62,10 @@ def block_errors(
     )
 
 
-def _free_errors(
-    error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
-) -> BlockErrors:
+def _free_errors(error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, cfg: FittingCfg) -> BlockErrors:
     """Errors of joints that are free at times: the free time of each, in as many blocks; 1 where it has none."""
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
-    count = _free_blocks([len(each) for each in own], control_dt, cfg)
+    count = cfg.blocks  # whichever joints are looked at: models are compared block by block
     square = torch.ones(count, len(own), dtype=torch.float64)
     for j, places in enumerate(own):
         if len(places):
