@@ -56,4 +56,4 @@ def test_a_fit_reaches_what_is_true(name, tmp_path):
 def test_commands_logged_more_slowly_than_they_were_sent_are_told(tmp_path):
     run("lerobot_leg", CASES["lerobot_leg"], SHARED, tmp_path)
     found = json.loads((tmp_path / "lerobot_leg.found.json").read_text())
-    assert "If the drive got more of them than were logged" in " ".join(found["warnings"])
+    assert "The drive probably received more commands than were logged" in " ".join(found["warnings"])
