@@ -11,6 +11,7 @@ from pace_optim import fit
 from pace_optim.optimizers.derivatives import colour
 from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.recording import save_recording
+from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
 from pace_optim.uncertainty.assessment import assess
@@ -92,7 +93,8 @@ def test_a_step_that_shows_in_the_error_is_halved_unless_it_is_stated(tmp_path, 
     settings = FitSettings(
         task=BENCH, data=[str(log)], optimizer="least_squares", log_dir=str(tmp_path), physics_dt=stated
     )
-    result, _ = fit(settings, ProgressLine())
+    result, folder = fit(settings, ProgressLine())
+    assert open_problem(folder).physics_dt == result.physics_dt
     assert result.physics_dt <= finest and (stated is None or result.physics_dt == stated)
     share = result.rmse["train"]["all"] / 1e-4
     assert (share < 2.0) == (stated is None)

@@ -84,7 +84,7 @@ class Run:
 
         Args:
             data: Recordings in place of its own.
-            physics_dt: Another physics step [s].
+            physics_dt: Another physics step [s]; ``None``: that of its result.
             effects: Other effects; ``None`` keeps its own.
             columns: Column map of logs among ``data``; ``None``: guessed.
             strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
@@ -98,7 +98,7 @@ class Run:
             settings = replace(settings, **own, columns=columns, rate=None, strict=strict)  # type: ignore[arg-type]
         try:
             drive_dt = self.told_drive_dt if settings.drive_dt is None else settings.drive_dt
-            settings = replace(settings, physics_dt=physics_dt or settings.physics_dt, drive_dt=drive_dt)
+            settings = replace(settings, physics_dt=physics_dt or self.used_physics_dt, drive_dt=drive_dt)
             problem = problem_of(settings, self.load_cfg(), told=not data)
         except ValueError as error:
             if data or str(self.folder) in str(error):
@@ -114,6 +114,14 @@ class Run:
         path = self.folder / "result.json"
         rate = FitResult.load(path).loop_rate if path.is_file() else {}
         return rate["used_s"] if rate and rate["used_s"] != rate["assumed_s"] else None
+
+    @property
+    def used_physics_dt(self) -> float | None:
+        """Physics step of its result [s], which may be finer than the robot's; ``None``: the robot's."""
+        path = self.folder / "result.json"
+        if self.settings.physics_dt is not None or self.overridden or not path.is_file():
+            return self.settings.physics_dt
+        return FitResult.load(path).physics_dt
 
     def load_cfg(self) -> Any:
         """A fresh configuration of its environment."""
