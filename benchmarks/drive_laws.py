@@ -1,4 +1,4 @@
-"""Does a diagnosis name the laws that drives have, and nothing where a law is none that it knows?
+"""Does a diagnosis name the laws that drives have, and nothing where it does not know the law?
 
 A plant of its own (drive_laws_plant.py) hides one law at a time on the test bench. Those in LAWS are in the library;
 OUTSIDE holds laws that are not, with the variable that carries each.

@@ -96,7 +96,7 @@ def _as_found(problem: Problem, result: FitResult) -> Problem:
 
 
 def _own_effects(problem: Problem, result: FitResult) -> list[EffectCfg]:
-    """The run's effects with its values, but those that found facts which nobody knew: the problem has these."""
+    """The run's effects with its values, except those for unknown facts: the problem has these."""
     found = {UNKNOWN_FACTS[fact] for fact in problem.unknown}
     cfgs = [EffectCfg.parse(effect) for effect in result.effects]
     return [
