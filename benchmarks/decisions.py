@@ -17,8 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
-from pace_optim.diagnosis.judging.rules import decided
+from pace_optim.diagnosis.selection.decisions import Decision, as_lines, read_decisions
+from pace_optim.diagnosis.selection.rules import decided
 
 
 def main() -> None:

@@ -24,12 +24,12 @@ import numpy as np
 from drive_laws_plant import CONTROL_DT, NOISE, PLANT_DT, Law, Plan, State, drawn_base, plans, simulate, with_loads
 
 from pace_optim.diagnosis import candidate_effects, search_effects
-from pace_optim.diagnosis.judging.decisions import Decision, as_lines
-from pace_optim.diagnosis.telling.findings import Findings, summary_of
+from pace_optim.diagnosis.findings.findings import Findings, summary_of
+from pace_optim.diagnosis.selection.decisions import Decision, as_lines
 from pace_optim.diagnosis.verdict.free_curves import error_map
 from pace_optim.diagnosis.verdict.sizes import sizes
+from pace_optim.joints.fits.fits import Fits, fits_on
 from pace_optim.problem.problem import Problem, load_problem
-from pace_optim.single_joint_fits.fits import Fits, fits_on
 
 DURATION = 4.0
 

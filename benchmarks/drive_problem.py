@@ -14,7 +14,7 @@ import torch
 
 from pace_envs import load_env_cfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
-from pace_optim.optimizers.derivatives import Colouring, colour
+from pace_optim.estimate.derivatives import Colouring, colour
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem

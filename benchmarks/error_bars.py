@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording.dataset import make_dataset
-from pace_optim.uncertainty.assessment import assess
 
 
 def one_seed(problem: Problem, seed: int, noise: float, bits: int) -> tuple[np.ndarray, np.ndarray]:

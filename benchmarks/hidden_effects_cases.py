@@ -16,19 +16,19 @@ from typing import Any, Literal
 import torch
 
 from pace_actuators.effects import Effect, get_effect
+from pace_optim.data_collection.plant import Case, library_effects, outside_effects, write_case
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.decisions import Decision, as_lines
+from pace_optim.diagnosis.selection.decisions import Decision, as_lines
 from pace_optim.diagnosis.verdict.verdict import ranking
-from pace_optim.plant import Case, library_effects, outside_effects, write_case
+from pace_optim.joints.fits.base_fit import fit_base
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits, fits_on
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import start_values
+from pace_optim.joints.fits.reference_update import ReferenceUpdate
+from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem, load_problem
-from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits, fits_on
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import start_values
-from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
-from pace_optim.single_joint_model.problem import TwinProblem
 
 GROUPS = ("effects", "clean", "outside", "pairs", "background", "harmonic")
 ROBOTS = {"bench": ("Pace-TestBench-v0", ".*"), "leg": ("Pace-AnymalD-v0", "LF_.*")}

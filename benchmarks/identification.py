@@ -27,9 +27,9 @@ import numpy as np
 from solver_trace import machine, table, write_json
 
 from pace_envs.simulation import Simulation
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.search import search
 from pace_optim.identification.fit import fit
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
-from pace_optim.optimizers.search import search
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import load_recording

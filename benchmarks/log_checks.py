@@ -23,7 +23,7 @@ import numpy as np
 from cases import CASES
 
 from pace_envs.task_source import use_task
-from pace_optim.log_checks import Finding, check_log
+from pace_optim.identification.log_checks import Finding, check_log
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording import Drive, Recording, save_recording
 

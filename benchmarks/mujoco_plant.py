@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from pace_optim.diagnosis import candidate_effects, search_effects
-from pace_optim.diagnosis.telling.findings import Findings
+from pace_optim.diagnosis.findings.findings import Findings
 from pace_optim.problem.problem import load_problem
 
 CONTROL_DT, PLANT_DT, DURATION, NOISE = 0.0025, 1e-4, 10.0, 1e-4

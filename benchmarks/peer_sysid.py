@@ -22,7 +22,7 @@ from drive_problem import DriveProblem, drive_problem
 from solver_trace import Trace, machine, table, write_json
 from sysid_peer import Peer
 
-from pace_optim.optimizers.way_down import WHOLE, WayDown, WayDownCfg
+from pace_optim.estimate.way_down import WHOLE, WayDown, WayDownCfg
 from pace_optim.terminal.cli import run_cli
 
 OURS = "pace least_squares"

@@ -33,9 +33,9 @@ from workers import pinned_pool
 
 from pace_envs.rl import Evaluation, PlaySettings, play
 from pace_envs.rl.training import EditCfg
+from pace_optim.data_collection.plant import PlantCfg, Truth, draw_base, make_suite, plant_robot, simulate_runs
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.identification.fit import fit
-from pace_optim.plant import PlantCfg, Truth, draw_base, make_suite, plant_robot, simulate_runs
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 

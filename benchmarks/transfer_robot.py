@@ -13,9 +13,9 @@ from pace_actuators import PaceDCMotor
 from pace_envs.identified import set_step
 from pace_envs.registration import set_physics_dt
 from pace_envs.tasks.velocity import VelocityEnvCfg
-from pace_optim.plant import PlantRobot, Truth, effect_named
-from pace_optim.plant.hidden import HiddenEffect
-from pace_optim.plant.truth import per_joint
+from pace_optim.data_collection.plant import PlantRobot, Truth, effect_named
+from pace_optim.data_collection.plant.hidden import HiddenEffect
+from pace_optim.data_collection.plant.truth import per_joint
 
 PHYSICS_DT = 5e-4
 """Of the "real" robot [s]."""

@@ -11,7 +11,7 @@ from multiprocessing.queues import SimpleQueue
 
 import torch
 
-from pace_optim.problem.forked import end_with_parent
+from pace_optim.terminal.parallel import end_with_parent
 
 
 @contextmanager

@@ -8,10 +8,8 @@ if TYPE_CHECKING:
     from pace_optim.comparison import compare, comparison_lines
     from pace_optim.data_collection import CollectionCfg, collect
     from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-    from pace_optim.excitation import Motion, Trajectory, make_excitation, register_excitation
-    from pace_optim.identification.fit import fit, resume
-    from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
-    from pace_optim.optimizers.convergence import (
+    from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+    from pace_optim.estimate.convergence import (
         Criterion,
         EarlyStopping,
         MovingWindow,
@@ -22,8 +20,10 @@ if TYPE_CHECKING:
         SearchState,
         TargetScore,
     )
-    from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
-    from pace_optim.optimizers.search import search
+    from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+    from pace_optim.estimate.search import search
+    from pace_optim.identification.fit import fit, resume
+    from pace_optim.motion.signals import Motion, Trajectory, make_excitation, register_excitation
     from pace_optim.problem.evaluator import Evaluator
     from pace_optim.problem.parameter_space import ParameterSpace
     from pace_optim.problem.problem import Problem, load_problem

@@ -5,9 +5,9 @@ import sys
 import torch
 from problems import chirp, make_problem, record
 
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import Descent, checkpoint_of
-from pace_optim.optimizers.way_down import WayDown
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.least_squares import Descent, checkpoint_of
+from pace_optim.estimate.way_down import WayDown
 
 
 def main() -> None:

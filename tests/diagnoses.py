@@ -14,18 +14,18 @@ from run_folders import JOINTS, make_result
 from pace_actuators.effects import Effect, get_effect
 from pace_actuators.files import write_json
 from pace_envs import set_physics_dt
+from pace_optim.data_collection.plant import PlantCfg, draw_visible, make_suite, plant_robot
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.judging.candidate_results import Trial
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.state import Outcome, Search
-from pace_optim.plant import PlantCfg, draw_visible, make_suite, plant_robot
+from pace_optim.diagnosis.selection.candidate_results import Trial
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits, fits_on
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE
+from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import save_recording
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits, fits_on
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE
-from pace_optim.single_joint_model import reference_path, twin_problem
 
 FITS = fits_on("cpu", DiagnosisCfg().fitting)
 """As a diagnosis has them: compiled, where there is a compiler."""

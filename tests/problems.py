@@ -14,7 +14,7 @@ import torch
 from pace_actuators import PaceDCMotorCfg
 from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_env_cfg
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem

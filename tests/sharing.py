@@ -5,11 +5,11 @@ import sys
 
 import torch
 
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
-from pace_optim.optimizers.search import search
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.search import search
 from pace_optim.problem.problem import load_problem
-from pace_optim.problem.processes import Processes, join
 from pace_optim.terminal.cli import run_cli
+from pace_optim.terminal.processes import Processes, join
 
 GENERATIONS = 3
 

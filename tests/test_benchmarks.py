@@ -23,7 +23,7 @@ from solver_trace import Trace, table
 from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_actuators.effects import EffectCfg
 from pace_envs import load_env_cfg
-from pace_optim.plant import plant_robot
+from pace_optim.data_collection.plant import plant_robot
 from pace_optim.problem.problem import load_problem
 
 needs_peer = pytest.mark.skipif(not hasattr(sysid, "optimize"), reason="the extra `benchmark` is not installed")

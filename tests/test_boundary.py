@@ -17,7 +17,7 @@ from pace_actuators import memory
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.files import remove_leftovers, write_together
 from pace_actuators.memory import available_memory, check_memory
-from pace_optim.identification.beginning import search_population
+from pace_optim.identification.setup import search_population
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.cli import make_parser, one_line, readable, run_cli, safe_streams

@@ -16,10 +16,10 @@ from problems import (
     record,
 )
 
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
-from pace_optim.optimizers.convergence import TargetScore
-from pace_optim.optimizers.search import search
-from pace_optim.optimizers.tree_strategy import DIVERGED_SCORE
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.convergence import TargetScore
+from pace_optim.estimate.search import search
+from pace_optim.estimate.tree_strategy import DIVERGED_SCORE
 
 
 @pytest.fixture(scope="module")

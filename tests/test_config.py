@@ -12,7 +12,7 @@ from pace_envs.assets_dir import ASSETS_DIR
 from pace_envs.robots import anymal_d_cfg, go2_cfg
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, base_parameters
 from pace_envs.tasks.velocity import set_drives
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizerCfg
 
 GAINS = {"stiffness": 10.0, "damping": 0.0}
 

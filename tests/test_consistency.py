@@ -9,14 +9,14 @@ from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.tasks.pace import Parameter
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars import consistency
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.consistency import check_consistency
+from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
-from pace_optim.uncertainty import consistency
-from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.consistency import check_consistency
 
 GAINS = {"soft": (60.0, 1.0), "middle": (85.0, 2.0), "stiff": (120.0, 4.0)}
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pace_optim.optimizers.convergence import (
+from pace_optim.estimate.convergence import (
     MovingWindow,
     ParameterSpread,
     Plateau,

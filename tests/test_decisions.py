@@ -14,8 +14,8 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from decisions import read_cases, save_cases, table
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.decisions import Decision, as_lines, read_decisions
-from pace_optim.diagnosis.judging.rules import decide, decided
+from pace_optim.diagnosis.selection.decisions import Decision, as_lines, read_decisions
+from pace_optim.diagnosis.selection.rules import decide, decided
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "single_joint_fits")]
@@ -98,7 +98,7 @@ def test_every_tuned_number_is_in_the_configuration():
     assert [each for path in files for each in numbers(path)] == []
 
 
-@pytest.mark.parametrize("name", ["diagnosis/diagnosis_cfg.py", "single_joint_fits/fitting_cfg.py"])
+@pytest.mark.parametrize("name", ["diagnosis/diagnosis_cfg.py", "joints/fits/fitting_cfg.py"])
 def test_every_tuned_number_is_documented(name):
     tree = ast.parse((ROOT / "pace_optim" / name).read_text(encoding="utf-8"))
     for part in (node for node in tree.body if isinstance(node, ast.ClassDef)):

@@ -14,8 +14,8 @@ from problems import (
     record,
 )
 
-from pace_optim.optimizers.derivatives import NARROW, Colouring, Jacobian, colour, stencil
-from pace_optim.optimizers.levenberg_marquardt import LinearModel
+from pace_optim.estimate.derivatives import NARROW, Colouring, Jacobian, colour, stencil
+from pace_optim.estimate.levenberg_marquardt import LinearModel
 from pace_optim.problem.evaluator import Residuals
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}

@@ -19,13 +19,13 @@ from pace_actuators.files import write_json
 from pace_optim.diagnosis import candidate_effects
 from pace_optim.diagnosis.candidates.screening import _explained
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.comparison import judge
 from pace_optim.diagnosis.method import search_effects
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.comparison import judge
 from pace_optim.diagnosis.verdict.verdict import confounded, ranking, verdict
-from pace_optim.problem.forked import parallel_map
-from pace_optim.single_joint_fits.block_errors import BlockErrors, block_errors, check_long_enough
-from pace_optim.single_joint_fits.labels import labels
+from pace_optim.joints.fits.block_errors import BlockErrors, block_errors, check_long_enough
+from pace_optim.joints.fits.labels import labels
+from pace_optim.terminal.parallel import parallel_map
 
 ROOT = Path(__file__).parents[1]
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

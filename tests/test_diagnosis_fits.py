@@ -10,18 +10,18 @@ from diagnoses import FITS, joint_alone
 from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
-from pace_optim.diagnosis.beginning.data_check import check_data, unstamped
 from pace_optim.diagnosis.candidates.multistart import multistart
+from pace_optim.diagnosis.checks.data_check import check_data, unstamped
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.single_joint_fits import base_fit
-from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.descent import TRIALS, JointDescent
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel, start_values, whole_values
-from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
-from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot, _merged
-from pace_optim.single_joint_model import reference_path, twin_problem
+from pace_optim.joints.fits import base_fit
+from pace_optim.joints.fits.base_fit import fit_base
+from pace_optim.joints.fits.descent import TRIALS, JointDescent
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE, JointModel, start_values, whole_values
+from pace_optim.joints.fits.reference_update import ReferenceUpdate
+from pace_optim.joints.fits.side_by_side import SideBySide, Slot, _merged
+from pace_optim.joints.simulation import reference_path, twin_problem
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

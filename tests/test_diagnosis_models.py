@@ -11,9 +11,9 @@ from pace_optim.diagnosis.candidates.screening import Probe
 from pace_optim.diagnosis.search.one_round import _ranked
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE, JointModel, start_values
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 

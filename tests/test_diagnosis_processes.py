@@ -16,10 +16,10 @@ from pace_actuators.effects import Effect, get_effect
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE, JointModel, start_values
 from pace_optim.problem import forked as processes
-from pace_optim.problem.forked import parallel_map
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel, start_values
+from pace_optim.terminal.parallel import parallel_map
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 

@@ -12,17 +12,17 @@ from problems import DT
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.choice import choose
+from pace_optim.diagnosis.findings.advice import advise, rivals
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch
-from pace_optim.diagnosis.telling.advice import advise, rivals
-from pace_optim.experiment_design import telling_apart
-from pace_optim.experiment_design.telling_apart import MenuCfg, Rivals, distances, menu, next_experiments
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.labels import labels
-from pace_optim.single_joint_fits.model import BASE, JointModel
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.choice import choose
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.motion.design import telling_apart
+from pace_optim.motion.design.telling_apart import MenuCfg, Rivals, distances, menu, next_experiments
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 CLOCK, ELASTICITY, BACKLASH = (get_effect(n) for n in ("clock_skew", "joint_elasticity", "backlash"))

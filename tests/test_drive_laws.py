@@ -19,12 +19,12 @@ from pace_envs import set_physics_dt
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.optimizers.comb_scan import scanned
+from pace_optim.estimate.comb_scan import scanned
+from pace_optim.joints.fits.base_fit import fit_base
+from pace_optim.joints.fits.model import JointModel
 from pace_optim.problem.drive_work import drive_reach, with_work
 from pace_optim.recording.dataset import Work
 from pace_optim.run.result import FitResult
-from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.model import JointModel
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 

@@ -18,9 +18,9 @@ import pace_optim.identification.fit as fit_module
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
 from pace_optim.identification.fit import fit
+from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
-from pace_optim.single_joint_model import reference_path, twin_problem
 from pace_optim.terminal.progress import ProgressLine
 
 ROOT = Path(__file__).parents[1]

@@ -7,14 +7,14 @@ import pytest
 
 from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg
-from pace_optim.excitation import Trajectory, excitations, make_excitation, register_excitation, write_command_csv
-from pace_optim.experiment_design.motion_check import (
+from pace_optim.motion.design.motion_check import (
     MotionLimits,
     check_command,
     check_simulated,
     refuse_errors,
     summarise,
 )
+from pace_optim.motion.signals import Trajectory, excitations, make_excitation, register_excitation, write_command_csv
 
 DT = 0.0025
 TASKS = ("Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0")
@@ -181,7 +181,7 @@ def test_an_excitation_of_ones_own_is_one_function():
     assert len(trajectory.time) == 2000
     with pytest.raises(ValueError, match="already registered"):
         register_excitation("test_sine", "again")(sine)
-    from pace_optim.excitation import registry
+    from pace_optim.motion.signals import registry
 
     del registry._EXCITATIONS["test_sine"]
 

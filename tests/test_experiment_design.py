@@ -11,15 +11,15 @@ from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.data_collection.design import expected_parameters
-from pace_optim.excitation import make_excitation
-from pace_optim.experiment_design import DesignCfg, optimize_motion
-from pace_optim.experiment_design.joint_motion import slowed
-from pace_optim.experiment_design.motion_check import MotionLimits, check_command
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.least_squares import least_squares
+from pace_optim.motion.design import DesignCfg, optimize_motion
+from pace_optim.motion.design.joint_motion import slowed
+from pace_optim.motion.design.motion_check import MotionLimits, check_command
+from pace_optim.motion.signals import make_excitation
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import Recording, load_recording
-from pace_optim.uncertainty.assessment import assess
 
 NOISE = 1e-4  # [rad]
 SMALL = DesignCfg(noise=NOISE, candidates=(8, 4), width=(0.2,))

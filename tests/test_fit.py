@@ -13,11 +13,11 @@ from problems import BENCH, TRUTH, chirp, record
 
 import pace_optim.identification.fit as fit_module
 from pace_envs import load_env_cfg
+from pace_optim.estimate.way_down import WayDown
 from pace_optim.identification import conclusion
-from pace_optim.identification.beginning import load_for_fit
 from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.optimization import Optimization
-from pace_optim.optimizers.way_down import WayDown
+from pace_optim.identification.setup import load_for_fit
 from pace_optim.recording import Drive, Load, load_recording, save_recording
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.result import FitResult
@@ -401,7 +401,7 @@ def test_the_time_left_is_that_of_the_phase(monkeypatch):
 
 def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, monkeypatch):
     told = io.StringIO()
-    monkeypatch.setattr("pace_optim.identification.conclusion._LONG", 0.0)
+    monkeypatch.setattr("pace_optim.identification.conclude._LONG", 0.0)
     settings = FitSettings(task=BENCH, data=[str(save_recording(tmp_path / "r.npz", record()))], log_dir=str(tmp_path))
     fit(settings, ProgressLine(told))
     first, _, _ = told.getvalue().partition("That was the fit; checks follow")

@@ -19,11 +19,11 @@ from problems import (
 )
 from scipy.optimize import brentq
 
-from pace_optim.optimizers.derivatives import colour
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.error_bars.warnings import critical_delay, fit_warnings, in_words
 from pace_optim.recording import Load
-from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.warnings import critical_delay, fit_warnings, in_words
 
 FINE = {"train": {"all": 1e-3}, "validation": {"all": 1.1e-3}}
 
@@ -203,7 +203,7 @@ def test_a_validation_error_far_above_the_training_error_is_told(train, validati
 @pytest.mark.parametrize(("change", "told"), [(0.7e-3, True), (0.9e-3, False), (5e-3, False), (10e-3, True)])
 def test_what_the_physics_step_adds_to_the_validation_error_is_not_held_against_the_fit(change, told, monkeypatch):
     problem = make_problem(record(chirp(0.2)))
-    monkeypatch.setattr("pace_optim.uncertainty.warnings.step_error", lambda *_: torch.tensor([change]))
+    monkeypatch.setattr("pace_optim.estimate.error_bars.warnings.step_error", lambda *_: torch.tensor([change]))
     rmse = {"train": {"all": 1e-3}, "validation": {"all": 1.7e-3}}
     found = fit_warnings(problem, physical(problem), known(problem), rmse)
     assert any("does not carry over" in warning for warning in found) is told

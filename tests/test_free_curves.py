@@ -13,21 +13,21 @@ from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.joint_units import all_hinges
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
-from pace_optim.diagnosis.beginning.data_check import DataCheck
+from pace_optim.diagnosis.checks.data_check import DataCheck
+from pace_optim.diagnosis.findings.advice import advise
+from pace_optim.diagnosis.findings.findings import summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.telling.advice import advise
-from pace_optim.diagnosis.telling.findings import summary_of
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.names import Names
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
+from pace_optim.joints.fits.base_fit import fit_base
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import BASE, JointModel
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
-from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.labels import labels
-from pace_optim.single_joint_fits.model import BASE, JointModel
 
 CURVES = [name for name in available_effects() if get_effect(name).free_form]
 YES = torch.tensor([True])
@@ -232,8 +232,8 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
         "friction_over_speed@b. With all of it"
     )
-    monkeypatch.setattr("pace_optim.diagnosis.telling.advice.next_experiments", lambda *_: [])
-    monkeypatch.setattr("pace_optim.diagnosis.telling.advice.drive_in_force", lambda _: {})
+    monkeypatch.setattr("pace_optim.diagnosis.findings.advice.next_experiments", lambda *_: [])
+    monkeypatch.setattr("pace_optim.diagnosis.findings.advice.drive_in_force", lambda _: {})
     advice = advise(robot, found.outcome, found.verdict, found.data, [])
     assert any("None of the known effects explains the error of some joints" in sentence for sentence in advice)
     told = error_map(curves, robot.joint_names, outcome.base_errors)

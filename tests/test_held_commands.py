@@ -11,10 +11,10 @@ from problems import BENCH, env_cfg
 
 from pace_actuators import ActuatorActions, DelayBuffer, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import load_env_cfg
+from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.problem import Problem, load_problem
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.result import drive_in_force
-from pace_optim.uncertainty.undetermined import whole_delay
 
 URDF = """<robot name="pendulum"><link name="base"/>
   <link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/>

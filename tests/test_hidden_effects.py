@@ -13,7 +13,7 @@ import hidden_effects_cases
 from hidden_effects_cases import Job, make_jobs
 from hidden_effects_table import declared, in_declared_set, make_table, top_1
 
-from pace_optim.plant import Case, library_effects, outside_effects
+from pace_optim.data_collection.plant import Case, library_effects, outside_effects
 
 
 def line(group, effects, verdict, added=(), confounded=(), seed=0):

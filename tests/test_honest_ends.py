@@ -12,16 +12,9 @@ from run_folders import make_result
 
 from pace_actuators import IdentifiedDrives
 from pace_optim.comparison.drive_loads import drive_loads
-from pace_optim.export import FORMATS
-from pace_optim.identification.fit import fit
-from pace_optim.optimizers.least_squares import LeastSquaresCfg
-from pace_optim.problem.problem import load_problem
-from pace_optim.recording import Drive, save_recording
-from pace_optim.run.settings import FitSettings
-from pace_optim.run.summary import summary
-from pace_optim.uncertainty.honest_end import far_end, times_noise
-from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.undetermined import (
+from pace_optim.estimate.error_bars.far_from_noise import far_end, times_noise
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.error_bars.undetermined import (
     DELAY,
     at_prior,
     held_at_prior,
@@ -29,7 +22,14 @@ from pace_optim.uncertainty.undetermined import (
     undetermined,
     without_delay,
 )
-from pace_optim.uncertainty.warnings import fit_warnings
+from pace_optim.estimate.error_bars.warnings import fit_warnings
+from pace_optim.estimate.least_squares import LeastSquaresCfg
+from pace_optim.export import FORMATS
+from pace_optim.identification.fit import fit
+from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive, save_recording
+from pace_optim.run.settings import FitSettings
+from pace_optim.run.summary import summary
 
 
 def uncertainty(problem, **changes):

@@ -7,8 +7,8 @@ import pytest
 from recordings import says
 from walking import DT, walking_problem
 
-from pace_optim.log_checks.balance import views_of
-from pace_optim.log_checks.checks import explained
+from pace_optim.identification.log_checks.balance import views_of
+from pace_optim.identification.log_checks.checks import explained
 
 
 @pytest.fixture(scope="module")

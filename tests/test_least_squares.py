@@ -20,9 +20,9 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from pace_optim.optimizers.derivatives import Colouring, colour
-from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.optimizers.levenberg_marquardt import bounded_step
+from pace_optim.estimate.derivatives import Colouring, colour
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.estimate.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History

@@ -13,10 +13,10 @@ import log_checks as inputs
 
 from pace_envs import load_env_cfg
 from pace_envs.task_source import use_task
-from pace_optim.identification.beginning import load_for_fit
-from pace_optim.log_checks import check_log, checked
-from pace_optim.log_checks.balance import _bounded
-from pace_optim.log_checks.checks import _flat_ends
+from pace_optim.identification.log_checks import check_log, checked
+from pace_optim.identification.log_checks.balance import _bounded
+from pace_optim.identification.log_checks.checks import _flat_ends
+from pace_optim.identification.setup import load_for_fit
 from pace_optim.problem.problem import load_problem
 from pace_optim.run.settings import FitSettings
 

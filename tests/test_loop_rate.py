@@ -7,15 +7,15 @@ import pytest
 import torch
 from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, loop_rates
+from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.identification.optimization import Optimization
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.drive_steps import set_drive_rate
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.loop_rate import LoopRates, _against, _lagrange, loop_rates
 
 GAINS = {"stiffness": 85.0, "damping": 0.6}
 

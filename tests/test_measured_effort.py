@@ -12,9 +12,9 @@ from scipy.signal import savgol_filter
 
 import pace_optim.identification.fit as fit_module
 from pace_optim.identification.fit import fit_with_torques
-from pace_optim.measured_effort import read_drives, read_law
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive, Recording, conform_recording, save_recording
+from pace_optim.recording.torque import read_drives, read_law
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
 

@@ -13,22 +13,22 @@ from problems import CALM
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-from pace_optim.diagnosis.beginning.data_check import DataCheck
-from pace_optim.diagnosis.beginning.stated_facts import excluded_effects
-from pace_optim.diagnosis.judging.naming import Evidence, doubts
-from pace_optim.diagnosis.judging.size_consistency import unevenness
+from pace_optim.diagnosis.checks.data_check import DataCheck
+from pace_optim.diagnosis.checks.stated_facts import excluded_effects
+from pace_optim.diagnosis.findings import findings
+from pace_optim.diagnosis.findings.findings import Findings, summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.telling import findings
-from pace_optim.diagnosis.telling.findings import Findings, summary_of
+from pace_optim.diagnosis.selection.naming import Evidence, doubts
+from pace_optim.diagnosis.selection.size_consistency import unevenness
 from pace_optim.diagnosis.verdict import names as names_module
 from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import BASE, JointModel
 from pace_optim.recording import Load
 from pace_optim.report import write_report
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.labels import labels
-from pace_optim.single_joint_fits.model import BASE, JointModel
 
 SPRING, QUADRATIC, STRIBECK = (get_effect(n) for n in ("parallel_spring", "quadratic_friction", "stribeck_friction"))
 CREEP, SKEW = get_effect("creeping_friction"), get_effect("clock_skew")

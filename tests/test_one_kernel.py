@@ -16,11 +16,11 @@ from pace_actuators.effects import get_effect, registry
 from pace_actuators.files import OwnFolder
 from pace_envs.kernels import CannotCompileError, HostKernels, host, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
-from pace_optim.single_joint_fits.fits import fits_on
-from pace_optim.single_joint_fits.fitting_cfg import DEFAULT
-from pace_optim.single_joint_fits.model import BASE, JointModel
-from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot
-from pace_optim.single_joint_model import reference_path, twin_problem
+from pace_optim.joints.fits.fits import fits_on
+from pace_optim.joints.fits.fitting_cfg import DEFAULT
+from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.joints.fits.side_by_side import SideBySide, Slot
+from pace_optim.joints.simulation import reference_path, twin_problem
 
 STEPS = 80
 """Control steps that are simulated."""

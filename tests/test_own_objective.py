@@ -18,17 +18,17 @@ from problems import BENCH, TRUTH, chirp, env_cfg, make_problem, pendulums_cfg, 
 from pace_envs import TerrainCfg
 from pace_envs.contact_sensor import ContactSensorCfg
 from pace_optim import CMAESOptimizer
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizerCfg
+from pace_optim.estimate.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.estimate.own_objective import Objective, optimizer_class
 from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.own_objective import error_bars
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
-from pace_optim.optimizers.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
-from pace_optim.optimizers.own_objective import Objective, optimizer_class
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.uncertainty.assessment import assess
 
 ROOT = Path(__file__).parents[1]
 

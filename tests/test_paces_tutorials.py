@@ -16,9 +16,9 @@ import torch
 from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_envs import load_env_cfg
 from pace_optim import CMAESOptimizer
-from pace_optim.excitation import make_excitation
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizerCfg
-from pace_optim.optimizers.convergence import ScoreSpread, SearchState
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizerCfg
+from pace_optim.estimate.convergence import ScoreSpread, SearchState
+from pace_optim.motion.signals import make_excitation
 from pace_optim.problem.parameter_space import ParameterSpace
 
 PAGE = Path(__file__).parents[1] / "docs" / "coming_from_pace.md"

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from problems import TRUTH, chirp, env_cfg, make_problem, range_error, record
 
 from pace_envs.tasks.pace import Parameter, base_parameters
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 
 

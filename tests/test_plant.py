@@ -13,7 +13,7 @@ import pytest
 from problems import BENCH, env_cfg
 
 from pace_envs.task_source import use_task
-from pace_optim.plant import (
+from pace_optim.data_collection.plant import (
     BENCH_LOAD,
     EFFECTS,
     BaseTruth,
@@ -33,8 +33,8 @@ from pace_optim.plant import (
     simulate_truths,
     write_case,
 )
-from pace_optim.plant.friction_solver import friction_impulse
-from pace_optim.plant.suite import make_suite
+from pace_optim.data_collection.plant.friction_solver import friction_impulse
+from pace_optim.data_collection.plant.suite import make_suite
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, conform_recording, load_recording
@@ -318,7 +318,7 @@ def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path):
 
 @pytest.mark.slow
 def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
-    monkeypatch.setattr("pace_optim.plant.case.make_suite", partial(make_suite, duration=2.0))
+    monkeypatch.setattr("pace_optim.data_collection.plant.case.make_suite", partial(make_suite, duration=2.0))
     case = Case(effects=("torque_gain",), background=0.5, kind="chirp")
     (_, both), (_, main), (_, rest) = (
         make_case(replace(case, part=part)) for part in ("both", "effects", "background")

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.reference_update import ReferenceUpdate
 
 FLOOR = 0.5
 

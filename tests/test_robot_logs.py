@@ -14,9 +14,9 @@ from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording
-from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
-from pace_optim.robot_logs.messages import rows_of
-from pace_optim.robot_logs.words import meaning
+from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
+from pace_optim.recording.logs.messages import rows_of
+from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the readers of logs are not installed")

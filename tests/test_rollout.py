@@ -22,7 +22,7 @@ from problems import (
 from problems import PENDULUMS_TRUTH as TWO
 
 from pace_envs import set_physics_dt
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load
 from pace_optim.recording.resample import interpolate_smooth

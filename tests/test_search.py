@@ -1,6 +1,6 @@
 """The loop around the search."""
 
-from pace_optim.optimizers.search import search
+from pace_optim.estimate.search import search
 
 
 def test_the_loop_asks_simulates_tells_and_evolves_until_finished():

@@ -9,15 +9,15 @@ from diagnoses import FakeFits, errors_of, make_search, make_trial
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.decisions import unlogged
-from pace_optim.diagnosis.judging.rules import beats
 from pace_optim.diagnosis.search.carried_links import _other_rivals
 from pace_optim.diagnosis.search.look_ahead import ends
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch, Search
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.decisions import unlogged
+from pace_optim.diagnosis.selection.rules import beats
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE, JointModel
 
 ELASTICITY, MOUNT, GAIN, SPRING, PAYLOAD = (
     get_effect(name) for name in ("joint_elasticity", "mount_compliance", "torque_gain", "parallel_spring", "payload")

@@ -16,9 +16,9 @@ from problems import ANYMAL, BENCH, record
 from sharing import searched
 
 from pace_optim.identification.fit import fit
-from pace_optim.problem.processes import Processes
 from pace_optim.recording import save_recording
 from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.processes import Processes
 
 HERE = Path(__file__).parent
 FIT = str(HERE.parent / "scripts" / "fit.py")

@@ -11,11 +11,11 @@ from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, re
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
-from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.checks.shared_delay import hold_late_joints
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.single_joint_fits.base_fit import fit_base, later_than_most
-from pace_optim.single_joint_fits.model import BASE
+from pace_optim.joints.fits.base_fit import fit_base, later_than_most
+from pace_optim.joints.fits.model import BASE
 
 LATE_LOG = get_effect("measurement_delay")
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.02, "delay": 2.0}
@@ -95,6 +95,6 @@ def test_a_joint_is_not_held_where_its_delay_does_not_matter(punctual, monkeypat
     """That of a joint that hardly moves may be anything."""
     twins, base = punctual
     monkeypatch.setattr(
-        "pace_optim.diagnosis.beginning.shared_delay.later_than_most", lambda delay, cfg: torch.arange(len(delay)) == 4
+        "pace_optim.diagnosis.checks.shared_delay.later_than_most", lambda delay, cfg: torch.arange(len(delay)) == 4
     )
     assert hold_late_joints(FITS, twins, base) == (base, [])

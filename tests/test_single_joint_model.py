@@ -10,9 +10,9 @@ from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, rec
 
 from pace_envs import set_physics_dt
 from pace_envs.from_model import cfg_from_model
+from pace_optim.joints.simulation import measured_path, reference_path, twin_problem
+from pace_optim.joints.simulation.simulation import _with_friction
 from pace_optim.recording import Load
-from pace_optim.single_joint_model import measured_path, reference_path, twin_problem
-from pace_optim.single_joint_model.simulation import _with_friction
 
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.0, "delay": 2.0}
 

@@ -10,7 +10,7 @@ import pytest
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.pages import effect_page
-from pace_optim.plant import EFFECTS
+from pace_optim.data_collection.plant import EFFECTS
 
 ROOT = Path(__file__).parents[1]
 LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*?\b(?:src|href)=[\"']?(https?:)?//[^\s\"'>]+")

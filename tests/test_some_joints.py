@@ -11,14 +11,14 @@ from problems import ANYMAL, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import get_effect
 from pace_envs.simulation import SimulationCfg
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.choice import choose
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.choice import choose
+from pace_optim.joints.fits.base_fit import joint_vectors
+from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.joints.fits.side_by_side import SideBySide, Slot
+from pace_optim.joints.simulation import reference_path, twin_problem
+from pace_optim.joints.simulation.simulation import TwinSimulation
 from pace_optim.recording import Load
-from pace_optim.single_joint_fits.base_fit import joint_vectors
-from pace_optim.single_joint_fits.model import BASE, JointModel
-from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot
-from pace_optim.single_joint_model import reference_path, twin_problem
-from pace_optim.single_joint_model.simulation import TwinSimulation
 
 ELASTICITY, MOUNT, GAIN, FRICTION, PAYLOAD = (
     get_effect(name)

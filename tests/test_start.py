@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from pace_actuators.effects import get_effect
+from pace_optim.joints.fits.model import JointModel
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive, Recording, save_recording
-from pace_optim.single_joint_fits.model import JointModel
 
 PENDULUM = """
 <robot name="pendulum">

@@ -8,14 +8,14 @@ from test_uncertainty import linear
 
 from pace_envs import set_physics_dt
 from pace_optim import fit
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
+from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.recording import save_recording
 from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.step_share import change_without_step, step_share
 
 START = torch.zeros(2, dtype=torch.float64)
 

@@ -9,7 +9,7 @@ from run_folders import JOINTS, make_result
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pace_envs.tasks.pace import PaceCfg, base_parameters
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.run.tensorboard_log import TensorBoardLog
 

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from pace_optim.optimizers.tree_strategy import TreeStrategy, into_unit_box
+from pace_optim.estimate.tree_strategy import TreeStrategy, into_unit_box
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

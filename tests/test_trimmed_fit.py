@@ -8,10 +8,10 @@ import torch
 from diagnoses import FITS, joint_alone
 from problems import DT
 
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE, JointModel
 from pace_optim.recording import windows
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE, JointModel
 
 ALL = torch.tensor([True])
 

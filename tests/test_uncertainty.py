@@ -6,13 +6,13 @@ import torch
 from problems import TRUTH, chirp, env_cfg, make_problem, normalised, physical, record
 
 from pace_envs.tasks.pace import Parameter
-from pace_optim.optimizers.derivatives import Colouring, Jacobian, colour
-from pace_optim.optimizers.least_squares import least_squares
+from pace_optim.estimate.derivatives import Colouring, Jacobian, colour
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty, autocovariance, estimate_uncertainty
+from pace_optim.estimate.error_bars.undetermined import _wide
+from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.uncertainty.assessment import assess
-from pace_optim.uncertainty.uncertainty import Uncertainty, autocovariance, estimate_uncertainty
-from pace_optim.uncertainty.undetermined import _wide
 
 
 def linear(columns, error, names=None):

@@ -15,13 +15,13 @@ from pace_actuators.files import write_json
 from pace_actuators.text import size_text
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
-from pace_optim.diagnosis.telling.findings import percent_text
-from pace_optim.diagnosis.telling.text import lines_of
+from pace_optim.diagnosis.findings.findings import percent_text
+from pace_optim.diagnosis.findings.text import lines_of
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import JointModel
-from pace_optim.uncertainty.uncertainty import sandwich
+from pace_optim.estimate.error_bars.uncertainty import sandwich
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import JointModel
 
 GAIN = get_effect("torque_gain")
 SIZE = {

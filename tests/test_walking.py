@@ -10,7 +10,7 @@ from walking import DT, crawler, walking_problem, write_log
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.kernels import host
-from pace_optim.optimizers.derivatives import colour, stencil
+from pace_optim.estimate.derivatives import colour, stencil
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.dataset import make_dataset

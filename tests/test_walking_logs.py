@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from recordings import says
 
-from pace_optim.robot_logs import load_recordings, read_map
-from pace_optim.robot_logs.base import BaseMap, Channels, base_fields, guess_base
-from pace_optim.robot_logs.column_map import map_text
-from pace_optim.robot_logs.log import Channel, Log
+from pace_optim.recording.logs import load_recordings, read_map
+from pace_optim.recording.logs.base import BaseMap, Channels, base_fields, guess_base
+from pace_optim.recording.logs.column_map import map_text
+from pace_optim.recording.logs.log import Channel, Log
 
 TIME = np.arange(200) * 0.0025
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 from problems import chirp, make_problem, normalised, record
 
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg, checkpoint_of, least_squares
-from pace_optim.optimizers.way_down import PIECES, WHOLE, WayDown, WayDownCfg
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, checkpoint_of, least_squares
+from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
+from pace_optim.joints.fits.base_fit import joint_vectors
+from pace_optim.joints.fits.model import JointModel
+from pace_optim.joints.fits.side_by_side import SideBySide, Slot
+from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.recording.windows import Windows
-from pace_optim.single_joint_fits.base_fit import joint_vectors
-from pace_optim.single_joint_fits.model import JointModel
-from pace_optim.single_joint_fits.side_by_side import SideBySide, Slot
-from pace_optim.single_joint_model import reference_path, twin_problem
 
 DURATION = 6.5
 EFFECTS = {

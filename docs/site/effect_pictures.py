@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from pace_actuators.effects import available_effects, get_effect
+from pace_optim.data_collection.plant import EFFECTS, Case, write_case
 from pace_optim.identification.fit import fit
-from pace_optim.plant import EFFECTS, Case, write_case
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.settings import FitSettings
 

@@ -5,7 +5,7 @@ import sys
 import torch
 
 from pace_optim.data_collection import cfg_from_args, collect, make_collection_parser
-from pace_optim.experiment_design import design_table
+from pace_optim.motion.design import design_table
 from pace_optim.terminal.progress import ProgressLine
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-from pace_optim.diagnosis.telling.text import lines_of
+from pace_optim.diagnosis.findings.text import lines_of
 from pace_optim.run.result import FitResult
 from pace_optim.run.summary import errors_of
 from pace_optim.terminal.choices import MEASURED_FACTS

@@ -115,9 +115,9 @@ def main() -> None:
     import torch
 
     from pace_optim.identification.fit import fit_with_torques, help_fit, resume
-    from pace_optim.problem.processes import join
     from pace_optim.run.settings import FitSettings
     from pace_optim.run.summary import summary
+    from pace_optim.terminal.processes import join
 
     args = take_common_options(args)
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small

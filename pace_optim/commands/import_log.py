@@ -7,7 +7,7 @@ from pathlib import Path
 from pace_actuators.files import refuse_taken
 from pace_actuators.text import listed
 from pace_optim.recording import SUFFIXES, save_recording, written_files
-from pace_optim.robot_logs import Robot, is_log, load_recordings, read_map, understood, with_rate, write_map
+from pace_optim.recording.logs import Robot, is_log, load_recordings, read_map, understood, with_rate, write_map
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_overwrite_option, add_rate_option, take_common_options
 

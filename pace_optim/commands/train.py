@@ -8,9 +8,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 from pace_actuators import IdentifiedDrives
 from pace_envs.registration import registered_tasks
 from pace_envs.rl import RunSettings, resume, train
-from pace_optim.problem.processes import own_device
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
+from pace_optim.terminal.processes import own_device
 
 
 def main() -> None:

@@ -17,9 +17,9 @@ from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import run_folder
 from pace_optim.run.tensors import held_out_spans
 
+from .error_regions import AT_THE_FLOOR, NEGLIGIBLE, worst_places
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
 from .ladder import check_alike, make_ladder
-from .places import AT_THE_FLOOR, NEGLIGIBLE, worst_places
 from .tracks import RunTracks, Track, load_tracks
 
 VERSION = 1

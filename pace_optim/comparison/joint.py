@@ -14,9 +14,9 @@ from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
 from pace_optim.run.tensors import rms
 
 from .dimensions import Dimension, dimensions_of
+from .error_regions import Place, joint_sentence, places_of
 from .frequency import band_edges, band_power, narrowest_band, response
 from .motion import Motion, motion_of
-from .places import Place, joint_sentence, places_of
 from .regions import lay_out
 from .tracks import Track
 from .words import band_text

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_envs.task_source import file_digest
+from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Drive, Recording
@@ -18,7 +19,6 @@ from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_trajectory
-from pace_optim.uncertainty.assessment import trajectories
 
 from .load_torque import load_torques
 

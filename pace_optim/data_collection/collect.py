@@ -13,9 +13,9 @@ import numpy as np
 from pace_envs import load_env_cfg, registered_tasks
 from pace_envs.registration import make_env
 from pace_envs.tasks.pace import PaceCfg
-from pace_optim.excitation import Trajectory, make_excitation, write_command_csv
-from pace_optim.experiment_design import Design
-from pace_optim.experiment_design.motion_check import (
+from pace_optim.data_collection.plant import write_truth
+from pace_optim.motion.design import Design
+from pace_optim.motion.design.motion_check import (
     MotionFinding,
     MotionLimits,
     check_command,
@@ -23,7 +23,7 @@ from pace_optim.experiment_design.motion_check import (
     refuse_errors,
     summarise,
 )
-from pace_optim.plant import write_truth
+from pace_optim.motion.signals import Trajectory, make_excitation, write_command_csv
 from pace_optim.problem.drive_steps import set_control_step, set_drive_step
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import save_recording

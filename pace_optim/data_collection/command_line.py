@@ -7,9 +7,9 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pace_optim.excitation import excitations
-from pace_optim.experiment_design.motion_check import MAX_SHARE_AT_LIMIT
-from pace_optim.plant import library_effects, outside_effects
+from pace_optim.data_collection.plant import library_effects, outside_effects
+from pace_optim.motion.design.motion_check import MAX_SHARE_AT_LIMIT
+from pace_optim.motion.signals import excitations
 from pace_optim.recording import Load
 from pace_optim.terminal.cli import Parser, make_parser
 from pace_optim.terminal.options import (

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 from pace_envs.tasks.pace import PaceCfg
-from pace_optim.excitation import Trajectory
-from pace_optim.experiment_design import Design, DesignCfg, optimize_motion
-from pace_optim.experiment_design.motion_check import MotionLimits
+from pace_optim.motion.design import Design, DesignCfg, optimize_motion
+from pace_optim.motion.design.motion_check import MotionLimits
+from pace_optim.motion.signals import Trajectory
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem

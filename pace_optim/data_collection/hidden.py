@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS, PER_JOINT
-from pace_optim.excitation import Trajectory, make_excitation
-from pace_optim.plant import (
+from pace_optim.data_collection.plant import (
     BaseTruth,
     PlantCfg,
     Truth,
@@ -24,6 +23,7 @@ from pace_optim.plant import (
     simulate_motions,
     simulate_truths,
 )
+from pace_optim.motion.signals import Trajectory, make_excitation
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.data import Drive, Load
 

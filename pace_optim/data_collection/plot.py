@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from pace_actuators.files import write_atomically
 from pace_actuators.joint_units import JointType, units_for
-from pace_optim.excitation import Trajectory
+from pace_optim.motion.signals import Trajectory
 
 _TARGET, _TARGET_ALONE, _MEASURED, _LIMIT = "#b4b9bf", "#5f6368", "#1f5fa8", "#c0392b"
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from pace_optim.excitation import Trajectory
+from pace_optim.motion.signals import Trajectory
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, Recording, conform_recording

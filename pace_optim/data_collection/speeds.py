@@ -9,7 +9,7 @@ import numpy as np
 
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
-from pace_optim.excitation import Trajectory
+from pace_optim.motion.signals import Trajectory
 from pace_optim.problem.drive_steps import of_joints
 
 from .cfg import CollectionCfg

@@ -2,8 +2,8 @@
 
 from pace_optim.diagnosis.candidates.library import candidate_effects
 from pace_optim.diagnosis.diagnose import diagnose
+from pace_optim.diagnosis.findings.result import Diagnosis
 from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.settings import DiagnosisSettings
-from pace_optim.diagnosis.telling.result import Diagnosis
 
 __all__ = ["Diagnosis", "DiagnosisSettings", "candidate_effects", "diagnose", "search_effects"]

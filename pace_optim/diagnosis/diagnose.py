@@ -11,21 +11,21 @@ from pathlib import Path
 from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
-from pace_optim.diagnosis.judging.decisions import FILE as DECISIONS
-from pace_optim.diagnosis.judging.decisions import Decision, as_lines
+from pace_optim.diagnosis.findings.findings import Findings, told
+from pace_optim.diagnosis.findings.result import FILE, Diagnosis
 from pace_optim.diagnosis.method import search_effects
+from pace_optim.diagnosis.selection.decisions import FILE as DECISIONS
+from pace_optim.diagnosis.selection.decisions import Decision, as_lines
 from pace_optim.diagnosis.settings import DiagnosisSettings
-from pace_optim.diagnosis.telling.findings import Findings, told
-from pace_optim.diagnosis.telling.result import FILE, Diagnosis
 from pace_optim.identification.fit import fit
+from pace_optim.joints.fits.fits import fits_on
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import whole_values
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import started_from, with_identified
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
-from pace_optim.single_joint_fits.fits import fits_on
-from pace_optim.single_joint_fits.labels import labels
-from pace_optim.single_joint_fits.model import whole_values
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine

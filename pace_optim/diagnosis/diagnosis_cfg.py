@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pace_optim.experiment_design.telling_apart import MenuCfg
-from pace_optim.single_joint_fits.fitting_cfg import FittingCfg
+from pace_optim.joints.fits.fitting_cfg import FittingCfg
+from pace_optim.motion.design.telling_apart import MenuCfg
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,28 +8,28 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
-from pace_optim.diagnosis.beginning.data_check import check_data
-from pace_optim.diagnosis.beginning.shared_delay import hold_late_joints
-from pace_optim.diagnosis.beginning.stated_facts import excluded_effects
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.checks.data_check import check_data
+from pace_optim.diagnosis.checks.shared_delay import hold_late_joints
+from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.decisions import Log, unlogged
+from pace_optim.diagnosis.findings.findings import Findings
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Search
-from pace_optim.diagnosis.telling.findings import Findings
+from pace_optim.diagnosis.selection.decisions import Log, unlogged
 from pace_optim.diagnosis.verdict.free_curves import fit_curves, take_curves
 from pace_optim.diagnosis.verdict.names import earned_names, shares_of
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
+from pace_optim.joints.fits.base_fit import fit_base
+from pace_optim.joints.fits.block_errors import check_long_enough
+from pace_optim.joints.fits.denormals import flushed_denormals
+from pace_optim.joints.fits.fits import Fits, fits_on
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
-from pace_optim.single_joint_fits.base_fit import fit_base
-from pace_optim.single_joint_fits.block_errors import check_long_enough
-from pace_optim.single_joint_fits.denormals import flushed_denormals
-from pace_optim.single_joint_fits.fits import Fits, fits_on
-from pace_optim.single_joint_fits.labels import labels
-from pace_optim.single_joint_fits.reference_update import ReferenceUpdate
 
 
 @flushed_denormals()

@@ -9,13 +9,12 @@ from typing import Any
 
 from pace_actuators.effects import effect_modules
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.identification.beginning import load_for_fit, make_optimizer, make_searcher
-from pace_optim.identification.conclusion import conclude
+from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
+from pace_optim.estimate.search import agree_to_stop, search
+from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.identification.own_objective import conclude_own
-from pace_optim.optimizers.own_objective import optimizer_modules, use_recorded_optimizer
-from pace_optim.optimizers.search import agree_to_stop, search
-from pace_optim.problem.processes import Processes
+from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.inputs import (
@@ -29,6 +28,7 @@ from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds
+from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
 _NOISY = 1.5

@@ -9,23 +9,23 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import effect_cfgs
-from pace_optim.identification.beginning import make_optimizer, make_searcher
-from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
-from pace_optim.optimizers.comb_scan import scanned
-from pace_optim.optimizers.derivatives import colour
-from pace_optim.optimizers.least_squares import Descent, LeastSquaresCfg
-from pace_optim.optimizers.search import agree_to_stop, search
-from pace_optim.optimizers.way_down import PIECES, WHOLE, WayDown, WayDownCfg
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
+from pace_optim.estimate.comb_scan import scanned
+from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.far_from_noise import noise_score
+from pace_optim.estimate.error_bars.undetermined import at_prior
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
+from pace_optim.estimate.search import agree_to_stop, search
+from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
+from pace_optim.identification.setup import make_optimizer, make_searcher
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem, as_vector
-from pace_optim.problem.processes import Processes
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
+from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
-from pace_optim.uncertainty.honest_end import noise_score
-from pace_optim.uncertainty.undetermined import at_prior
 
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""

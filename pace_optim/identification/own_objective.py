@@ -11,14 +11,14 @@ import torch
 from pace_actuators.drive_result import ALL
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
+from pace_optim.estimate.error_bars.assessment import trajectories
+from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
+from pace_optim.estimate.error_bars.uncertainty import AT_BOUND, Uncertainty, uncertainty_of
+from pace_optim.estimate.error_bars.undetermined import undetermined
+from pace_optim.estimate.error_bars.warnings import fit_warnings
+from pace_optim.estimate.own_objective import Objective, optimizer_class
 from pace_optim.identification.optimization import Optimization, Outcome
-from pace_optim.optimizers.own_objective import Objective, optimizer_class
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
-from pace_optim.uncertainty.assessment import trajectories
-from pace_optim.uncertainty.honest_end import FAR_ABOVE_NOISE, times_noise
-from pace_optim.uncertainty.uncertainty import AT_BOUND, Uncertainty, uncertainty_of
-from pace_optim.uncertainty.undetermined import undetermined
-from pace_optim.uncertainty.warnings import fit_warnings
 
 _STEP = 2e-3
 """Of the first derivatives, normalised to bounds of -1 and 1: a thousandth of each range."""

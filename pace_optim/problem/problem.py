@@ -19,7 +19,6 @@ from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
-from pace_optim.measured_effort import MeasuredDrives, read_drives
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -45,6 +44,7 @@ from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
 from pace_optim.recording.parts import affordable
+from pace_optim.recording.torque import MeasuredDrives, read_drives
 from pace_optim.recording.windows import Windows
 from pace_optim.terminal.choices import DELAY_MODES
 

@@ -19,7 +19,7 @@ from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import with_columns
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.robot_logs import Robot, load_recordings, paired_files, read_map, with_rate
+from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -74,7 +74,7 @@ def read_logs(
     begins. Two files that are the halves of one log (states, commands) are joined.
 
     Args:
-        groups: Files and folders, each as :func:`pace_optim.robot_logs.load_recordings` takes it.
+        groups: Files and folders, each as :func:`pace_optim.recording.logs.load_recordings` takes it.
         env: The robot.
         joints: Regular expression of the joints that are to be identified; ``None``: those of the recordings.
         columns: Column map of the logs among them; ``None``: guessed.

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.one_kernel.robot_kernel import CompiledRobot
+from pace_envs.compiled_drive.robot_kernel import CompiledRobot
+from pace_envs.moving_frame import Course
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.dataset import Dataset, Work
-from pace_optim.recording.moving_base import Course
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv

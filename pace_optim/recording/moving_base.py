@@ -27,22 +27,6 @@ _LOADED = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Course:
-    """What a simulation of candidates on recordings is given beside commands."""
-
-    motion: torch.Tensor
-    """Of the model's frame in each physics step, (T, parts, R, 9): see :mod:`pace_envs.moving_frame`."""
-    point: torch.Tensor
-    """Where the specific force was measured, (R, 3) [m], in the model's world."""
-    held: torch.Tensor
-    """Positions [rad] and speeds [rad/s] at which joints are held, (T, R, n, 2); NaN where they are free."""
-    shift: torch.Tensor
-    """What is added to them, (num_envs, n, 2): encoder bias, and what nobody knows of where a phase begins."""
-    push: torch.Tensor
-    """What is added to the specific force, (num_envs, 3) [m/s²]."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Carried:
     """R recordings of n joints at T control steps."""
 

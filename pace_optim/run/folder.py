@@ -15,14 +15,14 @@ import torch
 from pace_actuators.files import checked, json_text, refuse, write_atomically, write_json, write_tensors, writing
 from pace_actuators.files.writing import Writer
 from pace_envs.task_source import file_digest
-from pace_optim.optimizers.least_squares import Descent, checkpoint_of
+from pace_optim.estimate.least_squares import Descent, checkpoint_of
 from pace_optim.run.history import History
 from pace_optim.run.resolved import resolved, write_model
 from pace_optim.terminal.arrays import read_arrays
 from pace_optim.terminal.cli import command
 
 if TYPE_CHECKING:
-    from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+    from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
     from pace_optim.problem.problem import Problem
 
 _README = """Identification of {robot} with {task}, started {started}.

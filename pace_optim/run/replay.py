@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
+from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.run.open import open_problem
-from pace_optim.uncertainty.assessment import trajectories
 
 
 def replay(run: Path, physical: torch.Tensor, task: str | None = None) -> dict[str, Any]:

@@ -15,13 +15,13 @@ from pace_actuators.drive_result import ALL, CURE, DriveResult
 from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
 from pace_optim.recording.notes import notes_by_kind
-from pace_optim.uncertainty.uncertainty import Uncertainty
-from pace_optim.uncertainty.undetermined import whole_delay
 
 
 @dataclass(kw_only=True)

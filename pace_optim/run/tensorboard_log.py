@@ -13,7 +13,7 @@ from pace_optim.run.result import FitResult
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-    from pace_optim.optimizers.cmaes_optimizer import CMAESOptimizer
+    from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 
 _PACES_GROUPS = {
     "delay": "0_Delay",

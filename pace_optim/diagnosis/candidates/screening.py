@@ -11,11 +11,11 @@ import torch
 
 from pace_actuators.effects import PROBED_EFFORT, Effect, comb_grid, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import COLUMN, start_values
-from pace_optim.single_joint_fits.side_by_side import Slot
-from pace_optim.single_joint_model.problem import TwinProblem
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import COLUMN, start_values
+from pace_optim.joints.fits.side_by_side import Slot
+from pace_optim.joints.simulation.problem import TwinProblem
 
 _RIDGE = 1e-9
 

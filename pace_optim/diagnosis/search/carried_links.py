@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.judging.candidate_results import Round, Trial
 from pace_optim.diagnosis.search.one_round import round_of
 from pace_optim.diagnosis.search.state import Branch, Search
-from pace_optim.single_joint_fits.block_errors import BlockErrors
+from pace_optim.diagnosis.selection.candidate_results import Round, Trial
+from pace_optim.joints.fits.block_errors import BlockErrors
 
 
 def judged_over_trees(search: Search, end: Branch, choosing: Callable[[Round], Branch]) -> Branch:

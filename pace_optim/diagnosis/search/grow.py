@@ -7,11 +7,11 @@ from functools import partial
 
 import torch
 
-from pace_optim.diagnosis.judging.candidate_results import Round
 from pace_optim.diagnosis.search.carried_links import judged_over_trees
 from pace_optim.diagnosis.search.replace_effect import replace_effects
 from pace_optim.diagnosis.search.state import Branch, Search
-from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.joints.fits.fitted import Fitted
 
 
 def grown(search: Search, branch: Branch, found: Round) -> Branch:

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
-from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
-from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.grow import combined, grown
 from pace_optim.diagnosis.search.state import Branch, Search
+from pace_optim.diagnosis.selection.candidate_results import Round, near_trials
+from pace_optim.diagnosis.selection.rules import decide
 
 
 def ends(branch: Branch, found: Round | None) -> list[dict[str, Any]]:

@@ -12,12 +12,12 @@ from pace_actuators.effects import Effect
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
-from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.judging.choice import choose
-from pace_optim.diagnosis.judging.decisions import Decision
 from pace_optim.diagnosis.search.state import Branch, Search
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.diagnosis.selection.candidate_results import Round, Trial
+from pace_optim.diagnosis.selection.choice import choose
+from pace_optim.diagnosis.selection.decisions import Decision
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fitted import Fitted
 
 
 def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | None:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.judging.decisions import Log, unlogged
-from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.diagnosis.selection.decisions import Log, unlogged
+from pace_optim.diagnosis.selection.rules import decide
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
 
 _RIDGE = 1e-12
 

@@ -9,12 +9,12 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import JudgingCfg
-from pace_optim.diagnosis.judging.candidate_results import Round, near_trials
-from pace_optim.diagnosis.judging.comparison import within
-from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.state import Branch, Search
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import BASE
+from pace_optim.diagnosis.selection.candidate_results import Round, near_trials
+from pace_optim.diagnosis.selection.comparison import within
+from pace_optim.diagnosis.selection.rules import decide
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import BASE
 
 _Exchange = dict[int, tuple[type[Effect], int]]
 """Joint -> the effect that another one takes the place of, and the round that it was chosen in, by index."""

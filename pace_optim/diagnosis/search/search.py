@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_model.problem import TwinProblem
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.rules import decide
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.simulation.problem import TwinProblem
 
 
 def add_effects(search: Search, problem: TwinProblem, base: Fitted) -> Outcome:

@@ -9,13 +9,13 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
-from pace_optim.diagnosis.judging.candidate_results import Round
-from pace_optim.diagnosis.judging.decisions import Decision, Log, unlogged
-from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_model.problem import TwinProblem
+from pace_optim.diagnosis.selection.candidate_results import Round
+from pace_optim.diagnosis.selection.decisions import Decision, Log, unlogged
+from pace_optim.diagnosis.selection.rules import decide
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.simulation.problem import TwinProblem
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

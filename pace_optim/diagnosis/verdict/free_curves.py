@@ -12,16 +12,16 @@ from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.joint_units import JointType, units_for
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
-from pace_optim.diagnosis.judging.comparison import within
-from pace_optim.diagnosis.judging.decisions import Log, unlogged
-from pace_optim.diagnosis.judging.rules import decide
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.selection.comparison import within
+from pace_optim.diagnosis.selection.decisions import Log, unlogged
+from pace_optim.diagnosis.selection.rules import decide
 from pace_optim.diagnosis.verdict.names import above_floor
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import COLUMN
-from pace_optim.single_joint_model.problem import TwinProblem
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import COLUMN
+from pace_optim.joints.simulation.problem import TwinProblem
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

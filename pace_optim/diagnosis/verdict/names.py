@@ -8,16 +8,16 @@ from dataclasses import asdict, dataclass, replace
 import torch
 
 from pace_actuators.effects import Effect
-from pace_optim.diagnosis.judging.decisions import Log, unlogged
-from pace_optim.diagnosis.judging.naming import Evidence, doubts
-from pace_optim.diagnosis.judging.rules import decide
-from pace_optim.diagnosis.judging.size_consistency import unevenness
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.selection.decisions import Log, unlogged
+from pace_optim.diagnosis.selection.naming import Evidence, doubts
+from pace_optim.diagnosis.selection.rules import decide
+from pace_optim.diagnosis.selection.size_consistency import unevenness
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
-from pace_optim.single_joint_fits.block_errors import BlockErrors
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.single_joint_fits.model import JointModel
+from pace_optim.joints.fits.block_errors import BlockErrors
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import JointModel
 
 
 @dataclass(frozen=True, kw_only=True)

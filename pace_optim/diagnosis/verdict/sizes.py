@@ -9,9 +9,9 @@ import torch
 
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.single_joint_fits.fits import Fits
-from pace_optim.single_joint_fits.fitted import Fitted
-from pace_optim.uncertainty.uncertainty import ANYWHERE, sandwich
+from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
+from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.fitted import Fitted
 
 
 def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:

@@ -11,11 +11,11 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_actuators.joint_units import JointType, all_hinges, units_for
-from pace_optim.diagnosis.judging.candidate_results import Round, Trial
-from pace_optim.diagnosis.judging.comparison import least_ratio
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.selection.candidate_results import Round, Trial
+from pace_optim.diagnosis.selection.comparison import least_ratio
 from pace_optim.diagnosis.verdict.names import above_floor, curves_in, new_effects
-from pace_optim.single_joint_fits.fitted import Fitted
+from pace_optim.joints.fits.fitted import Fitted
 
 
 def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple[str, Outcome]:

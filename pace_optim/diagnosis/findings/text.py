@@ -1,0 +1,37 @@
+"""A diagnosis as lines to print: the verdict, what was found and how large it is, its likes, what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pace_actuators.joint_units import units_for
+from pace_actuators.text import conjoined, size_text
+from pace_optim.diagnosis.findings.result import Diagnosis
+
+_EFFECTS = 8
+"""Effects in the list of what was tried, at most."""
+
+
+def lines_of(diagnosis: Diagnosis) -> list[str]:
+    """What is printed as soon as the verdict is known, the most important first."""
+    lines = [f"verdict: {diagnosis.verdict}", diagnosis.summary]
+    lines += [f"  {text}" for text in size_lines(diagnosis.sizes)]
+    stuck = dict.fromkeys(f"{size['effect']} ({size['joint']})" for size in diagnosis.sizes if size["at_bound"])
+    if stuck:
+        lines.append(f"At its bound: {', '.join(stuck)}.")
+    lines += [f"{effect} cannot be separated from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
+    lines += [f"- {sentence}" for sentence in diagnosis.advice]
+    names = list(diagnosis.joints)
+    for entry in diagnosis.ranking[:_EFFECTS]:
+        before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
+        mark = "added" if entry["added"] else ("pays" if entry["significant"] else "does not pay")
+        unit = units_for("mrad", diagnosis.joint_types(entry["joints"]))
+        where = f"on {len(entry['joints'])} of {len(names)} joints" if len(names) > 1 else ""
+        lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} {unit}  {mark:13s}  {where}".rstrip())
+    return lines + [f"- {sentence}" for sentence in diagnosis.data]
+
+
+def size_lines(sizes: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for each size: "torque_gain.gain of servo: 0.450 ± 0.002, 0.45 times what was stated"."""
+    return [f"{size['effect']}.{size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes]

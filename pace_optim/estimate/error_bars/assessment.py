@@ -1,0 +1,149 @@
+"""A result looked at once more: its error bars and its trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
+from pace_optim.estimate.least_squares import Descent
+from pace_optim.problem.evaluator import Evaluator, Residuals
+from pace_optim.problem.problem import Problem
+
+_INITIAL_STEP = 1e-5
+"""Change of the first position for its derivative [rad]; more where the simulation's own noise is more than that."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Assessment:
+    """What is known of a vector."""
+
+    uncertainty: Uncertainty
+    """Its error bars."""
+    residuals: Residuals
+    """On all samples, m = 1."""
+    jacobian: Jacobian
+    """On the training samples of the recordings that are trained on."""
+    noise: float
+    """The simulation's own noise [rad]."""
+
+
+def assess(
+    problem: Problem,
+    evaluator: Evaluator,
+    colouring: Colouring,
+    x: torch.Tensor,
+    held: Sequence[str] = (),
+    ended: Descent | None = None,
+) -> Assessment:
+    """Error bars at x from the training samples, where some labels are held, and x's residuals on all samples.
+
+    Args:
+        problem: What was fitted.
+        evaluator: Simulates all recordings.
+        colouring: Which entries are perturbed together.
+        x: Normalised, (size,).
+        held: Labels of what is held where it is.
+        ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
+    """
+    data, recordings = problem.dataset, problem.dataset.trained()
+    evaluator.look_at_phases(problem.space.to_physical(x), anew=True)
+    hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
+    for _ in range(2 if hessian is None else 1):
+        around = stencil(x, colouring, hessian, noise, score)
+        shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
+        probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
+        every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
+        train = data.train[every.step][:, recordings]
+        steps = train.any(dim=1)
+        error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
+        weight = None if every.weight is None else every.weight[steps][:, recordings]
+        trained = Residuals(error=error, where=train[steps], step=every.step[steps], weight=weight)
+        there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
+        hessian, _ = there.normal_equations()
+    initial = probes.initial(error)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held)
+    residuals = every.rows(0, 1)
+    return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Probes:
+    """The simulations that say how the residuals depend on the parameters and on the first positions."""
+
+    vectors: torch.Tensor
+    """Normalised: x, those around it, then x once per set of joints, (m, size)."""
+    offset: torch.Tensor
+    """Added to the first positions, (m, n) [rad]."""
+    initial_joints: tuple[tuple[int, ...], ...]
+    """Joints whose first position is moved together: the i-th of each tree."""
+    shake: float
+    """How far it is moved [rad]."""
+
+    def initial(self, error: torch.Tensor) -> torch.Tensor:
+        """Derivatives by the first positions of ``initial_joints``, (sets, …), of residuals (m, …)."""
+        return (error[-len(self.initial_joints) :] - error[:1]) / self.shake
+
+
+def make_probes(
+    x: torch.Tensor,
+    around: Stencil,
+    trees: Sequence[Sequence[str]],
+    joint_names: Sequence[str],
+    shake: float = _INITIAL_STEP,
+) -> Probes:
+    """What to simulate for the error bars at x.
+
+    Args:
+        x: Normalised vector, (size,).
+        around: Vectors around x that tell the derivatives.
+        trees: Groups of joints that do not influence each other.
+        joint_names: All joints, in order.
+        shake: How far first positions are moved [rad].
+    """
+    moved, joints = _shaken(trees, joint_names, shake)
+    vectors = torch.cat([x[None], around.vectors, x.repeat(len(joints), 1)])
+    offset = torch.cat([torch.zeros(len(vectors) - len(joints), len(joint_names), dtype=torch.float64), moved])
+    return Probes(vectors=vectors, offset=offset, initial_joints=joints, shake=shake)
+
+
+def _shaken(
+    trees: Sequence[Sequence[str]], joint_names: Sequence[str], shake: float
+) -> tuple[torch.Tensor, tuple[tuple[int, ...], ...]]:
+    """Changes of the first positions, (sets, n) [rad], and which joints each of them moves: the i-th of each tree."""
+    index = {name: i for i, name in enumerate(joint_names)}
+    depth = max(len(tree) for tree in trees)
+    joints = tuple(tuple(index[tree[i]] for tree in trees if i < len(tree)) for i in range(depth))
+    offset = torch.zeros(depth, len(joint_names), dtype=torch.float64)
+    for row, own in zip(offset, joints, strict=True):
+        row[list(own)] = shake
+    return offset, joints
+
+
+def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
+    """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
+    data, result = problem.dataset, []
+    for r, recording in enumerate(data.recordings):
+        at = residuals.where[:, r]
+        measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
+        enabled = recording.torque_enable
+        error = residuals.error[0, at, r]
+        if residuals.weight is not None:
+            error = error / residuals.weight[at, r].clamp(min=1.0)
+        on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
+        result.append(
+            {
+                "name": recording.name,
+                "time": torch.as_tensor(recording.time)[: len(measured)],
+                "des_dof_pos": torch.as_tensor(recording.sampled_command)[: len(measured)],
+                "dof_pos": measured,
+                "sim_dof_pos": measured + error,
+                "train": data.train[residuals.step][at, r],
+                "torque_enable": on[: len(measured)],
+            }
+        )
+    return {"joint_names": list(problem.joint_names), "recordings": result}

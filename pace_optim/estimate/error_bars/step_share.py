@@ -1,0 +1,78 @@
+"""What the physics step does to a result: the part of each value that makes up for its error."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from pace_optim.estimate.derivatives import Jacobian
+from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered, inverse_of
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.problem import Problem
+
+_FINER = 4
+"""A step this many times finer stands for none: what is left then is a third of what changes (an error of first order,
+as that of friction that turns within a step, whatever the integrator)."""
+_TO_NO_STEP = _FINER / (_FINER - 1)
+
+
+def change_without_step(problem: Problem, physical: torch.Tensor, there: Residuals) -> torch.Tensor | None:
+    """How the motion would change if the physics had no step, on the training samples, (K, R, n) [rad].
+
+    Args:
+        problem: What was fitted.
+        physical: The result, (size,).
+        there: Its residuals.
+
+    Returns:
+        The change; ``None`` where the finer simulation diverges.
+    """
+    finer = problem.with_physics_dt(problem.physics_dt / _FINER)
+    change = _TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
+    return change if bool(change.isfinite().all()) else None
+
+
+def step_share(
+    there: Jacobian, change: torch.Tensor, space: ParameterSpace, x: torch.Tensor, known: np.ndarray
+) -> np.ndarray:
+    """What of each value comes from the step, physical (size,): the value less what a fit without a step would give.
+
+    The residuals r at the result change by c when the step goes, and the result moves, in the linear map of its error
+    bars, by - (JᵀJ)⁻¹ Jᵀ c. It does so only if the recording has no such step in it: what no parameter makes up for,
+    c' = c + J times that move, then stands in the residuals, r = - c' + noise. A recording that this very step made has
+    nothing of it. So much of c' as the residuals hold, α = - r c' / c' c', tells them apart.
+
+    Args:
+        there: At the result, on the training samples.
+        change: Of the residuals when the step goes, (K, R, n) [rad].
+        space: The parameters.
+        x: The result, normalised (size,).
+        known: Which parameters have an error bar, (size,) bool; the others stay.
+    """
+    result = np.where(known, 0.0, np.nan)
+    free = np.flatnonzero(known)
+    if not len(free):
+        return result
+    hessian, _ = there.normal_equations()
+    inverse, _ = inverse_of(hessian.numpy()[np.ix_(free, free)])
+    move = torch.zeros(space.size, dtype=torch.float64)
+    move[free] = torch.from_numpy(-inverse @ there.transposed_times(change).numpy()[free])
+    if not _has_no_step(there, change + there.times(move)):
+        return result
+    result[free] = -(move * space.slope(x)).numpy()[free]
+    return result
+
+
+def _has_no_step(there: Jacobian, left: torch.Tensor) -> bool:
+    """Whether the recording may be of physics without the step: not if less than half of c' is surely in r."""
+    residuals, total = there.residuals, float(left.square().sum())
+    if total == 0:
+        return False
+    part, variance = -float((residuals.error[0] * left).sum()) / total, 0.0
+    for r in range(residuals.where.shape[1]):
+        at = residuals.where[:, r]
+        for joint in range(left.shape[-1]) if bool(at.any()) else ():
+            own, error = left[None, at, r, joint].numpy(), residuals.error[0, at, r, joint].numpy()
+            variance += float((own * filtered(own, autocovariance(error))).sum())
+    return part + SURE * np.sqrt(max(variance, 0.0)) / total > 0.5

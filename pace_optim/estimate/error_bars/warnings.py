@@ -1,0 +1,264 @@
+"""What a user must know before trusting a result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from pace_actuators.drive_result import ALL
+from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import conjoined
+from pace_envs.tasks.pace import GLOBAL
+from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.step_error import step_error
+
+_OVERFIT_RATIO = 1.5
+_NAMED = 3
+"""Joints that a sentence names, at most."""
+_ROUGH = 0.05
+"""Part of the error from the simulation's own noise above which a warning is given."""
+_NOTHING = 1e-6
+"""Errors below this are negligible [rad]."""
+_OF_THE_STEP = (0.3, 5.0)
+"""The physics step matters where halving it changes the motion by so much of the error that is left; where by more, the
+recording comes from a simulation with this very step."""
+
+
+def fit_warnings(
+    problem: Problem,
+    physical: torch.Tensor,
+    uncertainty: Uncertainty,
+    rmse: dict[str, dict[str, float]],
+    left_open: Sequence[str] = (),
+    unsure: Sequence[str] = (),
+) -> list[str]:
+    """Plain sentences, the most important first, one for each kind; none if all is well.
+
+    Args:
+        problem: What was fitted.
+        physical: The result, (size,).
+        uncertainty: At the result.
+        rmse: Errors as in ``result.json``.
+        left_open: Labels of parameters that the recordings do not determine, at their prior.
+        unsure: Labels of those that are not determined either, but fit worse there.
+    """
+    change = _change_at_half_the_step(problem, physical, rmse)
+    return [
+        *problem.contradictions,
+        *problem.measured.warnings,
+        *_overfit(rmse, change, problem.joint_types),
+        *_sampled_commands(problem, rmse, uncertainty),
+        *_critical_delays(problem, physical),
+        *_at_bounds(problem, physical, uncertainty),
+        *_undetermined(left_open),
+        *_unsure(unsure),
+        *_alike(uncertainty.indistinguishable),
+        *_coarse_step(problem, rmse, change),
+    ]
+
+
+def _undetermined(labels: Sequence[str]) -> list[str]:
+    """One sentence for each parameter that the recordings leave open on some joints."""
+    return [
+        f"{_first(name)}{_of(keys)} cannot be identified from these recordings: it has no influence, or its error bar "
+        "is as large as its bounds or its value. The prior is kept, and exports omit it. [W10]"
+        for name, keys in _by_parameter(labels).items()
+    ]
+
+
+def _unsure(labels: Sequence[str]) -> list[str]:
+    """The same for those whose error bar leaves open what the error does not, with this physics step."""
+    return [
+        f"{_first(name)}{_of(keys)} is barely identified by these recordings: its error bar is as large as its value "
+        "or its bounds, or other parameters compensate for it. The value that fits best with this physics step is "
+        "kept. [W11]"
+        for name, keys in _by_parameter(labels).items()
+    ]
+
+
+def _first(name: str) -> str:
+    """A parameter's name in words, as a sentence begins with it."""
+    words = name.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
+    """One sentence for each kind of confounded parameters, with the joints."""
+    kinds: dict[tuple[str, ...], list[str]] = {}
+    for group in groups:
+        keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
+        kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
+        kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
+    return [
+        f"The recordings cannot separate "
+        f"{conjoined([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
+        ": move more, or in other poses. [W12]"
+        for kind, keys in kinds.items()
+    ]
+
+
+def _by_parameter(labels: Sequence[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for label in labels:
+        name, key = label.split("/", 1)
+        found.setdefault(name, []).append(key)
+    return found
+
+
+def _of(keys: Sequence[str]) -> str:
+    """On which joints: all of them where they are few, else some and how many."""
+    if list(keys) == [GLOBAL]:
+        return ""
+    if len(keys) <= _NAMED:
+        return f" of {conjoined(keys)}"
+    return f" of {len(keys)} joints ({', '.join(keys[:_NAMED])}, …)"
+
+
+def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequence[JointType]) -> list[str]:
+    """Whether the error on other data is larger than the fit and the physics step (its change [rad]) make it."""
+    train, validation = rmse["train"].get(ALL), rmse["validation"].get(ALL)
+    if not train or not validation or validation < _NOTHING:
+        return []
+    of_the_step = change if change <= _OF_THE_STEP[1] * validation else 0.0
+    if validation <= math.hypot(_OVERFIT_RATIO * train, of_the_step):
+        return []
+    unit = units_for("mrad", joint_types)
+    return [
+        f"The validation error ({1e3 * validation:.3g} {unit}) is {validation / train:.1f} times the training error "
+        f"({1e3 * train:.3g} {unit}): the fit does not carry over. Use more recordings, at other gains and speeds. [W6]"
+    ]
+
+
+def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty) -> list[str]:
+    """Whether the drives seem to have got commands more often than they were logged.
+
+    What is logged with slow samples is then early by half of the time between two commands on average: no delay that
+    is 0 or more makes up for it, and the motion has none of the steps that held commands make.
+    """
+    slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
+    low = problem.space.lower[problem.space["delay"]]
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
+    if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
+        return []
+    return [
+        f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between. "
+        "Even with a delay of 0 they come too late. The drive probably received more commands than were logged: log "
+        "every command, with its instant (des_time). [W7]"
+    ]
+
+
+def rough_motion(noise: float, score: float) -> list[str]:
+    """Whether the simulation's own noise [rad] is a notable part of the error (score [rad²])."""
+    if noise < _ROUGH * score**0.5:
+        return []
+    return [
+        "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
+        f"{100 * noise / score**0.5:.0f} % of the error. Derivatives use larger steps; error bars are less accurate. "
+        "[W14]"
+    ]
+
+
+def _change_at_half_the_step(problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]]) -> float:
+    """RMS change of the motion when the physics step is halved [rad], where errors are judged."""
+    data = problem.dataset
+    where = data.validation if rmse["validation"].get(ALL) else data.train
+    return float(step_error(problem, physical, where).square().mean().sqrt())
+
+
+def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: float) -> list[str]:
+    """Whether a part of the error may come from the physics step (its change [rad])."""
+    left = rmse["validation"].get(ALL) or rmse["train"].get(ALL)
+    least, most = _OF_THE_STEP
+    if not left or not least * left <= change <= most * left:
+        return []
+    unit = units_for("mrad", problem.joint_types)
+    return [
+        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} {unit}, "
+        f"and the error is {1e3 * left:.3g} {unit}: part of it may come from the step. Fit with "
+        f"--physics_dt {problem.physics_dt / 2:.12g}. [W13]"
+    ]
+
+
+def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:
+    """One sentence per parameter and side."""
+    space = problem.space
+    low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
+    places: dict[tuple[str, str, float], list[str]] = {}
+    for label in uncertainty.at_bound:
+        i = space.labels.index(label)
+        name, key = label.split("/", 1)
+        side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
+        places.setdefault((name, side, bound), []).append(key)
+    return [
+        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.unit_of(name, keys[0])})"
+        + _of(keys).replace(" of ", " on ", 1)
+        + ": widen the bound, or find the missing physics that this parameter stands in for. [W9]"
+        for (name, side, bound), keys in places.items()
+    ]
+
+
+def in_words(labels: tuple[str, ...]) -> str:
+    """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
+    names = [label.split("/")[0].replace("_", " ") for label in labels]
+    keys = {label.split("/", 1)[1] for label in labels} - {ALL}
+    if len(keys) == 1:
+        return f"{conjoined(names)} of {keys.pop()}"
+    return conjoined([f"{name} of {label.split('/', 1)[1]}" for name, label in zip(names, labels, strict=True)])
+
+
+def critical_delay(inertia: float, viscous_friction: float, stiffness: float, damping: float) -> float:
+    """The delay of the whole torque at which a PD loop starts to oscillate [s].
+
+    The characteristic equation I s² + d s + (P + D s) e^(-sT) = 0 has a root on the imaginary axis, s = iω, where
+    |P + iDω| = |Iω² - idω|; then T = (arg(P + iDω) - arg(Iω² - idω)) / ω.
+
+    Args:
+        inertia: I, armature and load [kg m²].
+        viscous_friction: d [N m s/rad].
+        stiffness: P [N m/rad].
+        damping: D [N m s/rad].
+
+    Returns:
+        T; infinite if no delay makes it oscillate.
+    """
+    # I²w² + (d² - D²) w - P² = 0 with w = ω²
+    a, b, c = inertia**2, viscous_friction**2 - damping**2, -(stiffness**2)
+    if stiffness <= 0 or a <= 0:
+        return math.inf
+    omega = math.sqrt((-b + math.sqrt(b * b - 4 * a * c)) / (2 * a))
+    phase = math.atan2(damping * omega, stiffness) - math.atan2(-viscous_friction * omega, inertia * omega**2)
+    return phase % (2 * math.pi) / omega
+
+
+def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
+    """Only a delay of the whole torque lies inside the loop, whose gains and load are each recording's own."""
+    if problem.delay_mode != "effort":
+        return []
+    rollout, space = problem.evaluator().rollout(1), problem.space
+    rollout.start(physical[None])
+    robot, sim = rollout.robot, rollout.env.sim
+    sim.forward()
+    delay_s = float(physical[space["delay"]]) * problem.control_dt
+    viscous = physical[space["viscous_friction"]].tolist()
+    shortest: dict[str, float] = {}
+    for r in range(problem.dataset.num_recordings):
+        inertia = torch.as_tensor(sim.model_of(r).dof_M0)[robot.dof_columns].tolist()
+        for actuator in robot.actuators.values():
+            for column, name in enumerate(actuator.joint_names):
+                j = robot.joint_names.index(name)
+                kp, kd = float(actuator.stiffness[r, column]), float(actuator.damping[r, column])
+                limit = critical_delay(inertia[j], viscous[j], kp, kd)
+                shortest[name] = min(limit, shortest.get(name, math.inf))
+    rollout.env.close()
+    beyond = [f"{name} ({1e3 * limit:.1f} ms)" for name, limit in shortest.items() if delay_s > limit]
+    if not beyond:
+        return []
+    return [
+        f"The delay of {1e3 * delay_s:.1f} ms is beyond the critical delay of the control loop of "
+        f"{conjoined(beyond)}: the simulation oscillates by itself. Lower the delay's bound, or use "
+        "--delay_mode command. [W8]"
+    ]

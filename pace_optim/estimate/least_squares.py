@@ -1,0 +1,271 @@
+"""Levenberg–Marquardt on rollout residuals of a whole robot, inside the bounds.
+
+An iteration looks around x, which gives J, H = JᵀJ, g = Jᵀr and the simulation's noise (``derivatives``), and tries
+steps at several dampings (``levenberg_marquardt``). A look costs as many simulations as a tree has parameters, a step a
+few: so the iteration goes on with the same J, and g = Jᵀr of its best trial, as long as that pays (Shamanskii's method;
+Ortega and Rheinboldt, 1970, 10.2). H, g and x are all that the next one needs: a descent that is resumed is the one
+that was interrupted, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+
+from pace_actuators.files import checked
+from pace_optim.estimate.derivatives import NOISE_ROWS, Colouring, Jacobian, stencil
+from pace_optim.estimate.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
+from pace_optim.problem.evaluator import Evaluator
+
+_CREEPING = 3
+_REFUSED = 2
+_AS_EXPECTED = 0.5
+"""Part of the expected gain that a step must bring for J to serve for another."""
+
+
+@dataclass(kw_only=True)
+class LeastSquaresCfg:
+    """When a descent ends."""
+
+    max_iteration: int = 40
+    """Largest number of iterations."""
+
+    score_tolerance: float = 1e-6
+    """Stop when less than this part of the score is left to gain, by the linear model. Where the score is k² times that
+    of the noise, k² times as much: what is left to gain is then small against what is missing."""
+
+    loosest_tolerance: float = 5e-3
+    """The largest such part."""
+
+    creep_tolerance: float = 1e-4
+    """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
+
+    target_score: float = 1e-16
+    """Stop below this score [rad²]."""
+
+    noise_score: float = 0.0
+    """Score that the measurement's noise alone leaves [rad²]."""
+
+    give_up_ratio: float = 100.0
+    """Stop, from the fifth iteration on, a start whose score is this many times that of a start before it."""
+
+    same_valley: float = 2e-2
+    """Stop a start that has come this near to the end of one before it, in every normalised parameter."""
+
+    def tolerance(self, score: float) -> float:
+        """The part of a score that may be left to gain."""
+        above = score / self.noise_score if self.noise_score > 0 else 1.0
+        return self.score_tolerance * max(1.0, min(above, self.loosest_tolerance / max(self.score_tolerance, 1e-300)))
+
+
+@dataclass(kw_only=True)
+class DescentState:
+    """The plain numbers of a descent."""
+
+    stage: str = ""
+    """Of which stage of a fit it is."""
+    damping: float = FIRST_DAMPING
+    """Levenberg–Marquardt damping, relative to the diagonal of JᵀJ."""
+    noise: float = 0.0
+    """The simulation's own noise where it was looked last [rad]."""
+    stop_reason: str = ""
+    """Why it has ended; empty: it has not."""
+    iteration: int = 0
+    refused: int = 0
+    """Iterations in a row in which no trial was better."""
+    simulations: int = 0
+    """Vectors simulated."""
+    scores: list[float] = field(default_factory=list)
+    """The score at the start and after each iteration [rad²]; empty until it is known, and where it is not finite."""
+
+    @property
+    def score(self) -> float:
+        """The present score [rad²]; infinite where none is known."""
+        return self.scores[-1] if self.scores else math.inf
+
+
+@dataclass(kw_only=True, eq=False)
+class Descent(DescentState):
+    """One start's way down."""
+
+    x: torch.Tensor
+    """Present normalised vector, (size,)."""
+    hessian: torch.Tensor | None = None
+    """JᵀJ where it was looked last, (size, size)."""
+    gradient: torch.Tensor | None = None
+    """Jᵀr at x, (size,); ``None``: look around first."""
+    jacobian: Jacobian | None = None
+    """J at x where it is at hand, for the next iteration alone; no part of a checkpoint."""
+
+    @classmethod
+    def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
+        """Descents as :func:`checkpoint_of` has them.
+
+        Raises:
+            ValueError: If its parts do not fit together.
+        """
+        states = [
+            checked(DescentState, each, "descents", "Start a new fit.")
+            for each in json.loads(str(checkpoint["descents"]))
+        ]
+        known = zip(checkpoint["descent_x"], checkpoint["descent_hessian"], checkpoint["descent_gradient"], strict=True)
+        return [
+            cls(
+                **vars(state),
+                x=torch.as_tensor(x),
+                hessian=torch.as_tensor(hessian) if hessian.any() else None,
+                gradient=None if np.isnan(gradient).any() else torch.as_tensor(gradient),
+            )
+            for state, (x, hessian, gradient) in zip(states, known, strict=True)
+        ]
+
+    def look(
+        self, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
+        """H and g at x; where they are not known, they, the noise and J are taken."""
+        renewed = evaluator.look_at_phases(evaluator.space.to_physical(self.x), anew=True)
+        if self.hessian is not None and self.gradient is not None:
+            return self.hessian, self.gradient, self.jacobian
+        around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
+        vectors = torch.cat([self.x[None], around.vectors])
+        residuals = evaluator.residuals(evaluator.space.to_physical(vectors), where)
+        self.simulations += len(vectors)
+        score = float(residuals.score[0])
+        if not self.scores and math.isfinite(score):
+            self.scores = [score]
+        elif renewed and math.isfinite(score):  # by what is known of phases here
+            self.scores[-1] = score
+        self.noise = around.noise(residuals)
+        jacobian = around.jacobian(residuals)
+        self.hessian, self.gradient = jacobian.normal_equations()
+        return self.hessian, self.gradient, jacobian
+
+
+def checkpoint_of(descents: Sequence[Descent]) -> dict[str, np.ndarray]:
+    """All that :meth:`Descent.restore` needs, as arrays."""
+    size = len(descents[0].x) if descents else 0
+    states = [{each.name: getattr(d, each.name) for each in fields(DescentState)} for d in descents]
+    nothing, unknown = np.zeros((size, size)), np.full(size, np.nan)
+    hessians = [nothing if d.hessian is None else d.hessian.numpy() for d in descents]
+    gradients = [unknown if d.gradient is None else d.gradient.numpy() for d in descents]
+    return {
+        "descents": np.array(json.dumps(states)),
+        "descent_x": np.array([d.x.numpy() for d in descents]).reshape(len(descents), size),
+        "descent_hessian": np.array(hessians).reshape(len(descents), size, size),
+        "descent_gradient": np.array(gradients).reshape(len(descents), size),
+    }
+
+
+def least_squares(
+    evaluator: Evaluator,
+    colouring: Colouring,
+    starts: Sequence[torch.Tensor | Descent],
+    cfg: LeastSquaresCfg | None = None,
+    on_iteration: Callable[[list[Descent]], None] | None = None,
+    where: torch.Tensor | None = None,
+) -> list[Descent]:
+    """Refine starts, one after the other, to the nearest minimum of the score.
+
+    Args:
+        evaluator: Simulates.
+        colouring: Which entries are perturbed together.
+        starts: Normalised vectors, (size,), or descents to go on with.
+        cfg: When a descent ends.
+        on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
+        where: Which samples count, (T, R) bool; ``None`` means those to train on.
+
+    Returns:
+        The descents, the best first.
+    """
+    cfg = cfg or LeastSquaresCfg()
+    descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
+    for i, descent in enumerate(descents):
+        while not descent.stop_reason:
+            _iterate(descent, evaluator, colouring, cfg, where)
+            _give_up(descent, descents[:i], cfg)
+            if on_iteration is not None:
+                on_iteration(descents)
+    return sorted(descents, key=lambda d: d.score)
+
+
+def _iterate(
+    descent: Descent, evaluator: Evaluator, colouring: Colouring, cfg: LeastSquaresCfg, where: torch.Tensor | None
+) -> None:
+    """Look around if x has moved, try steps, take the best, and say when it is time to stop."""
+    blind = descent.hessian is None
+    hessian, gradient, jacobian = descent.look(evaluator, colouring, where)
+    descent.jacobian = None
+    if not descent.scores:
+        descent.stop_reason = "diverged at its start"
+        return
+    if descent.score <= cfg.target_score:
+        descent.stop_reason = f"score below {cfg.target_score:g}"
+        return
+    descent.iteration += 1
+    descent.scores.append(descent.score)
+    step = _Step(descent, hessian, gradient)
+    left, allowed = step.expected, cfg.tolerance(descent.score) * descent.score
+    steps = 1 if jacobian is None else 1 + (len(colouring.colours) + 1 + NOISE_ROWS) // len(step.trials)
+    for _ in range(steps):
+        gain, error = step.take(evaluator, where)
+        if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
+            break
+        step = _Step(descent, hessian, jacobian.transposed_times(error))
+    if descent.scores[-1] < descent.scores[-2]:
+        descent.gradient, descent.refused = None, 0
+    else:
+        descent.refused += 1
+        if blind:  # the derivatives were those of a first look
+            descent.gradient = None
+    if descent.score <= cfg.target_score:
+        descent.stop_reason = f"score below {cfg.target_score:g}"
+    elif not blind and (left <= allowed or descent.refused >= _REFUSED or _creeps(descent.scores, cfg)):
+        descent.stop_reason = "converged"
+    elif descent.iteration >= cfg.max_iteration:
+        descent.stop_reason = f"max_iteration {cfg.max_iteration}"
+
+
+class _Step:
+    """Trials of one step of a descent, at several dampings."""
+
+    def __init__(self, descent: Descent, hessian: torch.Tensor, gradient: torch.Tensor):
+        model = LinearModel(hessian, gradient)
+        self.descent = descent
+        self.trials = model.trials(descent.x, descent.damping)
+        self.expected = model.expected_gain(self.trials[0] - descent.x)
+        """What the first of them gains where J is right [rad²]."""
+
+    def take(self, evaluator: Evaluator, where: torch.Tensor | None) -> tuple[float, torch.Tensor]:
+        """Simulate them and go to the best; returns what was gained [rad²] and the best's error, (K, R, n)."""
+        descent = self.descent
+        residuals = evaluator.residuals(evaluator.space.to_physical(self.trials), where)
+        descent.simulations += len(self.trials)
+        scores = residuals.score
+        best = int(scores.argmin())
+        gain = descent.score - float(scores[best])
+        if gain > 0:
+            descent.x, descent.scores[-1] = self.trials[best].clone(), float(scores[best])
+        descent.damping = next_damping(descent.damping, best if gain > 0 else None)
+        return gain, residuals.error[best]
+
+
+def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:
+    """Whether the score has all but stopped falling, as it does where friction makes it rough."""
+    tolerance = max(cfg.creep_tolerance, cfg.tolerance(scores[-1]))
+    return len(scores) > _CREEPING and scores[-1 - _CREEPING] - scores[-1] < _CREEPING * tolerance * scores[-1]
+
+
+def _give_up(descent: Descent, before: Sequence[Descent], cfg: LeastSquaresCfg) -> None:
+    """Stop a start that has come into the valley of one before it, or stays far above it."""
+    if descent.stop_reason or not before:
+        return
+    best = min(before, key=lambda d: d.score)
+    if descent.iteration >= 5 and descent.score > cfg.give_up_ratio * best.score:
+        descent.stop_reason = "another start is far better"
+    elif any(float((descent.x - other.x).abs().max()) < cfg.same_valley for other in before):
+        descent.stop_reason = "another start is in the same valley"

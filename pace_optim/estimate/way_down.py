@@ -1,0 +1,170 @@
+"""The way of a fit from its starts to its result.
+
+1. Descend on pieces: windows of two seconds, a share of each recording, at the longest stable physics step. Over a
+   short time the error bends less, and has fewer valleys.
+2. Go on at the fit's own step, where that is finer: what a long step leaves is no wrong valley.
+3. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
+   simulate a stated multiple of what the descents took. Descend again from its best.
+4. Descend on the whole recordings from the end that is best there.
+
+A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
+physics is missing, the fit ends early.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from pace_optim.estimate.derivatives import Colouring
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.evaluator import Evaluator
+
+PIECES, FINE, WHOLE = "pieces", "fine pieces", "whole"
+"""The stages of descents, in this order; their names may begin with more."""
+
+
+@dataclass(kw_only=True)
+class WayDownCfg:
+    """Numbers of the stages."""
+
+    share: float = 0.25
+    """Share of each recording that the pieces make."""
+
+    on_pieces: LeastSquaresCfg = field(
+        default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-10)
+    )
+    """Descents on pieces."""
+
+    on_whole: LeastSquaresCfg = field(default_factory=LeastSquaresCfg)
+    """Descents on the whole recordings."""
+
+    far: float = 3.0
+    """Times the noise above which the end of a descent on pieces may be a wrong valley."""
+
+    search_budget: float = 2.0
+    """Simulations of the search, in multiples of what the descents on pieces took."""
+
+
+class WayDown:
+    """The stages of one fit; its descents are all that it goes on from when it is resumed."""
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        colouring: Colouring,
+        *,
+        pieces: Evaluator | None = None,
+        fine: Evaluator | None = None,
+        noise_score: float = 0.0,
+        cfg: WayDownCfg | None = None,
+        on_iteration: Callable[[Sequence[Descent]], None] | None = None,
+        name: str = "",
+    ):
+        """Prepare the stages.
+
+        Args:
+            evaluator: Simulates the whole recordings.
+            colouring: Which entries are perturbed together.
+            pieces: Simulates the pieces; ``None``: the whole recordings are the pieces.
+            fine: Simulates the pieces at the step of the whole recordings; ``None``: ``pieces`` does.
+            noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
+            cfg: Numbers of the stages.
+            on_iteration: Called with the stage's descents after each iteration.
+            name: What its stages' names begin with, where a fit has several ways.
+        """
+        self.cfg = cfg or WayDownCfg()
+        self.evaluator = evaluator
+        self.pieces = pieces or evaluator
+        self.fine = fine
+        self.colouring = colouring
+        self.noise_score = noise_score
+        self.descents: list[Descent] = []
+        """All so far, in the order in which they began."""
+        self.stages = f"{name}{PIECES}", f"{name}{FINE}", f"{name}{WHOLE}"
+        self._on_iteration = on_iteration or (lambda _: None)
+
+    def run(
+        self,
+        starts: Sequence[torch.Tensor],
+        search: Callable[[int], torch.Tensor] | None = None,
+        scan: Callable[[torch.Tensor], torch.Tensor | None] = lambda _: None,
+    ) -> Descent:
+        """Go all the way; returns the best descent on the whole recordings.
+
+        Args:
+            starts: Normalised vectors, (size,).
+            scan: Gives another start by the best end so far, or none.
+            search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
+        """
+        whole = self.stages[-1]
+        if not self._of(whole):
+            starts = list(starts)
+            rounds = 1
+            best = self._on_pieces(starts, rounds)
+            if (found := scan(best.x)) is not None:
+                starts.append(found)
+                rounds += 1
+                best = self._on_pieces(starts, rounds)
+            if search is not None and self.is_far(best.score):
+                spent = sum(d.simulations for d in self._of(self.stages[0])[: len(starts)])
+                starts.append(search(round(self.cfg.search_budget * spent)))
+                self._on_pieces(starts, rounds + 1)
+            self.descents.append(self._best_on_whole(starts))
+        return self._descend(whole, [])
+
+    def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
+        """Descend on the whole recordings from a vector that is known to be near the best."""
+        if not self.descents:
+            self.descents = [Descent(x=x, stage=self.stages[-1])]
+        return self._descend(self.stages[-1], [], cfg)
+
+    def is_far(self, score: float) -> bool:
+        """Whether a score is above the noise by more than what a wrong valley may leave."""
+        return score > self.cfg.far**2 * self.noise_score and score > self.cfg.on_pieces.target_score
+
+    def _of(self, stage: str) -> list[Descent]:
+        """A stage's descents so far."""
+        return [d for d in self.descents if d.stage == stage]
+
+    def _on_pieces(self, starts: Sequence[torch.Tensor], rounds: int) -> Descent:
+        """Descend on pieces, and from the best end at the finer step; returns the best end at the finest step.
+
+        Args:
+            starts: Of all rounds so far.
+            rounds: How many these are; each has one descent at the finer step.
+        """
+        pieces, fine, _ = self.stages
+        self._descend(pieces, [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=pieces) for x in starts])
+        best = min(self._of(pieces)[: len(starts)], key=lambda d: d.score)
+        if self.fine is None:
+            return best
+        self._descend(fine, [*self._of(fine)[: rounds - 1], Descent(x=best.x.clone(), stage=fine)])
+        return min(self._of(fine)[:rounds], key=lambda d: d.score)
+
+    def _descend(self, stage: str, starts: Sequence[Descent], cfg: LeastSquaresCfg | None = None) -> Descent:
+        """Let a stage's descents end, those of its starts that are new among them; returns the best."""
+        own = self._of(stage)
+        added = starts[len(own) :]
+        own, self.descents = [*own, *added], [*self.descents, *added]
+        on_whole = stage == self.stages[-1]
+        cfg = cfg or (self.cfg.on_whole if on_whole else self.cfg.on_pieces)
+        evaluators = dict(zip(self.stages, (self.pieces, self.fine or self.pieces, self.evaluator), strict=True))
+        cfg = replace(cfg, noise_score=self.noise_score)
+        return least_squares(evaluators[stage], self.colouring, own, cfg, self._on_iteration)[0]
+
+    def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
+        """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""
+        ends = [d for stage in self.stages[:2] for d in self._of(stage)]
+        vectors = torch.stack([*(d.x for d in ends), *starts])
+        scores = self.evaluator.residuals(self.evaluator.space.to_physical(vectors)).score
+        best = int(scores.argmin())
+        hessian = ends[best].hessian if best < len(ends) else None
+        known = [float(scores[best])] if bool(scores[best].isfinite()) else []
+        return Descent(x=vectors[best].clone(), stage=self.stages[-1], hessian=hessian, damping=_DAMPING, scores=known)
+
+
+_DAMPING = 1e-5
+"""Where a descent on the whole recordings begins: near its valley."""

@@ -1,0 +1,306 @@
+"""What a fit concludes from where its optimizers ended: values, error bars, warnings; all of it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from pace_actuators.drive_result import ALL
+from pace_envs.task_source import EnvironmentRecord
+from pace_optim.comparison.drive_loads import drive_loads
+from pace_optim.estimate.derivatives import Jacobian
+from pace_optim.estimate.error_bars.assessment import Assessment, assess, trajectories
+from pace_optim.estimate.error_bars.consistency import Consistency, check_consistency
+from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, noise_score, times_noise
+from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used_loop
+from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.error_bars.undetermined import DELAY, held_at_prior, undetermined, without_delay
+from pace_optim.estimate.error_bars.warnings import fit_warnings, rough_motion
+from pace_optim.estimate.least_squares import LeastSquaresCfg
+from pace_optim.identification.optimization import NEAR, Optimization, Outcome
+from pace_optim.problem.evaluator import Evaluator, Residuals
+from pace_optim.problem.problem import Problem
+from pace_optim.run.result import FitResult, make_result, rmse_by_joint
+from pace_optim.run.summary import summary
+
+_LONG = 60.0
+"""A fit that took longer tells its result before it is checked [s]."""
+_LOOP_IN_DOUBT = 1.5
+"""Times the noise above which a fit with an assumed loop rate tries another."""
+_STEP_IN_DOUBT = 1.3
+"""Times the noise above which a fit may go on at half its physics step ..."""
+_OF_THE_STEP = 0.25
+"""... where the step makes this part of what is above the noise, ..."""
+_HALVINGS = 2
+"""... so many times."""
+CHECKS_INTERRUPTED = "checks interrupted"
+"""Stop reason of a result that was not checked to the end."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _End:
+    """The vector that is kept, and what is known of it."""
+
+    problem: Problem
+    """What was fitted; where the recordings tell the rate of the drives' loops, with that."""
+    x: torch.Tensor
+    """Normalised, (size,)."""
+    of_noise: Uncertainty
+    """What noise alone leaves open."""
+    residuals: Residuals
+    """On all samples."""
+    jacobian: Jacobian
+    """On the training samples of the recordings that are trained on."""
+    noise: float
+    """The simulation's own noise [rad]."""
+    train_rmse: float
+    """Where the optimizers ended [rad]."""
+    times: float | None
+    """The same as a multiple of the noise."""
+    stop_reasons: tuple[str, ...]
+    left_open: list[str] = field(default_factory=list)
+    """Labels of what the recordings leave open: it is at its prior."""
+    rates: LoopRates | None = None
+    """What is known of the loops' rate where it is not stated."""
+    without_step: torch.Tensor | None = None
+    """How the motion would change without a physics step, (K, R, n) [rad]."""
+    consistency: Consistency = field(default_factory=Consistency)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether that is so far above the noise that error bars mean nothing."""
+        return self.times is not None and self.times >= FAR_ABOVE_NOISE
+
+    @property
+    def known(self) -> np.ndarray:
+        """Which parameters have an error bar, (size,) bool."""
+        return ~np.isnan(self.of_noise.std)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Error bars that know what comes from the physics step and from the loops' rate, too."""
+        result, shares = self.of_noise, [] if self.rates is None else list(self.rates.shares)
+        if self.without_step is not None:
+            shares.append(step_share(self.jacobian, self.without_step, self.problem.space, self.x, self.known))
+        for share in shares:
+            result = result.with_step(np.where(self.known, share, np.nan))
+        return result
+
+    def moved(self, run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
+        """Another vector, with some parameters held."""
+        known = _known_at(run, self.problem, x, held)
+        return replace(self, x=x, of_noise=known.uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+
+
+def conclude(
+    run: Optimization, record: EnvironmentRecord, outcome: Outcome, keep_interrupted: bool = True
+) -> FitResult:
+    """Write the result, then check it, and add what each check finds.
+
+    Args:
+        run: What has ended.
+        record: Where its environment comes from.
+        outcome: Where it ended.
+        keep_interrupted: Whether an interruption ends the checks; otherwise it is passed on. The file stays.
+
+    Raises:
+        ValueError: If the simulation diverges where it ended.
+    """
+    end = _reached(run, outcome)
+    checks: Sequence[Callable[[Optimization, _End], _End]] = _CHECKS
+    if outcome.is_interrupted:
+        checks = (_silent_at_prior,)
+    elif end.is_far:
+        checks = (_with_prior,)  # where physics is missing, recordings disagree: that is the diagnosis' work
+    try:
+        for check in checks:
+            _write(run, record, end)
+            end = check(run, end)
+            if check is _with_step and run.progress.elapsed > _LONG:
+                text = summary(_result(run, record, end))
+                run.progress.tell(*text, "That was the fit; checks follow (Ctrl-C keeps the fit).")
+    except KeyboardInterrupt:
+        if not keep_interrupted:
+            raise
+        end = replace(end, stop_reasons=(*end.stop_reasons, CHECKS_INTERRUPTED))
+    space = end.problem.space
+    bias = space.to_physical(end.x)[space["encoder_bias"]].numpy()
+    run.folder.write_json("drives.json", drive_loads(end.problem, _assessor(run, end.problem), bias))
+    return _write(run, record, end, checked=True)
+
+
+def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = False) -> FitResult:
+    """Write what is known so far; what takes simulations to tell only where all has been checked."""
+    run.folder.write_tensors("best_trajectory.pt", trajectories(end.problem, end.residuals))
+    result = _result(run, record, end, checked)
+    result.save(run.folder.path / "result.json")
+    return result
+
+
+def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = True) -> FitResult:
+    """What is known so far, as a run keeps it."""
+    problem, data, settings, every = end.problem, end.problem.dataset, run.settings, end.residuals
+    where = {"train": data.train[every.step], "validation": data.validation[every.step]}
+    rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
+    uncertainty = end.uncertainty
+    physical = problem.space.to_physical(end.x)
+    open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
+    unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
+    rates = end.rates
+    stalled = f"stalled: residual is {end.times or 0.0:,.0f}x the measurement noise"
+    return make_result(
+        problem,
+        end.x,
+        every,
+        uncertainty,
+        effects=problem.effects,
+        environment=record.to_dict(),
+        optimizer=settings.optimizer,
+        seed=settings.seed,
+        generations=run.optimizer.generation if run.optimizer else 0,
+        simulated_steps=run.steps + end.consistency.simulated_steps,
+        wall_time_s=run.progress.elapsed,
+        stop_reasons=[stalled if end.is_far and reason == "converged" else reason for reason in end.stop_reasons],
+        undetermined=end.left_open,
+        times_noise=end.times,
+        std_means_nothing=end.is_far,
+        assumes_loop_rate=run.problem.assumes_loop_rate,
+        loop_rate=_loop_rate(end),
+        warnings=[
+            *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
+            *rough_motion(end.noise, float(end.jacobian.residuals.score[0])),
+            *([] if rates is None else rates.sentences(problem.space, end.known)),
+            *(fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure) if checked else []),
+            *end.consistency.sentences,
+        ],
+    )
+
+
+def _loop_rate(end: _End) -> dict[str, Any]:
+    """What is known of the loops' rate; nothing where it is stated, or as assumed for want of a comparison."""
+    if end.rates is not None:
+        return end.rates.to_dict(end.problem.space)
+    assumed, used = end.problem.assumed_loop, end.problem.loop_dt
+    return {} if assumed in (None, used) else used_loop(assumed, used)
+
+
+def _reached(run: Optimization, outcome: Outcome) -> _End:
+    """Where the optimizers ended, with error bars."""
+    problem, known = run.problem, _known_at(run, run.problem, outcome.x)
+    run.refuse_divergence(float(known.residuals.score[0]))
+    train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)[ALL]
+    return _End(
+        problem=problem,
+        x=outcome.x,
+        of_noise=known.uncertainty,
+        residuals=known.residuals,
+        jacobian=known.jacobian,
+        noise=known.noise,
+        train_rmse=train,
+        times=times_noise(problem, train),
+        stop_reasons=tuple(outcome.stop_reasons),
+    )
+
+
+def _known_at(run: Optimization, problem: Problem, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
+    return assess(problem, _assessor(run, problem), run.colouring, x, held, run.ended)
+
+
+def _assessor(run: Optimization, problem: Problem) -> Evaluator:
+    """What simulates all recordings."""
+    return run.assessor if problem is run.problem else problem.evaluator()
+
+
+def _with_loop_rate(run: Optimization, end: _End) -> _End:
+    """Add what depends on an assumed loop rate; take another rate where only others fit."""
+    if end.problem.assumes_loop_rate:
+        run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
+    rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
+    least = float(end.jacobian.residuals.score[0]) if rates is None else rates.score
+    doubtful = end.problem.assumes_loop_rate and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)
+    if doubtful and (outcome := run.with_other_loop(end.x)) is not None:
+        end = _reached(run, outcome)
+        rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
+    if rates is None:
+        return end
+    end = replace(end, rates=rates)
+    if rates.chosen == rates.fitted:
+        return end
+    x = end.problem.space.to_normalised(torch.from_numpy(rates.value_at(rates.chosen)))
+    return replace(end, problem=end.problem.with_drive_dt(rates.chosen)).moved(run, x)
+
+
+def _with_step(run: Optimization, end: _End) -> _End:
+    """Add the physics step's part of each error bar; halve the step if it makes much of the error."""
+    for _ in range(_HALVINGS):
+        end = _with_step_share(run, end)
+        if run.settings.physics_dt is not None or not _shows_its_step(end):
+            return end
+        score = float(end.jacobian.residuals.score[0])
+        outcome = run.at_half_the_step(end.problem, end.x, score)
+        if outcome is None:
+            return end
+        end = replace(_reached(run, outcome), rates=end.rates)
+    return _with_step_share(run, end)
+
+
+def _with_step_share(run: Optimization, end: _End) -> _End:
+    run.progress.say("simulating with a finer step, to measure the part of the step")
+    physical = end.problem.space.to_physical(end.x)
+    return replace(end, without_step=change_without_step(end.problem, physical, end.jacobian.residuals))
+
+
+def _shows_its_step(end: _End) -> bool:
+    """Whether the physics step is a good part of what is above the noise."""
+    if end.times is None or end.is_far or end.times < _STEP_IN_DOUBT or end.without_step is None:
+        return False
+    there = end.jacobian.residuals
+    of_step = float(end.without_step.square().sum() / there.where.sum())
+    return of_step > _OF_THE_STEP * (float(there.score[0]) - noise_score(end.problem))
+
+
+def _with_prior(run: Optimization, end: _End) -> _End:
+    """What the recordings leave open is put to its prior, and the rest fitted again."""
+    return _at_prior(run, end, NEAR)
+
+
+def _silent_at_prior(run: Optimization, end: _End) -> _End:
+    """The same of what has no influence alone, which takes no fit."""
+    return _at_prior(run, end, None)
+
+
+def _at_prior(run: Optimization, end: _End, cfg: LeastSquaresCfg | None) -> _End:
+    left_open = undetermined(end.problem, end.x, end.uncertainty, end.is_far)
+    if not left_open:
+        return end
+    run.progress.say(f"fitting again with what the recordings do not determine at its prior: {len(left_open)} values")
+    x, left_open = held_at_prior(end.problem, end.x, end.uncertainty, left_open, cfg)
+    return replace(end.moved(run, x, left_open), left_open=left_open)
+
+
+def _perhaps_without_delay(run: Optimization, end: _End) -> _End:
+    """Set an insignificant delay to zero."""
+    x = without_delay(end.problem, end.x, end.uncertainty, end.left_open, NEAR)
+    return end if x is None else end.moved(run, x, [*end.left_open, DELAY])
+
+
+def _consistent(run: Optimization, end: _End) -> _End:
+    """Fit each recording alone, where there are several and the optimizer can afford it."""
+    if not run.settings.check_consistency or run.settings.optimizer == "cmaes":
+        return end
+    train = end.problem.dataset.train[end.residuals.step]
+    score = float(end.residuals.error[0].square()[train].sum(dim=1).mean())
+    result = check_consistency(end.problem, end.x, score, run.progress.say, end.jacobian)
+    if result.recordings:
+        run.folder.write_json("consistency.json", asdict(result))
+    return replace(end, consistency=result)
+
+
+_CHECKS = (_with_loop_rate, _with_step, _with_prior, _perhaps_without_delay, _consistent)
+"""What is checked of a result, in this order."""

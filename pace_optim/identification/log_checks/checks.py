@@ -1,0 +1,678 @@
+"""Cheap checks of recordings before a search: each names a cause that explains them, where as they are they do not fit.
+
+There is one method. A check changes the log, or one thing that the model takes for granted, and the torques' balance
+(:mod:`.balance`) is computed again. A change is named when the log as it is does not balance, and with the change it
+does. Changes add up: two joints may both be reversed.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from pace_actuators.text import listed
+from pace_optim.identification.log_checks.balance import Balance, Links, View, balances, views_of, without
+from pace_optim.identification.log_checks.imu import late, other_axes, other_units, stuck_contacts
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.recordings import tell_on_stderr
+
+_DOUBTED = 0.04
+"""Misfit from which a joint is looked at."""
+_LARGE = 0.3
+"""Misfit of a joint whose scale may be wrong, or whose torque a limit that is not stated."""
+_BETTER, _NOT_WORSE = 0.4, 0.8
+"""A change must leave at most so much of the misfit of the joints that it changes: in their geometric mean, of each."""
+_EXPLAINED = 0.12
+"""Misfit of a joint that is explained."""
+_WORTH = 0.6
+"""Of the misfits in a coarse look: a change that leaves more is not looked at further."""
+_TWICE = 1.8
+"""Smallest factor between units, or of a gear, that is named."""
+_LEAST_TRAVEL, _MOST_TRAVEL = 0.15, 7.0
+"""Of a joint in a recording that is fitted [rad]."""
+_SCALES = np.geomspace(1 / 200, 200, 27)
+_DIRECTIONS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+_SHARE = 0.02
+"""Part of a recording in which a limit must act to be named."""
+_COMMANDED = 0.05
+"""Travel of a command that moves a joint whose drive is on [rad, m]."""
+_FOLLOWED = 0.02
+"""Part of that travel which is no motion."""
+_FROZEN = 0.1
+"""Shortest standstill that is looked at [s]."""
+_ABRUPT = 3.0
+"""Of the largest change of a step elsewhere: one at an end of a standstill that was none."""
+_NUMERICAL = 1e-9
+"""Steps that are rounding [rad]."""
+_SPIKE = 3.0
+"""Of the steps that are larger than most: the two steps of a spike."""
+_TILT = 15.0
+"""Smallest turn of gravity that is named [degrees]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Change:
+    """Something that may be wrong with a recording, and the recording without it."""
+
+    joints: tuple[int, ...]
+    """Those that it explains."""
+    view: View
+    """The recording as it should be."""
+    text: str
+    """What was found, without the joints' names where ``{joints}`` stands, and the cure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What a check says of a recording."""
+
+    check: str
+    recordings: tuple[str, ...]
+    """In which it is found."""
+    joints: tuple[str, ...]
+    before: float | None
+    """Largest misfit of these joints as logged; ``None``: it is seen in the log by itself."""
+    after: float
+    """With the change."""
+    text: str
+    stops: bool
+    """Whether no fit of the log can be right."""
+
+    @property
+    def sentence(self) -> str:
+        """For a user."""
+        sure = (
+            ""
+            if self.before is None
+            else (
+                f" (So changed, the drives' torques fit the motion to {100 * self.after:.2g} %; as logged, to "
+                f"{100 * self.before:.2g} %.)"
+            )
+        )
+        return f"{listed(self.recordings)}: {self.text}{sure}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Evidence:
+    """A recording with how well it balances."""
+
+    view: View
+    links: Links
+    balance: dict[int, Balance]
+
+    @classmethod
+    def of(cls, view: View, before: Evidence | None = None, joints: Iterable[int] | None = None) -> Evidence:
+        """Of a recording; where only some joints have changed since, the others keep their balance."""
+        if before is None or not before.is_same_motion(view):
+            links = Links.of(view)
+            return cls(view=view, links=links, balance=balances(view, links, range(len(view.joints))))
+        changed = balances(view, before.links, range(len(view.joints)) if joints is None else joints)
+        return cls(view=view, links=before.links, balance={**before.balance, **changed})
+
+    def is_same_motion(self, view: View) -> bool:
+        """Whether another log has the same positions, so that the links move alike."""
+        own = self.view
+        return all(
+            getattr(view, name) is getattr(own, name)
+            for name in ("position", "gravity", "used", "frame", "free", "coarse")
+        )
+
+    def coarse(self) -> Evidence:
+        """The same at few instants."""
+        return Evidence.of(replace(self.view, coarse=True))
+
+    @property
+    def doubted(self) -> list[int]:
+        """Joints that do not balance, the worst first."""
+        return sorted(
+            (j for j, each in self.balance.items() if each.misfit > _DOUBTED),
+            key=lambda j: -self.balance[j].misfit,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One kind of fault."""
+
+    name: str
+    changes: Callable[[Any], Iterator[Change]]
+    """The changes that are worth trying."""
+    stops: bool
+
+
+def _column(series: np.ndarray, joint: int | list[int], values: np.ndarray) -> np.ndarray:
+    result = series.copy()
+    result[:, joint] = values
+    return result
+
+
+def _scaled(view: View, joints: list[int], measured: float | None, commanded: float | None) -> View:
+    """Some joints' measured or commanded series times a factor."""
+    changes: dict[str, Any] = {}
+    if measured is not None:
+        changes["position"] = _column(view.position, joints, measured * view.position[:, joints])
+    if commanded is not None:
+        changes["target"] = _column(view.target, joints, commanded * view.target[:, joints])
+        changes["target_vel"] = _column(view.target_vel, joints, commanded * view.target_vel[:, joints])
+        if abs(commanded) == 1.0:
+            changes["feed_forward"] = _column(view.feed_forward, joints, commanded * view.feed_forward[:, joints])
+    return replace(view, **changes)
+
+
+_SERIES = (
+    ((-1.0, None), "the positions (dof_pos)", "sign = -1 for its positions"),
+    ((None, -1.0), "the targets (des_dof_pos)", "sign = -1 for its commands"),
+    ((-1.0, -1.0), "positions and targets", "sign = -1 for both, or turn the joint's axis in the model"),
+)
+
+
+def _groups(evidence: Evidence) -> list[list[int]]:
+    """Joints that may share a fault: each that is doubted, and all."""
+    every = list(range(len(evidence.view.joints)))
+    return [[j] for j in evidence.doubted] + ([every] if len(every) > 1 and len(evidence.doubted) > 1 else [])
+
+
+def reversed_sign(evidence: Evidence) -> Iterator[Change]:
+    """Positions, targets or both run the other way than the model's axis."""
+    for joints in _groups(evidence):
+        for (measured, commanded), what, cure in _SERIES:
+            yield Change(
+                joints=tuple(joints),
+                view=_scaled(evidence.view, joints, measured, commanded),
+                text=f"{what} of {{joints}} have the opposite sign. In the column map, set {cure}.",
+            )
+
+
+def swapped(evidence: Evidence) -> Iterator[Change]:
+    """The columns of two joints are exchanged, in all series, the positions or the targets."""
+    view, doubted = evidence.view, evidence.doubted
+    for i, j in itertools.combinations(sorted(doubted), 2):
+        pair, other = [i, j], [j, i]
+        measured: dict[str, Any] = {"position": _column(view.position, pair, view.position[:, other])}
+        commanded: dict[str, Any] = {
+            key: _column(series, pair, series[:, other])
+            for key, series in (
+                ("target", view.target), ("target_vel", view.target_vel), ("feed_forward", view.feed_forward),
+            )
+        }  # fmt: skip
+        for changes, what in (
+            ({**measured, **commanded}, "all columns"), (measured, "the positions (dof_pos)"),
+            (commanded, "the targets (des_dof_pos)"),
+        ):  # fmt: skip
+            yield Change(
+                joints=(i, j),
+                view=replace(view, **changes),
+                text=f"{what} of {{joints}} are swapped. Exchange their names in the log or in its column map.",
+            )
+
+
+def scaled(evidence: Evidence) -> Iterator[Change]:
+    """Series are in another unit, or on the motor's side of a gear."""
+    view = evidence.view
+    for joints in _groups(evidence):
+        if max(evidence.balance[j].misfit for j in joints if j in evidence.balance) < _LARGE:
+            continue
+        measured, commanded = (
+            float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target)
+        )
+        for scales, positions, targets, what in (
+            (_both_scales(min(measured, commanded)), True, True, "positions and targets"),
+            (_scales_about(measured, commanded), True, False, "the positions (dof_pos)"),
+            (_scales_about(commanded, measured), False, True, "the targets (des_dof_pos)"),
+        ):
+            if not len(scales):
+                continue
+
+            def changed(
+                factor: float, joints: list[int] = joints, positions: bool = positions, targets: bool = targets
+            ) -> View:
+                return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
+
+            factor = _known(_least(evidence, changed, scales, joints))
+            if abs(np.log(factor)) > np.log(_TWICE):
+                yield Change(
+                    joints=tuple(joints),
+                    view=changed(factor),
+                    text=f"{what} of {{joints}} are {factor:.3g} times those of the joint. {_cure_of(factor)}",
+                )
+
+
+def _both_scales(travel: float) -> np.ndarray:
+    """Factors that leave a joint's travel one that is usual."""
+    return _SCALES[
+        (travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)
+    ]
+
+
+def _scales_about(one: float, other: float) -> np.ndarray:
+    """Factors about that between the travels of one series and another, where they differ."""
+    if min(one, other) <= 0 or abs(np.log(one / other)) < np.log(_TWICE):
+        return np.zeros(0)
+    return one / other * np.geomspace(0.3, 3.0, 7)
+
+
+_UNITS = (
+    (180 / np.pi, "degrees"), (np.pi / 180, "radians that were taken for degrees"), (1 / (2 * np.pi), "turns"),
+    (1000.0, "thousandths"), (0.001, "thousands"),
+)  # fmt: skip
+_NEAR = 0.05
+"""Relative distance within which a factor is that of a unit, or a gear's whole ratio."""
+
+
+def _known(factor: float) -> float:
+    """The factor of a unit or a gear that is nearest, if one is near."""
+    whole = round(factor) if factor > 1 else 1 / round(1 / factor)
+    known = [value for value, _ in _UNITS] + [float(whole)]
+    nearest = min(known, key=lambda value: abs(np.log(factor / value)))
+    return nearest if abs(factor / nearest - 1) < _NEAR else factor
+
+
+def _cure_of(factor: float) -> str:
+    for value, unit in _UNITS:
+        if factor == value:
+            return f"They are in {unit}: state the unit in the column map."
+    return f"They lie on the motor's side of a gear of {factor:.3g}: state gear_ratio in the column map."
+
+
+def wrapped_targets(evidence: Evidence) -> Iterator[Change]:
+    """Targets jump by a turn where the positions go on."""
+    view = evidence.view
+    at = np.arange(len(view.target))
+    for j in evidence.doubted:
+        position = np.interp(at, view.steps, view.position[:, j])
+        turns = np.round((position - view.target[:, j]) / (2 * np.pi))
+        if turns.any():
+            when = view.control_dt * float(np.flatnonzero(turns)[0])
+            yield Change(
+                joints=(j,),
+                view=replace(view, target=_column(view.target, j, view.target[:, j] + 2 * np.pi * turns)),
+                text=f"the targets of {{joints}} are wrapped: from {when:.3g} s on they differ by whole turns from the "
+                "positions. Apply numpy.unwrap to the targets.",
+            )
+
+
+_LONGER_THAN_HELD = 4
+"""Times the time for which a command is usually held: a target that stays at its end for longer is cut."""
+
+
+def clipped_targets(evidence: Evidence) -> Iterator[Change]:
+    """The log and the drive disagree on where targets end."""
+    view = evidence.view
+    for j in evidence.doubted:
+        target = view.target[:, j]
+        low, high = view.ranges[j]
+        if np.isfinite([low, high]).all() and (target.min() < low or target.max() > high):
+            yield Change(
+                joints=(j,),
+                view=replace(view, target=_column(view.target, j, np.clip(target, low, high))),
+                text=f"the drive of {{joints}} cuts its targets at the joint's range, {low:.4g} to {high:.4g}; the log "
+                "has them uncut. Cut des_dof_pos there.",
+            )
+        flat = _flat_ends(target)
+        if flat.any():
+            late = evidence.balance[j].delay + view.most_delay // 10 + 1
+            heard = np.convolve(flat, np.ones(late + 1), "full")[: len(flat)] > 0.5  # until the drive has heard others
+            yield Change(
+                joints=(j,),
+                view=without(view, heard[view.steps]),
+                text=f"the logged targets of {{joints}} are cut at {target.min():.4g} and {target.max():.4g}, first at "
+                f"{view.control_dt * float(np.flatnonzero(flat)[0]):.3g} s; the drive followed others. Log what it "
+                "gets, or leave these times out.",
+            )
+
+
+def _flat_ends(target: np.ndarray) -> np.ndarray:
+    """Where a target stays at its largest or smallest value for longer than commands are held, (G,) bool."""
+    begins = np.flatnonzero(np.diff(target, prepend=np.nan) != 0)
+    lengths = np.diff(begins, append=len(target))
+    stays = np.repeat(lengths > _LONGER_THAN_HELD * np.median(lengths), lengths)
+    return stays & ((target == target.max()) | (target == target.min()))
+
+
+def lifted_limits(evidence: Evidence) -> Iterator[Change]:
+    """The drive gives more than its stated limits."""
+    view = evidence.view
+    for j in evidence.doubted:
+        given, asked = view.given(j), view.asked(j)
+        if np.mean(np.abs(given - asked) > 1e-6 * np.abs(asked)) > _SHARE:
+            limits = {name: getattr(view, name).copy() for name in ("effort_limit", "saturation_effort")}
+            for values in limits.values():
+                values[j] = np.inf
+            yield Change(
+                joints=(j,),
+                view=replace(view, **limits),
+                text="{joints} gives the torque that is asked for, also where its stated limits would cut it. Correct "
+                "effort_limit, saturation_effort and velocity_limit.",
+            )
+
+
+def torque_limit(evidence: Evidence) -> Iterator[Change]:
+    """The drive gives no more than a torque that nobody states."""
+    view = evidence.view
+    for j in evidence.doubted:
+        if evidence.balance[j].misfit < 0.5 * _LARGE:
+            continue
+        most = np.quantile(np.abs(view.asked(j)), np.linspace(0.3, 0.995, 15))
+
+        def changed(limit: float, j: int = j) -> View:
+            limits = view.effort_limit.copy()
+            limits[j] = limit
+            return replace(view, effort_limit=limits)
+
+        limit = _least(evidence, changed, most, [j])
+        if limit < view.effort_limit[j] and np.mean(np.abs(view.asked(j)) > limit) > _SHARE:
+            yield Change(
+                joints=(j,),
+                view=changed(limit),
+                text=f"the torque of {{joints}} ends at about {limit:.3g} N m, stated is "
+                f"{_or_none(view.effort_limit[j])}. State effort_limit, or let it be sought: --unknown effort_limit.",
+            )
+
+
+def _or_none(limit: float) -> str:
+    return f"{limit:.3g} N m" if np.isfinite(limit) else "no limit"
+
+
+def turned_gravity(evidence: Evidence) -> Iterator[Change]:
+    """Gravity points elsewhere than in the model: the robot lies, or its base is tilted."""
+    few = evidence.coarse()
+    view, links = few.view, few.links
+    if view.frame is not None:
+        return
+    g = float(np.linalg.norm(view.gravity))
+    if not evidence.doubted or g == 0.0:
+        return
+    pull = np.stack(
+        [Links.of(replace(view, gravity=view.gravity + axis)).torque - links.torque for axis in np.eye(3)], axis=-1
+    )
+    judged = [j for j in few.balance if np.ptp(pull[:, j], axis=0).max() > 0]
+    free = balances(view, links, few.doubted, pull)
+    if not any(each.misfit < _WORTH * few.balance[j].misfit for j, each in free.items()):
+        return
+
+    def misfit(direction: np.ndarray) -> float:
+        gravity = g * direction / np.linalg.norm(direction)
+        turned = replace(links, torque=links.torque + pull @ (gravity - view.gravity))
+        found = balances(view, turned, judged)
+        return float(sum(np.log(each.misfit) for each in found.values()))
+
+    start = min(_DIRECTIONS, key=misfit)
+    found = minimize(misfit, start, method="Nelder-Mead", options={"maxfev": 60, "xatol": 1e-2, "fatol": 1e-2}).x
+    gravity = g * found / np.linalg.norm(found)
+    angle = float(np.degrees(np.arccos(np.clip(gravity @ view.gravity / g**2, -1, 1))))
+    if angle > _TILT:
+        yield Change(
+            joints=tuple(j for j in judged if j in evidence.doubted),
+            view=replace(evidence.view, gravity=gravity),
+            text=f"gravity points along ({', '.join(f'{v:.2f}' for v in gravity / g)}), {angle:.0f}° from the model's "
+            "direction: the robot lies or its base is tilted. Turn the base in the model, or its option gravity.",
+        )
+
+
+def imu_units(evidence: Evidence) -> Iterator[Change]:
+    """What the IMU shows is in other units."""
+    yield from _of_imu(evidence, other_units)
+
+
+def imu_axes(evidence: Evidence) -> Iterator[Change]:
+    """The IMU is turned, or its axes are exchanged."""
+    yield from _of_imu(evidence, other_axes)
+
+
+def _of_imu(evidence: Evidence, changed: Callable[[View], Iterator[tuple[View, str]]]) -> Iterator[Change]:
+    if joints := tuple(evidence.doubted):
+        for view, text in changed(evidence.view):
+            yield Change(joints=joints, view=view, text=text)
+
+
+def _of_base(view: View, evidence: Evidence) -> list[Finding]:
+    """What is seen of a base that moves once all else has been looked at: an IMU that is late, contacts that stick."""
+    result = []
+    if (found := late(evidence.view)) is not None:
+        change = Change(
+            joints=tuple(evidence.balance),
+            view=found[0],
+            text=f"the IMU is {1e3 * found[1]:.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
+            "Correct its time stamps.",
+        )
+        result.append(_finding(_LATE_IMU, change))
+    for joints, text in stuck_contacts(view, lambda: evidence.doubted):
+        result.append(_finding(_CONTACTS, Change(joints=tuple(joints), view=view, text=text)))
+    return result
+
+
+_LATE_IMU = Check(name="IMU delay", changes=lambda _: iter(()), stops=False)
+_CONTACTS = Check(name="contacts", changes=lambda _: iter(()), stops=False)
+
+
+def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
+    """The value of which the balance is best; refined between its neighbours."""
+    coarse = evidence.coarse()
+
+    def misfit(value: float, reference: Evidence) -> float:
+        view = replace(changed(float(np.exp(value))), coarse=reference.view.coarse)
+        links = reference.links if reference.is_same_motion(view) else Links.of(view)
+        return float(sum(np.log(each.misfit) for each in balances(view, links, joints).values()))
+
+    values = np.log(np.sort(values))
+    best = int(np.argmin([misfit(value, coarse) for value in values]))
+    bounds = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
+    fine = minimize_scalar(misfit, bounds=bounds, args=(evidence,), method="bounded", options={"maxiter": 12})
+    return float(np.exp(fine.x))
+
+
+def standstill(view: View) -> Iterator[Change]:
+    """The log shows no motion: the encoder is dead, or the drive off."""
+    travel = np.maximum(
+        np.ptp(view.target, axis=0), np.ptp(np.cumsum(view.target_vel, axis=0), axis=0) * view.control_dt
+    )
+    moved = np.ptp(view.smooth(view.position), axis=0)
+    still = [j for j in range(len(view.joints)) if travel[j] > _COMMANDED and moved[j] < _FOLLOWED * travel[j]]
+    dead = [j for j in still if np.ptp(view.position[:, j]) == 0.0]
+    for joints, what, cure in (
+        (dead, "never changes", "the encoder is dead or not logged, or the joint is blocked"),
+        ([j for j in still if j not in dead], "stands still", "the drive is off or too weak, or the joint is blocked"),
+    ):
+        for j in joints:
+            yield Change(
+                joints=(j,),
+                view=view,
+                text=f"the position of {{joints}} {what} while its command travels {travel[j]:.3g}: {cure}. Leave the "
+                "recording out, or log the joint.",
+            )
+
+
+def frozen_encoder(view: View) -> Iterator[Change]:
+    """A position keeps its value for a while; it stops, or goes on, more abruptly than anything else it does."""
+    shortest = max(5, round(_FROZEN / view.dt))
+    for j in range(len(view.joints)):
+        step = np.diff(view.position[:, j])
+        runs = [(a, b) for a, b in _runs(step == 0.0) if b - a >= shortest]
+        jerk = np.abs(np.diff(step, prepend=step[0], append=step[-1]))  # of sample k: between the steps around it
+        ends = [k for run in runs for k in run]
+        outside = np.ones(len(jerk), dtype=bool)
+        outside[[k for end in ends for k in (end - 1, end, end + 1) if k < len(jerk)]] = False
+        count = float(np.abs(step)[np.abs(step) > _NUMERICAL].min(initial=np.inf))  # of an encoder, at least
+        usual = max(float(jerk[outside].max(initial=0.0)), count)
+        frozen = [
+            (a, b)
+            for a, b in runs
+            if max(jerk[a], jerk[b]) > _ABRUPT * usual
+            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
+        ]
+        if not frozen:
+            continue
+        where = np.zeros(len(view.position), dtype=bool)
+        for a, b in frozen:
+            where[a : b + 1] = True
+        (a, b), more = frozen[0], len(frozen) - 1
+        yield Change(
+            joints=(j,),
+            view=without(view, where),
+            text=f"the position of {{joints}} is frozen from {a * view.dt:.4g} to {b * view.dt:.4g} s"
+            f"{f', and {more} times more' if more else ''}: it stops or goes on {max(jerk[a], jerk[b]) / usual:.0f} "
+            "times as abruptly as elsewhere. Cut the recording there.",
+        )
+
+
+def spikes(view: View) -> Iterator[Change]:
+    """Single positions lie far from their neighbours."""
+    for j in range(len(view.joints)):
+        position = view.position[:, j]
+        found = _spikes_of(position)
+        if found.any():
+            first = float(np.flatnonzero(found)[0] * view.dt)
+            at = np.arange(len(position))
+            yield Change(
+                joints=(j,),
+                view=replace(view, position=_column(view.position, j, np.interp(at, at[~found], position[~found]))),
+                text=f"{found.sum()} positions of {{joints}} are spikes, the first at {first:.4g} s. Leave those rows "
+                "out.",
+            )
+
+
+def _spikes_of(position: np.ndarray) -> np.ndarray:
+    """Up to three samples away from both neighbours, by steps that are large for the recording, (K,) bool."""
+    step = np.diff(position)
+    least = max(_SPIKE * float(np.quantile(np.abs(step), 0.98)), 0.01 * float(np.ptp(position)), 1e-3)
+    found = np.zeros(len(position), dtype=bool)
+    for a in np.flatnonzero(np.abs(step) > least):
+        for length in (1, 2, 3):
+            b = a + length
+            if b >= len(step) or a < 1 or b + 1 >= len(step):
+                break
+            there, back = step[a], step[b]
+            beside = max(abs(step[a - 1]), abs(step[b + 1]))
+            if (
+                there * back < 0
+                and abs(there + back) < 0.5 * abs(there)
+                and min(abs(there), abs(back)) > _SPIKE * beside
+            ):
+                found[a + 1 : b + 1] = True
+    return found
+
+
+def _runs(where: np.ndarray) -> list[tuple[int, int]]:
+    """Beginnings and ends of what is true without a break."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+SIGHTS = (
+    Check(name="standstill", changes=standstill, stops=True),
+    Check(name="frozen encoder", changes=frozen_encoder, stops=True),
+    Check(name="spikes", changes=spikes, stops=False),
+)
+"""What is seen in a log by itself."""
+CHECKS = (
+    Check(name="IMU units", changes=imu_units, stops=True),
+    Check(name="IMU axes", changes=imu_axes, stops=True),
+    Check(name="reversed sign", changes=reversed_sign, stops=True),
+    Check(name="swapped joints", changes=swapped, stops=True),
+    Check(name="wrapped targets", changes=wrapped_targets, stops=True),
+    Check(name="clipped targets", changes=clipped_targets, stops=True),
+    Check(name="lifted limits", changes=lifted_limits, stops=False),
+    Check(name="gravity", changes=turned_gravity, stops=False),
+    Check(name="torque limit", changes=torque_limit, stops=False),
+    Check(name="scale", changes=scaled, stops=True),
+)
+
+
+def explained(view: View) -> list[Finding]:
+    """What is wrong with a recording, change by change."""
+    findings = []
+    for check in SIGHTS:
+        for change in list(check.changes(view)):
+            findings.append(_finding(check, change))
+            view = replace(view, position=change.view.position, used=view.used & change.view.used)
+    before = evidence = Evidence.of(view)
+    named: list[tuple[Check, Change]] = []
+    for _ in range(2 * len(view.joints) + 1):
+        step = _best_change(evidence)
+        if step is None:
+            break
+        check, change, evidence = step
+        named.append((check, change))
+    for check, change in named:
+        misfits = [evidence.balance[j].misfit for j in change.joints if j in evidence.balance]
+        if misfits and max(misfits) < _EXPLAINED:
+            at_first = max(before.balance[j].misfit for j in change.joints if j in before.balance)
+            findings.append(_finding(check, change, at_first, max(misfits)))
+    return findings if view.frame is None else findings + _of_base(view, evidence)
+
+
+def _finding(check: Check, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
+    names = tuple(change.view.joints[j] for j in sorted(change.joints))
+    return Finding(
+        check=check.name, recordings=(change.view.name,), joints=names, before=before, after=after,
+        text=change.text.format(joints=listed(names, 6)), stops=check.stops,
+    )  # fmt: skip
+
+
+def _best_change(evidence: Evidence) -> tuple[Check, Change, Evidence] | None:
+    """The change that explains most; the first after which nothing is doubted."""
+    best: tuple[float, Check, Change, Evidence] | None = None
+    coarse = evidence.coarse()
+    for check in CHECKS:
+        for change in check.changes(evidence):
+            if not _may_explain(coarse, change):
+                continue
+            after = Evidence.of(change.view, evidence, change.joints)
+            gain = _gain(evidence, after, change)
+            if gain > 0 and (best is None or gain > best[0]):
+                best = gain, check, change, after
+                if not after.doubted:
+                    return best[1:]
+    return None if best is None else best[1:]
+
+
+def _may_explain(coarse: Evidence, change: Change) -> bool:
+    """Whether a change helps its own joints at the few instants that are looked at first."""
+    view = replace(change.view, coarse=True)
+    links = coarse.links if coarse.is_same_motion(view) else Links.of(view)
+    found = balances(view, links, change.joints)
+    ratio = [each.misfit / coarse.balance[j].misfit for j, each in found.items() if j in coarse.balance]
+    return bool(ratio) and bool(np.exp(np.mean(np.log(ratio))) < _WORTH)
+
+
+def _gain(before: Evidence, after: Evidence, change: Change) -> float:
+    """By how much a change explains a recording better, in natural logarithms of misfits; 0 if it does not count."""
+    both = [j for j in before.balance if j in after.balance]
+    ratio = {j: after.balance[j].misfit / before.balance[j].misfit for j in both}
+    own = [ratio[j] for j in change.joints if j in ratio]
+    if not own or max(own) > _NOT_WORSE or np.exp(np.mean(np.log(own))) > _BETTER:
+        return 0.0
+    return -float(sum(np.log(ratio[j]) for j in both))
+
+
+def check_log(problem: Problem) -> list[Finding]:
+    """What is wrong with the recordings of a problem; the same of several is said once."""
+    merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
+    for view in views_of(problem):
+        for finding in explained(view):
+            merged.setdefault((finding.check, finding.joints), []).append(finding)
+    return [replace(each[0], recordings=tuple(f.recordings[0] for f in each)) for each in merged.values()]
+
+
+def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] = tell_on_stderr) -> Problem:
+    """The problem with what is wrong with its log among its contradictions.
+
+    Args:
+        problem: What is to be fitted.
+        trust: Whether a log that no fit can be right of is only warned of.
+        tell: Is told the warnings.
+
+    Raises:
+        ValueError: If no fit of the log can be right.
+    """
+    found = check_log(problem)
+    if (wrong := [each.sentence for each in found if each.stops]) and not trust:
+        raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
+    for each in found:
+        tell(f"warning: {each.sentence} [W3]")
+    return replace(problem, contradictions=(*problem.contradictions, *(f"{each.sentence} [W3]" for each in found)))

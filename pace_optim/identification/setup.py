@@ -1,0 +1,105 @@
+"""What a fit begins with: its problem, and what searches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.convergence import stop_rule
+from pace_optim.estimate.own_objective import Objective, build, optimizer_class
+from pace_optim.estimate.way_down import WayDownCfg
+from pace_optim.identification.log_checks import checked
+from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.problem import Problem
+from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
+from pace_optim.problem.try_out import check_size, try_out
+from pace_optim.run.open import problem_of
+from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.processes import Processes
+
+_HYBRID_POPULATION = 48
+"""Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+
+
+def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
+    """Read everything, refuse what cannot be fitted, and try the simulation out.
+
+    Args:
+        settings: What to fit, and how.
+        env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
+        told: Whether an earlier run has told how the recordings are understood.
+
+    Raises:
+        ValueError: If anything does not fit.
+    """
+    both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
+    if both:
+        raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
+    problem = checked(problem_of(settings, env_cfg, told), settings.trust_log, tell_nobody if told else tell_on_stderr)
+    if problem.dataset.num_recordings * 4 > settings.num_envs and settings.only_searches:
+        raise ValueError(
+            f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "
+            f"least {4 * problem.dataset.num_recordings}, 4 candidates on each recording."
+        )
+    if not bool((problem.space.upper > problem.space.lower).any()):
+        raise ValueError("The bounds of every parameter are equal: there is nothing to identify. Widen bounds.")
+    try_out(problem)
+    search_settings(problem, settings)  # refuses stop rules and objectives that cannot be used
+    if settings.device != "cpu":
+        problem.for_search(settings.device).make_env(1).close()
+    if settings.optimizer != "least_squares":  # which chooses how much it simulates at once
+        simulated = search_population(problem, settings) * len(problem.dataset.trained())
+        check_size(problem, simulated, settings.num_envs)
+    return problem
+
+
+def search_settings(problem: Problem, settings: FitSettings) -> CMAESOptimizerCfg:
+    """The search's own settings: the robot's, with what a fit asks for.
+
+    Raises:
+        ValueError: If there is no such stop rule, or an objective of the user's own fails.
+    """
+    asked = {name: getattr(settings, name) for name in ("max_iteration", "epsilon", "sigma")}
+    cfg = CMAESOptimizerCfg.of(problem.env_cfg.sim2real)
+    cfg = replace(
+        cfg,
+        per_tree=cfg.per_tree and not settings.joint_strategy,
+        save_optimization_process=cfg.save_optimization_process or settings.save_optimization_process,
+        stop=settings.stop or cfg.stop,
+        **{name: value for name, value in asked.items() if value is not None},
+    )
+    for rule in cfg.stop:
+        stop_rule(rule)
+    if settings.has_own_objective and Objective(optimizer_class(settings.optimizer), problem).joins_joints:
+        cfg = replace(cfg, per_tree=False)
+    return cfg
+
+
+def search_population(problem: Problem, settings: FitSettings) -> int:
+    """Candidates in a generation; a hybrid takes all of ``num_envs`` on a GPU alone."""
+    population = max(4, settings.num_envs // len(problem.dataset.trained()))
+    is_small = settings.optimizer == "hybrid" and settings.device == "cpu"
+    return min(population, _HYBRID_POPULATION) if is_small else population
+
+
+def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
+    """The search of a fit."""
+    return build(
+        optimizer_class(settings.optimizer) if settings.has_own_objective else CMAESOptimizer,
+        problem,
+        search_population(problem, settings),
+        search_settings(problem, settings),
+        trees=problem.trees,
+        seed=settings.seed,
+        start=problem.space.start,
+        processes=processes,
+    )
+
+
+def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
+    """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
+    if settings.optimizer == "hybrid":
+        problem = problem.on_pieces(WayDownCfg().share)
+    return problem.training_evaluator()

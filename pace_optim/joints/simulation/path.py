@@ -1,0 +1,341 @@
+"""The motion of the whole robot in a reference simulation, and what each joint feels along it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+import torch
+
+from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
+from pace_envs.tasks.pace import GLOBAL
+from pace_optim.joints.simulation.joint_load import JointLoad, Links, LoadChange, Motion
+from pace_optim.joints.simulation.measured_motion import at_every_step, beside_simulation
+from pace_optim.problem.free_phases import FreePhases
+from pace_optim.problem.problem import Problem
+from pace_optim.recording.moving_base import Carried
+
+if TYPE_CHECKING:
+    from pace_optim.problem.rollout import Rollout
+
+_STEP = 1e-4
+"""Change of a position for a derivative [rad]."""
+_STIFFNESS_EVERY = 8
+"""The derivative of the torque varies slowly: it is computed at every so many control steps."""
+_SPAN = 0.02
+"""Accelerations are differences of slopes over so much time before and after [s]: measured positions have noise."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReferencePath:
+    """A reference simulation of R recordings at T control steps."""
+
+    position: torch.Tensor
+    """(T, R, n) [rad]."""
+    feel: JointLoad
+    stiffness: torch.Tensor
+    """Derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
+    model_effects: dict[tuple[str, str], LoadChange]
+    """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
+    columns: torch.Tensor
+    """The joints' degrees of freedom in the model, (n,)."""
+    control_dt: float
+    """[s]."""
+    phases: FreePhases | None = None
+    """What is not known of the free phases of each joint; ``None`` where all bases rest."""
+
+    def typical_effort(self, armature: torch.Tensor) -> torch.Tensor:
+        """RMS torque that moves each joint and holds its load, (n,) [N m].
+
+        Args:
+            armature: (n,) [kg m²].
+        """
+        return self.effort(armature).square().mean(dim=(0, 1)).sqrt()
+
+    def effort(self, armature: torch.Tensor) -> torch.Tensor:
+        """Torque that moves each joint and holds its load, (T', R, n) [N m]; the first and last steps are left out.
+
+        Args:
+            armature: (n,) [kg m²].
+        """
+        q, span = self.position, self._span
+        acceleration = (q[2 * span :] - 2 * q[span:-span] + q[: -2 * span]) / (span * self.control_dt) ** 2
+        inertia, torque = (each[span : span + len(acceleration)] for each in (self.feel.inertia, self.feel.torque))
+        return (inertia + armature) * acceleration - torque
+
+    def speed(self) -> torch.Tensor:
+        """At the same steps, (T', R, n) [rad/s]."""
+        return (self.position[2 * self._span :] - self.position[: -2 * self._span]) / (2 * self._span * self.control_dt)
+
+    def load(self) -> torch.Tensor:
+        """What the drives are told of their load at the same steps, (T', R, n) [N m]."""
+        return self.feel.load[self._span : len(self.position) - self._span]
+
+    @property
+    def _span(self) -> int:
+        """Steps over which differences are taken."""
+        return max(1, min(round(_SPAN / self.control_dt), (len(self.position) - 1) // 2))
+
+    def on_joints(self, joints: Sequence[int]) -> ReferencePath:
+        """Of some of the joints, by index."""
+        chosen = list(joints)
+        phases = None if self.phases is None else self.phases.on_joints(chosen)
+        return self._part((..., chosen), columns=self.columns[chosen], phases=phases)
+
+    def select(self, recordings: Sequence[int]) -> ReferencePath:
+        """Some of the recordings, by index."""
+        phases = None if self.phases is None else self.phases.select(recordings)
+        return self._part((slice(None), list(recordings)), phases=phases)
+
+    def at(self, step: torch.Tensor, recording: torch.Tensor) -> ReferencePath:
+        """Parts of the recordings: of each (W,) those control steps (T', W); where there are none, the last one."""
+
+        def of(values: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
+            return values[steps.clamp(max=len(values) - 1), recording]
+
+        intervals = step[:-1]
+        return replace(
+            self,
+            position=of(self.position, step),
+            feel=self.feel.map(lambda each: of(each, intervals)),
+            stiffness=of(self.stiffness, intervals),
+            model_effects={key: feel.map(lambda each: of(each, intervals)) for key, feel in self.model_effects.items()},
+        )
+
+    def _part(self, index: tuple, **changes: Any) -> ReferencePath:
+        return replace(
+            self,
+            position=self.position[index],
+            feel=self.feel.map(lambda each: each[index]),
+            stiffness=self.stiffness[index],
+            model_effects={key: feel.map(lambda each: each[index]) for key, feel in self.model_effects.items()},
+            **changes,
+        )
+
+
+def reference_path(
+    problem: Problem,
+    physical: torch.Tensor,
+    model_effects: Sequence[str] = (),
+    late: torch.Tensor | None = None,
+    away: float = math.inf,
+) -> ReferencePath:
+    """Simulate a candidate on all recordings, and compute what each joint feels on its way.
+
+    Where the robot was measured elsewhere, joints that have neighbours are taken there: what a joint's neighbours do to
+    it is what they did, not what the candidate lets them do.
+
+    Args:
+        problem: The problem; its own effects count too.
+        physical: The candidate's physical parameters, (size,).
+        model_effects: Effects on the rigid-body model whose influence is wanted.
+        late: Joints that are not taken there, (n,) bool: it may be their log that is late. ``None``: no joint.
+        away: Nor are those that are further from it than this, RMS over a recording [rad]: gravity is not linear in
+            between.
+    """
+    problem, values = _on_all_joints(problem, physical, model_effects)
+    rollout = _begun(problem, values)
+    moved: list[torch.Tensor] = []
+
+    def noted(steps: int) -> Iterable[torch.Tensor]:
+        shown, *moved[:] = rollout.motion(steps)
+        return shown
+
+    shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
+    positions, speeds = (each[: len(shown)].clone() for each in moved)
+    motion = positions, speeds
+    if problem.joints_stand_alone:
+        return _along(problem, values, model_effects, rollout, *motion)
+    beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
+    share = 1.0 if problem.dataset.carried is None else _share_of_free(problem.dataset.carried, len(beside))
+    beside *= (beside.square().mean(dim=0, keepdim=True) / share).sqrt() <= away
+    if late is not None:
+        beside[..., late] = 0.0
+    return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
+
+
+def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
+    """What each joint feels along the measured motion, straight between samples.
+
+    For robots whose joints have no neighbours, and all have drives: what those feel depends on their position only.
+
+    Args:
+        problem: The problem, without effects.
+        physical: A candidate's physical parameters, (size,); its encoder biases count.
+        model_effects: Effects on the rigid-body model whose influence is wanted.
+    """
+    problem, values = _on_all_joints(problem, physical, model_effects)
+    rollout = _begun(problem, values)
+    sim, steps = rollout.env.sim, rollout.duration_steps
+    positions, speeds = sim.qpos.repeat(steps, 1, 1), torch.zeros(steps, *sim.qvel.shape, dtype=torch.float64)
+    positions[..., rollout.robot.qpos_columns] = _biases(problem, values) + at_every_step(
+        problem.dataset, problem.dataset.measured.numpy(), steps
+    )
+    return _along(problem, values, model_effects, rollout, positions, speeds)
+
+
+def _biases(problem: Problem, values: dict[str, dict[str, float]]) -> torch.Tensor:
+    """Encoder biases of a candidate, (n,) [rad]."""
+    return torch.tensor([values["encoder_bias"][name] for name in problem.joint_names], dtype=torch.float64)
+
+
+def _taken(
+    rollout: Rollout, positions: torch.Tensor, speeds: torch.Tensor, beside: torch.Tensor, dt: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A motion with its driven joints moved by (T, R, n) [rad]; those without drives follow."""
+    robot = rollout.robot
+    faster = torch.gradient(beside, spacing=dt, dim=0)[0]
+    if (carried := rollout.dataset.carried) is not None:
+        faster = _within_phases(beside, faster, carried.free[: len(beside)], dt)
+    if robot.closed_loops is None:
+        positions[..., robot.qpos_columns] += beside
+        speeds[..., robot.dof_columns] += faster
+        return positions, speeds
+    model, columns, moved = rollout.env.sim.model, robot.dof_columns.numpy(), np.empty(positions.shape[-1])
+    for k, r in np.ndindex(positions.shape[:2]):
+        moved[:] = positions[k, r]
+        follow = robot.closed_loops.following(moved)[:, columns]
+        mujoco.mj_integratePos(model, moved, follow @ beside[k, r].numpy(), 1.0)
+        positions[k, r] = torch.from_numpy(moved)
+        speeds[k, r] += torch.from_numpy(follow @ faster[k, r].numpy())
+    return positions, speeds
+
+
+def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
+    """One candidate at the beginning of all recordings."""
+    rollout, space = problem.evaluator().rollout(1), problem.space
+    own = {
+        p.name: {key: values[p.name][key] for key in p.keys} for p in space.parameters
+    }  # some mean nothing on slides
+    rollout.start(space.from_dict(own)[None], problem.dataset.sampled)
+    return rollout
+
+
+def _along(
+    problem: Problem,
+    values: dict[str, dict[str, float]],
+    model_effects: Sequence[str],
+    rollout: Rollout,
+    positions: torch.Tensor,
+    speeds: torch.Tensor,
+) -> ReferencePath:
+    """What each joint feels along a motion of all, (T, R, nq) and (T, R, nv); closes the rollout's environment."""
+    carried = problem.dataset.carried
+    motion = Motion.between(positions, speeds, problem.control_dt, carried)
+    phases = None
+    if carried is not None:
+        evaluator = problem.evaluator()
+        own = {p.name: {key: values[p.name][key] for key in p.keys} for p in problem.space.parameters}
+        phases = evaluator.free_phases(problem.space.from_dict(own)).of_single_joints()
+    links = Links.of(rollout.env)
+    whole = feel = links.feel(motion)
+    whole_stiffness = torch.zeros_like(whole.torque)
+    for moved in _one_of_each_tree(problem):
+        whole_stiffness[..., moved] = _stiffness(links, motion, whole, moved)
+    stiffness = whole_stiffness
+    changes = {}
+    for name in model_effects:
+        for parameter in get_effect(name).parameters:
+            now = torch.tensor(list(values[f"{name}.{parameter.name}"].values()), dtype=torch.float64)
+            change = _change(problem, rollout, name, parameter.name, now, motion, whole, whole_stiffness)
+            feel = feel.less(change, now)  # each twin has its own part of the effect itself; its neighbours' stays
+            stiffness = stiffness - now * change.stiffness
+            changes[name, parameter.name] = change
+    rollout.env.close()
+    return ReferencePath(
+        position=positions[..., rollout.robot.qpos_columns],
+        feel=feel,
+        stiffness=stiffness,
+        model_effects=changes,
+        columns=rollout.robot.dof_columns,
+        control_dt=problem.control_dt,
+        phases=phases,
+    )
+
+
+def _share_of_free(carried: Carried, steps: int) -> torch.Tensor:
+    """In which part of the time each joint is free, (R, n)."""
+    return carried.free[:steps].double().mean(dim=0).clamp(min=1e-9)
+
+
+def _within_phases(values: torch.Tensor, slope: torch.Tensor, free: torch.Tensor, dt: float) -> torch.Tensor:
+    """Slopes of values (T, R, n) without what jumps where a free phase begins or ends."""
+    ahead = torch.zeros_like(values)
+    ahead[:-1] = (values[1:] - values[:-1]) / dt
+    begins, ends = torch.ones_like(free), torch.ones_like(free)
+    begins[1:], ends[:-1] = ~free[:-1], ~free[1:]
+    behind = torch.cat([torch.zeros_like(ahead[:1]), ahead[:-1]])
+    result = torch.where(ends, behind, torch.where(begins, ahead, slope))
+    return result * (free & ~(begins & ends))
+
+
+def _on_all_joints(
+    problem: Problem, physical: torch.Tensor, effects: Sequence[str]
+) -> tuple[Problem, dict[str, dict[str, float]]]:
+    """The problem with these effects on all joints, and the same candidate there: null where it did not have them."""
+    names, values = problem.joint_names, problem.space.to_dict(physical)
+    had = {cfg.effect_class.name: cfg for cfg in effect_cfgs(problem.env_cfg.sim2real.effects)}
+    for effect in effects:
+        joints = had[effect].joints(names) if effect in had else []
+        for parameter in get_effect(effect).parameters:
+            own = values.get(key := f"{effect}.{parameter.name}", {})
+            null = parameter.start if parameter.null is None else parameter.null
+            values[key] = {j: own.get(j, own.get(GLOBAL, null)) if j in joints else null for j in names}
+    others = [cfg for name, cfg in had.items() if name not in effects]
+    return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
+
+
+def _stiffness(links: Links, motion: Motion, feel: JointLoad, joints: Sequence[int]) -> torch.Tensor:
+    """Derivative of f_j - M_j a_j by the joint's own position of joints of which none moves another, (T, R, joints)."""
+    steps, motion, at = (
+        len(motion.qpos),
+        motion.every(_STIFFNESS_EVERY),
+        feel.map(lambda each: each[::_STIFFNESS_EVERY]),
+    )
+    there = links.feel(motion.moved(links.shifts(motion, joints, _STEP)))
+    change = (there.torque - at.torque) - (there.inertia - at.inertia) * motion.qacc[..., links.columns]
+    return (change[..., joints] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
+
+
+def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:
+    """Joints that can be changed at once because none moves another, until all have been."""
+    names = problem.joint_names
+    for i in range(max(len(tree) for tree in problem.trees)):
+        yield [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
+
+
+def _change(
+    problem: Problem,
+    rollout: Rollout,
+    effect: str,
+    parameter: str,
+    now: torch.Tensor,
+    motion: Motion,
+    whole: JointLoad,
+    stiffness: torch.Tensor,
+) -> LoadChange:
+    """What a unit of a parameter of an effect on the model changes of each joint's own feel.
+
+    Measured between what the joint has, ``now`` (n,), and null, or where it has null, a probe.
+    """
+    robot = rollout.robot
+    probe = torch.full_like(now, probe_points(get_effect(effect))[0][parameter])
+    other = torch.where(now == 0, probe, 0.0)
+    fields = {"inertia": whole.inertia, "torque": whole.torque, "load": whole.load, "stiffness": stiffness}
+    changes = {field: torch.zeros_like(value) for field, value in fields.items()}
+    for moved in _one_of_each_tree(problem):
+        values = now.clone()
+        values[moved] = other[moved]
+        robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
+        links = Links.of(rollout.env)
+        felt = links.feel(motion)
+        there = vars(felt) | {"stiffness": torch.zeros_like(stiffness)}
+        there["stiffness"][..., moved] = _stiffness(links, motion, felt, moved)
+        for field, value in fields.items():
+            changes[field][..., moved] = ((there[field] - value) / (other - now))[..., moved]
+    robot.write_effect_parameter_to_sim(effect, parameter, now.expand(robot.num_envs, -1))
+    return LoadChange(**changes)

@@ -1,0 +1,1 @@
+"""Which motion to record: the signals, and the design of a session."""
