@@ -18,8 +18,8 @@ def main() -> None:
     colouring = colour(problem.space, problem.trees, problem.joint_names)
 
     def way(**options):
-        pieces, fine = (each.on_pieces(0.5).training_evaluator() for each in (coarse, problem))
-        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, fine=fine, **options)
+        pieces = problem.on_pieces(0.5).training_evaluator()
+        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
 
     kept: list = []
     whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))

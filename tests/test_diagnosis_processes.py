@@ -18,7 +18,7 @@ from pace_optim.diagnosis.candidates.screening import screen
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.model import BASE, JointModel, start_values
-from pace_optim.problem import forked as processes
+from pace_optim.terminal import parallel as processes
 from pace_optim.terminal.parallel import parallel_map
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
@@ -136,7 +136,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     script.write_text(
         "import os, sys\n"
         "from pace_actuators.effects import get_effect\n"
-        "from pace_optim.problem import forked as processes\n"
+        "from pace_optim.terminal import parallel as processes\n"
         "processes.available_processors = lambda: 2\n"
         "here = os.getpid()\n"
         "def work(own):\n"

@@ -14,7 +14,7 @@ from problems import BENCH, TRUTH, chirp, record
 import pace_optim.identification.fit as fit_module
 from pace_envs import load_env_cfg
 from pace_optim.estimate.way_down import WayDown
-from pace_optim.identification import conclusion
+from pace_optim.identification import conclude
 from pace_optim.identification.fit import fit, resume
 from pace_optim.identification.optimization import Optimization
 from pace_optim.identification.setup import load_for_fit
@@ -336,9 +336,9 @@ def test_a_result_is_written_before_it_is_checked_and_an_interrupted_check_leave
         raise KeyboardInterrupt
 
     written = []
-    monkeypatch.setattr(conclusion, "change_without_step", interrupted)
+    monkeypatch.setattr(conclude, "change_without_step", interrupted)
     result, folder = run(tmp_path, recordings["noisy"], optimizer="least_squares")
-    assert result.stop_reasons[-1] == conclusion.CHECKS_INTERRUPTED
+    assert result.stop_reasons[-1] == conclude.CHECKS_INTERRUPTED
     assert written[0].parameters == FitResult.load(folder).parameters == result.parameters
     assert (folder / "best_trajectory.pt").is_file()
     with pytest.raises(KeyboardInterrupt):
@@ -408,7 +408,7 @@ def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, mo
     assert "error, all joints" in first and "armature" in first
 
 
-def test_a_descent_begins_at_the_longest_step_that_the_drives_allow(tmp_path):
+def test_derivatives_are_taken_at_the_longest_step_that_the_drives_allow(tmp_path):
     (tmp_path / "stiff.xml").write_text(
         '<mujoco model="stiff"><compiler angle="radian"/><worldbody><body>'
         '<joint name="j" axis="0 1 0" range="-2 2"/>'
@@ -421,5 +421,5 @@ def test_a_descent_begins_at_the_longest_step_that_the_drives_allow(tmp_path):
     run = Optimization(
         settings, load_for_fit(settings, load_env_cfg(settings.task)), RunFolder(tmp_path), ProgressLine()
     )
-    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.way.pieces))
+    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.evaluator._nearby))
     assert fine < coarse == 0.0025

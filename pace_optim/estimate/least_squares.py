@@ -3,7 +3,8 @@
 An iteration looks around x, which gives J, H = JᵀJ, g = Jᵀr and the simulation's noise (``derivatives``), and tries
 steps at several dampings (``levenberg_marquardt``). A look costs as many simulations as a tree has parameters, a step a
 few: so the iteration goes on with the same J, and g = Jᵀr of its best trial, as long as that pays (Shamanskii's method;
-Ortega and Rheinboldt, 1970, 10.2). H, g and x are all that the next one needs: a descent that is resumed is the one
+Ortega and Rheinboldt, 1970, 10.2). J may be of a longer physics step than r: it says where to go, r how far that is
+good. H, g and x are all that the next one needs: a descent that is resumed is the one
 that was interrupted, bit for bit.
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
@@ -133,15 +134,15 @@ class Descent(DescentState):
             return self.hessian, self.gradient, self.jacobian
         around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
-        residuals = evaluator.residuals(evaluator.space.to_physical(vectors), where)
+        here, residuals = evaluator.look_around(evaluator.space.to_physical(vectors), where)
         self.simulations += len(vectors)
-        score = float(residuals.score[0])
+        score = float(here.score[0])
         if not self.scores and math.isfinite(score):
             self.scores = [score]
         elif renewed and math.isfinite(score):  # by what is known of phases here
             self.scores[-1] = score
         self.noise = around.noise(residuals)
-        jacobian = around.jacobian(residuals)
+        jacobian = replace(around.jacobian(residuals), residuals=here)
         self.hessian, self.gradient = jacobian.normal_equations()
         return self.hessian, self.gradient, jacobian
 

@@ -1,11 +1,12 @@
 """The way of a fit from its starts to its result.
 
-1. Descend on pieces: windows of two seconds, a share of each recording, at the longest stable physics step. Over a
-   short time the error bends less, and has fewer valleys.
-2. Go on at the fit's own step, where that is finer: what a long step leaves is no wrong valley.
-3. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
+1. Descend on pieces: windows of two seconds, a share of each recording. Over a short time the error bends less, and
+   has fewer valleys.
+2. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
    simulate a stated multiple of what the descents took. Descend again from its best.
-4. Descend on the whole recordings from the end that is best there.
+3. Descend on the whole recordings from the end that is best there.
+
+Residuals are those of the fit's own physics step. Derivatives, and the search, take the longest stable one.
 
 A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
 physics is missing, the fit ends early.
@@ -22,7 +23,7 @@ from pace_optim.estimate.derivatives import Colouring
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.evaluator import Evaluator
 
-PIECES, FINE, WHOLE = "pieces", "fine pieces", "whole"
+PIECES, WHOLE = "pieces", "whole"
 """The stages of descents, in this order; their names may begin with more."""
 
 
@@ -57,7 +58,6 @@ class WayDown:
         colouring: Colouring,
         *,
         pieces: Evaluator | None = None,
-        fine: Evaluator | None = None,
         noise_score: float = 0.0,
         cfg: WayDownCfg | None = None,
         on_iteration: Callable[[Sequence[Descent]], None] | None = None,
@@ -69,7 +69,6 @@ class WayDown:
             evaluator: Simulates the whole recordings.
             colouring: Which entries are perturbed together.
             pieces: Simulates the pieces; ``None``: the whole recordings are the pieces.
-            fine: Simulates the pieces at the step of the whole recordings; ``None``: ``pieces`` does.
             noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
             cfg: Numbers of the stages.
             on_iteration: Called with the stage's descents after each iteration.
@@ -78,12 +77,11 @@ class WayDown:
         self.cfg = cfg or WayDownCfg()
         self.evaluator = evaluator
         self.pieces = pieces or evaluator
-        self.fine = fine
         self.colouring = colouring
         self.noise_score = noise_score
         self.descents: list[Descent] = []
         """All so far, in the order in which they began."""
-        self.stages = f"{name}{PIECES}", f"{name}{FINE}", f"{name}{WHOLE}"
+        self.stages = f"{name}{PIECES}", f"{name}{WHOLE}"
         self._on_iteration = on_iteration or (lambda _: None)
 
     def run(
@@ -99,19 +97,17 @@ class WayDown:
             scan: Gives another start by the best end so far, or none.
             search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
         """
-        whole = self.stages[-1]
+        pieces, whole = self.stages
         if not self._of(whole):
             starts = list(starts)
-            rounds = 1
-            best = self._on_pieces(starts, rounds)
+            best = self._on_pieces(starts)
             if (found := scan(best.x)) is not None:
                 starts.append(found)
-                rounds += 1
-                best = self._on_pieces(starts, rounds)
+                best = self._on_pieces(starts)
             if search is not None and self.is_far(best.score):
-                spent = sum(d.simulations for d in self._of(self.stages[0])[: len(starts)])
+                spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
                 starts.append(search(round(self.cfg.search_budget * spent)))
-                self._on_pieces(starts, rounds + 1)
+                self._on_pieces(starts)
             self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])
 
@@ -129,20 +125,11 @@ class WayDown:
         """A stage's descents so far."""
         return [d for d in self.descents if d.stage == stage]
 
-    def _on_pieces(self, starts: Sequence[torch.Tensor], rounds: int) -> Descent:
-        """Descend on pieces, and from the best end at the finer step; returns the best end at the finest step.
-
-        Args:
-            starts: Of all rounds so far.
-            rounds: How many these are; each has one descent at the finer step.
-        """
-        pieces, fine, _ = self.stages
+    def _on_pieces(self, starts: Sequence[torch.Tensor]) -> Descent:
+        """Descend on pieces from those starts that are new; returns the best end of all so far."""
+        pieces = self.stages[0]
         self._descend(pieces, [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=pieces) for x in starts])
-        best = min(self._of(pieces)[: len(starts)], key=lambda d: d.score)
-        if self.fine is None:
-            return best
-        self._descend(fine, [*self._of(fine)[: rounds - 1], Descent(x=best.x.clone(), stage=fine)])
-        return min(self._of(fine)[:rounds], key=lambda d: d.score)
+        return min(self._of(pieces)[: len(starts)], key=lambda d: d.score)
 
     def _descend(self, stage: str, starts: Sequence[Descent], cfg: LeastSquaresCfg | None = None) -> Descent:
         """Let a stage's descents end, those of its starts that are new among them; returns the best."""
@@ -151,13 +138,12 @@ class WayDown:
         own, self.descents = [*own, *added], [*self.descents, *added]
         on_whole = stage == self.stages[-1]
         cfg = cfg or (self.cfg.on_whole if on_whole else self.cfg.on_pieces)
-        evaluators = dict(zip(self.stages, (self.pieces, self.fine or self.pieces, self.evaluator), strict=True))
-        cfg = replace(cfg, noise_score=self.noise_score)
-        return least_squares(evaluators[stage], self.colouring, own, cfg, self._on_iteration)[0]
+        cfg, evaluator = replace(cfg, noise_score=self.noise_score), self.evaluator if on_whole else self.pieces
+        return least_squares(evaluator, self.colouring, own, cfg, self._on_iteration)[0]
 
     def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
         """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""
-        ends = [d for stage in self.stages[:2] for d in self._of(stage)]
+        ends = self._of(self.stages[0])
         vectors = torch.stack([*(d.x for d in ends), *starts])
         scores = self.evaluator.residuals(self.evaluator.space.to_physical(vectors)).score
         best = int(scores.argmin())

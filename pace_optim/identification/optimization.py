@@ -106,13 +106,11 @@ class Optimization:
 
     def _course(self, problem: Problem, name: str = "") -> _Course:
         """A way down with this problem, as far as an interrupted run had gone it."""
-        evaluator, fine = problem.training_evaluator(), problem.on_pieces(WayDownCfg().share)
-        pieces = fine.for_search()
+        evaluator, pieces = problem.training_evaluator(), problem.on_pieces(WayDownCfg().share)
         way = WayDown(
             evaluator,
             self.colouring,
             pieces=pieces.training_evaluator(),
-            fine=fine.training_evaluator() if pieces.physics_dt > fine.physics_dt else None,
             noise_score=noise_score(problem),
             on_iteration=self._after_iteration,
             name=name,
@@ -145,7 +143,7 @@ class Optimization:
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        used = (e for c in self._courses for e in (c.evaluator, c.assessor, c.way.pieces, c.way.fine) if e is not None)
+        used = (e for c in self._courses for e in (c.evaluator, c.assessor, c.way.pieces))
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 

@@ -59,6 +59,7 @@ class Evaluator:
         space: ParameterSpace,
         trees: Sequence[Sequence[str]] = (),
         phases: FreePhases | None = None,
+        nearby: Evaluator | None = None,
     ):
         """Keep what is needed to build environments.
 
@@ -68,6 +69,7 @@ class Evaluator:
             space: The parameters.
             trees: Groups of joints that do not influence each other; none: all are one.
             phases: What is not known of free phases; ``None``: what the candidates themselves show of that.
+            nearby: Simulates candidates whose differences count, at a longer physics step; ``None``: this one.
         """
         self.dataset = dataset
         self.space = space
@@ -77,6 +79,7 @@ class Evaluator:
         """What is not known of free phases; ``None`` where no base moves, or no candidate has been simulated yet."""
         self._phases_at: torch.Tensor | None = None
         self._make_env = make_env
+        self._nearby = nearby
         self._rollouts: dict[int, Rollout] = {}
         self.simulations = 0
         """Candidates simulated so far by :meth:`residuals`."""
@@ -85,7 +88,8 @@ class Evaluator:
     @property
     def simulated_steps(self) -> int:
         """Control steps simulated so far, over all environments."""
-        return sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again
+        own = sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again
+        return own if self._nearby is None else own + self._nearby.simulated_steps
 
     @contextlib.contextmanager
     def again(self) -> Iterator[None]:
@@ -102,6 +106,24 @@ class Evaluator:
             env = self._make_env(num_candidates * self.dataset.num_recordings)
             self._rollouts[num_candidates] = Rollout(env, self.dataset, self.space)
         return self._rollouts[num_candidates]
+
+    def look_around(self, physical: torch.Tensor, where: torch.Tensor | None = None) -> tuple[Residuals, Residuals]:
+        """The residuals of the first candidate (m = 1), and those of all whose differences count.
+
+        The latter are simulated at a longer physics step where there is one, and the first candidate does not diverge.
+
+        Args:
+            physical: Physical parameters, (m, size).
+            where: As for :meth:`residuals`.
+        """
+        if self._nearby is not None:
+            here = self.residuals(physical[:1], where)
+            self._nearby.phases, self._nearby._phases_at = self.phases, self._phases_at
+            every = self._nearby.residuals(physical, where)
+            if bool(every.error[0].isfinite().all()):
+                return here, every
+        every = self.residuals(physical, where)
+        return every.rows(0, 1), every
 
     def residuals(
         self,

@@ -186,8 +186,11 @@ class Problem:
         return Evaluator(self.make_env, self.dataset, self.space, self.trees)
 
     def training_evaluator(self) -> Evaluator:
-        """An evaluator of candidates on the recordings that are trained on."""
-        return Evaluator(self.make_env, self.dataset.select(self.dataset.trained()), self.space, self.trees)
+        """An evaluator of candidates on the recordings that are trained on; derivatives take the longest step."""
+        data, nearby = self.dataset.select(self.dataset.trained()), None
+        if self.coarsest_dt > self.physics_dt:
+            nearby = Evaluator(self.with_physics_dt(self.coarsest_dt).make_env, data, self.space, self.trees)
+        return Evaluator(self.make_env, data, self.space, self.trees, nearby=nearby)
 
     def on_pieces(self, share: float) -> Problem:
         """The same, trained on windows of what the recordings train on, a share of each."""
