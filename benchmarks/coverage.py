@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim import fit as fit_module
+import pace_optim.identification.fit as fit_module
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
@@ -37,11 +37,11 @@ CORRELATION = 0.8
 BITS = 14
 """Of the encoder that quantises, per turn."""
 LOG_DT, LOOP_DT, PLANT_DT, DURATION = 0.005, 0.001, 5e-5, 4.0
-KP, KD = 40.0, 1.0
+KP, KD, LIMIT = 40.0, 1.0, 40.0
 MODEL = """<mujoco model="pendulum"><compiler angle="radian"/><option timestep="{dt}" integrator="implicitfast"/>
 <worldbody><body><joint name="joint" axis="0 1 0" damping="0" range="-3 3" limited="true"/>
 <inertial pos="0 0 -0.15" mass="1" diaginertia="0.005 0.005 0.001"/></body></worldbody>
-<actuator><motor joint="joint" ctrlrange="-40 40"/></actuator></mujoco>"""
+<actuator><motor joint="joint" ctrlrange="-{limit} {limit}"/></actuator></mujoco>"""
 
 
 def drawn(rng: np.random.Generator) -> dict[str, float]:
@@ -63,9 +63,15 @@ def motion(rng: np.random.Generator, count: int) -> np.ndarray:
     return 0.6 * waves / np.abs(waves).max()
 
 
-def simulate(drive: dict[str, float], command: np.ndarray) -> np.ndarray:
-    """Encoder positions at the log's samples, (count,) [rad]; it stands still for a second before."""
-    model = mujoco.MjModel.from_xml_string(MODEL.format(dt=PLANT_DT))
+def simulate(drive: dict[str, float], command: np.ndarray, limit: float = LIMIT) -> np.ndarray:
+    """Encoder positions at the log's samples, (count,) [rad]; it stands still for a second before.
+
+    Args:
+        drive: As :func:`drawn` has it.
+        command: Targets, (count,) [rad].
+        limit: Of the drive's torque [N m].
+    """
+    model = mujoco.MjModel.from_xml_string(MODEL.format(dt=PLANT_DT, limit=limit))
     model.dof_armature[:], model.dof_damping[:] = drive["armature"], drive["viscous_friction"]
     model.dof_frictionloss[:] = drive["friction"]
     model.dof_solref[:], model.dof_solimp[:] = [2 * PLANT_DT, 1.0], [0.999, 0.9999, 0.001, 0.5, 2.0]
@@ -80,7 +86,7 @@ def simulate(drive: dict[str, float], command: np.ndarray) -> np.ndarray:
             position, speed = data.qpos[0] - bias, data.qvel[0]
         k = int(np.floor(((step + 0.5) * PLANT_DT - drive["delay"]) / LOG_DT))
         target = command[min(max(k, 0), len(command) - 1)]
-        force = KP * (target - position) - KD * speed
+        force = min(max(KP * (target - position) - KD * speed, -limit), limit)
         # where speeds move before positions a force acts half a step early, and the mean over two steps does not
         data.qfrc_applied[:] = 0.5 * (before + force)
         before = force
@@ -98,6 +104,20 @@ def noisy(seen: np.ndarray, kind: str, rng: np.random.Generator) -> np.ndarray:
     return np.round(shown / step) * step if kind == "quantised" else shown
 
 
+def write_inputs(folder: Path, shown: np.ndarray, command: np.ndarray, limit: float = LIMIT) -> None:
+    """``pendulum.xml`` and ``log.npz``, as a user has them."""
+    (folder / "pendulum.xml").write_text(MODEL.format(dt=0.002, limit=limit))
+    np.savez(
+        folder / "log.npz",
+        time=LOG_DT * np.arange(len(command)),
+        dof_pos=shown[:, None],
+        des_dof_pos=command[:, None],
+        joint_names=np.array(["joint"]),
+        stiffness=KP,
+        damping=KD,
+    )
+
+
 @contextlib.contextmanager
 def without_report() -> Iterator[None]:
     """No report of a fit."""
@@ -112,17 +132,7 @@ def one_fit(seed: int, kind: str, drive_dt: float | None) -> tuple[dict[str, flo
     shown = noisy(simulate(drive, command), kind, rng)
     with tempfile.TemporaryDirectory() as place, contextlib.redirect_stderr(io.StringIO()), without_report():
         folder = Path(place)
-        (folder / "pendulum.xml").write_text(MODEL.format(dt=0.002))
-        time_ = LOG_DT * np.arange(len(command))
-        np.savez(
-            folder / "log.npz",
-            time=time_,
-            dof_pos=shown[:, None],
-            des_dof_pos=command[:, None],
-            joint_names=np.array(["joint"]),
-            stiffness=KP,
-            damping=KD,
-        )
+        write_inputs(folder, shown, command)
         settings = FitSettings(
             task=str(folder / "pendulum.xml"),
             data=[str(folder / "log.npz")],
