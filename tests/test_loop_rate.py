@@ -7,10 +7,12 @@ import pytest
 import torch
 from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, loop_rates
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.problem.drive_steps import set_drive_rate
 from pace_optim.run.folder import RunFolder
@@ -80,6 +82,17 @@ def test_loops_of_another_kind_are_fitted_where_they_are_better(tmp_path):
     assert run.ended.score < score and torch.equal(run.ended.x, other.x)
     stages = [descent.stage for descent in run.descents]
     assert stages[-2:] == ["other loop, pieces", "other loop, whole"] and "whole" in stages
+
+
+def test_a_fit_far_above_the_noise_is_tried_with_other_rates(tmp_path):
+    """A drive that saturates made 13 times the noise of it, and a diagnosis named an effect that was not there."""
+    problem = recorded_at(0.001, noise=1e-5)
+    settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path), check_consistency=False)
+    run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
+    outcome = run.run()
+    assert run.ended.score > 100 * 1e-5**2 * len(problem.joint_names)
+    result = conclude(run, EnvironmentRecord.of(BENCH, problem.env_cfg), outcome)
+    assert result.loop_rate["used_s"] == 0.001 and result.times_noise < 1.5 and not result.std_means_nothing
 
 
 def test_only_drive_dt_states_a_rate():

@@ -95,7 +95,16 @@ class _End:
     def moved(self, run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
         """Another vector, with some parameters held."""
         known = _known_at(run, self.problem, x, held)
-        return replace(self, x=x, of_noise=known.uncertainty, residuals=known.residuals, jacobian=known.jacobian)
+        train = _train_rmse(self.problem, known.residuals)
+        return replace(
+            self,
+            x=x,
+            of_noise=known.uncertainty,
+            residuals=known.residuals,
+            jacobian=known.jacobian,
+            train_rmse=train,
+            times=times_noise(self.problem, train),
+        )
 
 
 def conclude(
@@ -116,11 +125,11 @@ def conclude(
     checks: Sequence[Callable[[Optimization, _End], _End]] = _CHECKS
     if outcome.is_interrupted:
         checks = (_silent_at_prior,)
-    elif end.is_far:
-        checks = (_with_prior,)  # where physics is missing, recordings disagree: that is the diagnosis' work
     try:
         for check in checks:
             _write(run, record, end)
+            if end.is_far and check not in _WHERE_FAR:
+                continue
             end = check(run, end)
             if check is _with_step and run.progress.elapsed > _LONG:
                 text = summary(_result(run, record, end))
@@ -194,7 +203,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
     """Where the optimizers ended, with error bars."""
     problem, known = run.problem, _known_at(run, run.problem, outcome.x)
     run.refuse_divergence(float(known.residuals.score[0]))
-    train = rmse_by_joint(known.residuals, problem.dataset.train[known.residuals.step], problem.joint_names)[ALL]
+    train = _train_rmse(problem, known.residuals)
     return _End(
         problem=problem,
         x=outcome.x,
@@ -206,6 +215,10 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
         times=times_noise(problem, train),
         stop_reasons=tuple(outcome.stop_reasons),
     )
+
+
+def _train_rmse(problem: Problem, every: Residuals) -> float:
+    return rmse_by_joint(every, problem.dataset.train[every.step], problem.joint_names)[ALL]
 
 
 def _known_at(run: Optimization, problem: Problem, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
@@ -223,11 +236,11 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
         run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
     rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
     least = float(end.jacobian.residuals.score[0]) if rates is None else rates.score
-    doubtful = end.problem.assumes_loop_rate and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)
+    doubtful = end.problem.assumes_loop_rate and not end.is_far and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)
     if doubtful and (outcome := run.with_other_loop(end.x)) is not None:
         end = _reached(run, outcome)
         rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
-    if rates is None:
+    if rates is None or (end.is_far and rates.chosen == rates.fitted):
         return end
     end = replace(end, rates=rates)
     if rates.chosen == rates.fitted:
@@ -304,3 +317,6 @@ def _consistent(run: Optimization, end: _End) -> _End:
 
 _CHECKS = (_with_loop_rate, _with_step, _with_prior, _perhaps_without_delay, _consistent)
 """What is checked of a result, in this order."""
+_WHERE_FAR = (_with_loop_rate, _silent_at_prior, _with_prior)
+"""What is checked far above the noise: another rate may be all that is wrong. Where physics is missing, recordings
+disagree, and that is the diagnosis' work."""
