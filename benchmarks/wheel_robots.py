@@ -200,7 +200,8 @@ def _call(command: list[str], file: Path, args: argparse.Namespace) -> tuple[int
         resource.setrlimit(resource.RLIMIT_CPU, (args.processor_limit, args.processor_limit + 20))
 
     before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     with file.open("w") as output:
         child = subprocess.Popen(
             *(command, -1),
