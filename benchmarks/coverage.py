@@ -36,7 +36,7 @@ CORRELATION = 0.8
 """Of correlated noise, from sample to sample."""
 BITS = 14
 """Of the encoder that quantises, per turn."""
-LOG_DT, LOOP_DT, PLANT_DT, DURATION = 0.005, 0.001, 5e-5, 4.0
+LOG_DT, LOOP_DT, PLANT_DT, DURATION = 0.005, 0.001, 1e-5, 4.0
 KP, KD, LIMIT = 40.0, 1.0, 40.0
 MODEL = """<mujoco model="pendulum"><compiler angle="radian"/><option timestep="{dt}" integrator="implicitfast"/>
 <worldbody><body><joint name="joint" axis="0 1 0" damping="0" range="-3 3" limited="true"/>
@@ -51,7 +51,7 @@ def drawn(rng: np.random.Generator) -> dict[str, float]:
         "viscous_friction": rng.uniform(0.2, 0.6),
         "friction": rng.uniform(0.1, 0.4),
         "encoder_bias": rng.uniform(-0.03, 0.03),
-        "delay": rng.uniform(0.002, 0.012),
+        "delay": PLANT_DT * round(rng.uniform(0.002, 0.012) / PLANT_DT),
     }
 
 
