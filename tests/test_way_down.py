@@ -71,7 +71,7 @@ def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colou
     staged = way(problem, colouring, noise_score=noise, cfg=WayDownCfg(on_pieces=stuck))
     budgets = []
 
-    def search(budget):
+    def search(budget, around):
         budgets.append(budget)
         return normalised(problem)
 

@@ -2,8 +2,9 @@
 
 1. Descend on pieces: windows of two seconds, a share of each recording. Over a short time the error bends less, and
    has fewer valleys.
-2. Where that ends above the noise, search the pieces by CMA-ES, one strategy for each kinematic tree. The search may
-   simulate a stated multiple of what the descents took. Descend again from its best.
+2. Where that ends above the noise, search the pieces around the best end by CMA-ES, one strategy for each kinematic
+   tree. Armatures, frictions and the like are searched by magnitude. The search may simulate a stated multiple of what
+   the descents took. Descend again from its best.
 3. Descend on the whole recordings from the end that is best there.
 
 Residuals are those of the fit's own physics step. Derivatives, and the search, take the longest stable one.
@@ -87,7 +88,7 @@ class WayDown:
     def run(
         self,
         starts: Sequence[torch.Tensor],
-        search: Callable[[int], torch.Tensor] | None = None,
+        search: Callable[[int, torch.Tensor], torch.Tensor] | None = None,
         scan: Callable[[torch.Tensor], torch.Tensor | None] = lambda _: None,
     ) -> Descent:
         """Go all the way; returns the best descent on the whole recordings.
@@ -95,7 +96,7 @@ class WayDown:
         Args:
             starts: Normalised vectors, (size,).
             scan: Gives another start by the best end so far, or none.
-            search: Searches the pieces from everywhere with a budget of simulations; returns its best vector.
+            search: Searches the pieces with a budget of simulations around a vector; returns its best vector.
         """
         pieces, whole = self.stages
         if not self._of(whole):
@@ -106,7 +107,7 @@ class WayDown:
                 best = self._on_pieces(starts)
             if search is not None and self.is_far(best.score):
                 spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
-                starts.append(search(round(self.cfg.search_budget * spent)))
+                starts.append(search(round(self.cfg.search_budget * spent), best.x))
                 self._on_pieces(starts)
             self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])

@@ -165,12 +165,12 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     start: Any = processes.agree(None)
     if start is None:
         return
-    settings, history, line_generation = start
+    settings, around, history, line_generation = start
     settings = replace(settings, device=device)
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg)
     searcher = make_searcher(problem.for_search(device), settings)
-    optimizer = make_optimizer(problem, settings, processes)
+    optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
     optimizer.restore(history, line_generation)
     search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
 

@@ -93,9 +93,9 @@ class Optimization:
         self.searcher = make_searcher(problem.for_search(settings.device), settings)
         self.processes = processes or Processes()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
-        self.optimizer = (
-            make_optimizer(problem, settings, self.processes) if settings.optimizer != "least_squares" else None
-        )
+        self.optimizer = make_optimizer(problem, settings, self.processes) if settings.only_searches else None
+        self._around = torch.zeros(0, dtype=torch.float64)
+        """Physical parameters around which a hybrid searches, (size,); empty before."""
         self._courses: list[_Course] = []
         self._use(self._course(problem))
         self._steps_before = 0
@@ -191,8 +191,11 @@ class Optimization:
         """Bring the optimizers to where the checkpoint has them."""
         self._steps_before = int(checkpoint["simulated_steps"])
         self.history = self.folder.history_of(checkpoint)
-        if self.optimizer is not None and checkpoint["history"].size:
-            self.optimizer.restore(list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process)
+        if checkpoint["history"].size:
+            self._around = torch.as_tensor(checkpoint["search_around"])
+            self._make_optimizer().restore(
+                list(checkpoint["history"]), int(checkpoint["line_generation"]), self._keep_process
+            )
             self._search_stop = checkpoint["search_stop"].tolist()
         self._restored = Descent.restore(checkpoint)
         self.way.descents = [d for d in self._restored if d.stage in self.way.stages]
@@ -213,11 +216,12 @@ class Optimization:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
         if self.optimizer is not None and self.settings.only_searches:
             self._search(self.optimizer)
-            return Outcome(x=self.optimizer.best, stop_reasons=self._search_stop)
+            return Outcome(x=self._best_of(self.optimizer), stop_reasons=self._search_stop)
         if self.settings.start is not None:
             end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
-            end = self.way.run(self._starts(), None if self.optimizer is None else self._search_within, self._scan)
+            searches = self.settings.optimizer != "least_squares"
+            end = self.way.run(self._starts(), self._search_within if searches else None, self._scan)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
@@ -234,21 +238,29 @@ class Optimization:
         effects = effect_cfgs(problem.env_cfg.sim2real.effects)
         return scanned(problem.space, self.way.pieces, x, effects, problem.joint_names)
 
-    def _search_within(self, budget: int) -> torch.Tensor:
-        """The best of a search of the pieces with a budget of simulations."""
-        optimizer = self.optimizer
-        if optimizer is None:
-            raise ValueError("This fit has no search.")
+    def _make_optimizer(self) -> CMAESOptimizer:
+        """The search; a hybrid's is made when it begins."""
+        if self.optimizer is None:
+            self.optimizer = make_optimizer(self.problem, self.settings, self.processes, self._around)
+        return self.optimizer
+
+    def _search_within(self, budget: int, x: torch.Tensor) -> torch.Tensor:
+        """The best of a search of the pieces around a normalised vector (size,), with a budget of simulations."""
+        if not len(self._around):
+            self._around = self.problem.space.to_physical(x)
+        optimizer = self._make_optimizer()
         generations = max(_FEWEST_GENERATIONS, budget // optimizer.population_size)
         optimizer.cfg = replace(optimizer.cfg, max_iteration=min(optimizer.cfg.max_iteration, generations))
         self.progress.say("far above the noise: searching (Ctrl-C keeps what is found)")
         return self._search(optimizer)
 
     def _write_checkpoint(self) -> None:
-        self.folder.write_checkpoint(self.optimizer, self.descents, self._search_stop, self.steps, self.history)
+        self.folder.write_checkpoint(
+            self.optimizer, self._around, self.descents, self._search_stop, self.steps, self.history
+        )
 
     def _write_mean(self, optimizer: CMAESOptimizer) -> None:
-        self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(optimizer.mean))
+        self.folder.write_mean(self.history.iterations, optimizer.space.to_physical(optimizer.mean))
 
     def _search(self, optimizer: CMAESOptimizer) -> torch.Tensor:
         """Run CMA-ES as far as an interrupted run had not; returns the best."""
@@ -258,14 +270,18 @@ class Optimization:
             agree_to_stop(optimizer, self.processes)
 
         self._searched = True
-        self.processes.agree((self.settings, optimizer.history, optimizer.line_generation))
+        self.processes.agree((self.settings, self._around, optimizer.history, optimizer.line_generation))
         self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
         self._search_stop = optimizer.stop_reasons
         self._write_mean(optimizer)
         self._write_process()
-        return optimizer.best
+        return self._best_of(optimizer)
+
+    def _best_of(self, optimizer: CMAESOptimizer) -> torch.Tensor:
+        """The best vector of a search, normalised as the problem has it, (size,)."""
+        return self.problem.space.to_normalised(optimizer.space.to_physical(optimizer.best))
 
     def _after_generation(self, optimizer: CMAESOptimizer) -> None:
         cfg, history = optimizer.cfg, self.history
@@ -324,5 +340,5 @@ class Optimization:
             if known:
                 return min(known, key=lambda d: d.score).x
         if self.optimizer is not None and self.optimizer.generation:
-            return self.optimizer.best
+            return self._best_of(self.optimizer)
         return self.problem.space.start

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.estimate.convergence import stop_rule
 from pace_optim.estimate.own_objective import Objective, build, optimizer_class
@@ -21,6 +23,8 @@ from pace_optim.terminal.processes import Processes
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
+_AROUND = 0.25
+"""First standard deviation of a hybrid's search, in normalised parameters: half a decade of a magnitude."""
 
 
 def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
@@ -84,16 +88,31 @@ def search_population(problem: Problem, settings: FitSettings) -> int:
     return min(population, _HYBRID_POPULATION) if is_small else population
 
 
-def make_optimizer(problem: Problem, settings: FitSettings, processes: Processes) -> CMAESOptimizer:
-    """The search of a fit."""
+def make_optimizer(
+    problem: Problem, settings: FitSettings, processes: Processes, around: torch.Tensor | None = None
+) -> CMAESOptimizer:
+    """The search of a fit.
+
+    Args:
+        problem: What is fitted.
+        settings: How.
+        processes: Who shares the search.
+        around: Physical parameters (size,) around which the hybrid searches, by magnitude; ``None``: PACE's search from
+            the start of the parameters.
+    """
+    space, start, cfg = problem.space, problem.space.start, search_settings(problem, settings)
+    if around is not None:
+        space = space.by_magnitude()
+        start = space.to_normalised(around).clamp(-1.0, 1.0)
+        cfg = replace(cfg, sigma=_AROUND if settings.sigma is None else settings.sigma)
     return build(
         optimizer_class(settings.optimizer) if settings.has_own_objective else CMAESOptimizer,
-        problem,
+        replace(problem, space=space),
         search_population(problem, settings),
-        search_settings(problem, settings),
+        cfg,
         trees=problem.trees,
         seed=settings.seed,
-        start=problem.space.start,
+        start=start,
         processes=processes,
     )
 

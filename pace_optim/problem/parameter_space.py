@@ -14,6 +14,11 @@ from pace_optim.problem.box import Box
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
+_SPANS = 1e-3
+"""Part of the upper bound up to which a lower one leaves the magnitude open."""
+_SMALLEST = 1e-4
+"""Part of the upper bound that stands for none on a logarithmic scale."""
+
 
 class ParameterSpace:
     """Lays parameters out in one vector, in order, one entry per key; the optimizer's coordinates are a `Box`'s."""
@@ -45,6 +50,23 @@ class ParameterSpace:
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
         """The space of a robot's configuration: the base parameters, the effects', and the user's own."""
         return cls((*base_parameters(cfg), *effect_parameters(cfg), *cfg.extra_parameters))
+
+    def by_magnitude(self) -> ParameterSpace:
+        """The same entries, on a logarithmic scale where no value is negative and the bounds span magnitudes.
+
+        Armatures and frictions are a small part of their bounds, and a search in parts of the bounds passes over them.
+        """
+        parameters = []
+        for p in self.parameters:
+            free = [(low, high) for low, high in zip(p.lower, p.upper, strict=True) if high > low]
+            if p.scale == "linear" and free and all(0 <= low <= _SPANS * high for low, high in free):
+                lower = tuple(
+                    max(low, _SMALLEST * high) if high > low else low
+                    for low, high in zip(p.lower, p.upper, strict=True)
+                )
+                p = replace(p, lower=lower, scale="log", start=None)
+            parameters.append(p)
+        return ParameterSpace(parameters)
 
     def holding(self, labels: Sequence[str], physical: torch.Tensor) -> ParameterSpace:
         """The same with some entries held at the values of a physical vector (size,)."""

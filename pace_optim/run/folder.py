@@ -47,6 +47,7 @@ _ANEW = "Start a new fit."
 
 _CHECKPOINT = {
     "history": ("f", 3),
+    "search_around": ("f", 1),
     "line_generation": ("i", 0),
     "search_stop": ("U", 1),
     "simulated_steps": ("i", 0),
@@ -132,6 +133,7 @@ class RunFolder:
     def write_checkpoint(
         self,
         optimizer: CMAESOptimizer | None,
+        around: torch.Tensor,
         descents: Sequence[Descent],
         search_stop: Sequence[str],
         steps: int,
@@ -141,6 +143,7 @@ class RunFolder:
         history = np.stack(optimizer.history) if optimizer and optimizer.history else np.zeros((0, 0, 0))
         arrays = {
             "history": history,
+            "search_around": around.numpy(),
             "line_generation": np.array(optimizer.line_generation if optimizer else -1),
             "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),

@@ -48,7 +48,9 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     """
     if times is None or times < FAR_ABOVE_NOISE:
         return []
-    search = "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches all bounds."
+    search = (
+        "" if optimizer != "least_squares" else f" {command('fit')} --optimizer hybrid searches for another valley."
+    )
     unit = units_for("mrad", joint_types)
     return [
         f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: physics is missing, a fact "
