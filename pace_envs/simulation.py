@@ -265,6 +265,11 @@ class Simulation:
         """Note that model fields were written: what derives from them is computed before the next step."""
         self._constants_changed = True
 
+    def update_constants(self) -> None:
+        """Compute now what derives from model fields that were written."""
+        if self._constants_changed:
+            self._update_constants()
+
     @property
     def state(self) -> list[torch.Tensor]:
         """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
@@ -272,8 +277,7 @@ class Simulation:
 
     def step(self) -> None:
         """Advance every simulation by one physics step."""
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         if self._drift is None:
             self._step()
         else:
@@ -307,8 +311,7 @@ class Simulation:
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
 
     def reset(self, env_ids: EnvIds = None) -> None:

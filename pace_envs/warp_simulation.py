@@ -66,8 +66,7 @@ class WarpSimulation(Simulation):
 
         For some environments, only where somebody reads it before the next step; then for all of them.
         """
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         if env_ids is None or not self._bound <= _AFTER_RESETS.union(_STATE):
             self._run("forward")
 

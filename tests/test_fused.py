@@ -130,9 +130,9 @@ def test_what_follows_the_physics_is_the_same_in_few_kernels():
         env.episode_length_buf[:] = torch.arange(NUM_ENVS) + 15
     after, rows, reset, forward = fused._after_physics, fused.sim.rows, fused.sim.reset, fused.sim.forward
 
-    def in_few_kernels(with_drives: bool) -> dict[str, torch.Tensor]:
+    def in_few_kernels() -> dict[str, torch.Tensor]:
         with fusion:
-            return after(with_drives)
+            return after()
 
     fused._after_physics = in_few_kernels  # type: ignore[method-assign]
     fused.sim.rows = lambda ids: ids if isinstance(ids, torch.Tensor) else rows(ids)  # type: ignore[method-assign]
