@@ -118,9 +118,13 @@ def part_of_bare(
     for action in [*actions, *actions]:  # graphs are captured, robots have found their feet or fallen
         call(action)
     motion = Motion(env)
-    graphs, env.cfg.sim.graphs = env.cfg.sim.graphs, env.cfg.sim.graphs
+    graphs = env.cfg.sim.graphs
+    env.cfg.sim.graphs = False  # its physics is called step by step
     for action in actions:
         motion.record(lambda action=action: call(action))  # type: ignore[misc]
+    env.cfg.sim.graphs = graphs
+    for action in actions[:20]:
+        call(action)
     whole, alone = [], []
     for _ in range(REPEATS):
         motion.put(0)

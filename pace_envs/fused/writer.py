@@ -161,5 +161,7 @@ def kernels(operations: Sequence[Operation]) -> list[tuple[int, str, list[Any]]]
         for operation in operations:
             if operation.phase == phase:
                 operation.emit(writer)
-        result.append((phase, writer.source(phase), writer.arguments()))
+        source = writer.source(phase)
+        if arguments := writer.arguments():  # else nothing of it is wanted
+            result.append((phase, source, arguments))
     return result
