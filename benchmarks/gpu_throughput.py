@@ -5,11 +5,11 @@
 
 The environment steps on random targets and its torques are kept; then both start from the same state again and
 again, in turns: ``env.simulate`` (action, drives, physics), and the physics alone with those torques copied in.
-``env.step`` is timed, too (rewards, ends, resets, commands, observations), against the physics along its motion: torques
-are copied in, and before each control step the state that the environment had, resets included. What the copies of the
-state take, and of the friction that effects write, is measured alone and taken off. ``--effect`` gives the drives an
-effect at its start values, ``--own_reward`` the task a reward that is not this package's. ``--plain`` leaves every
-operation of torch a kernel of its own.
+``env.step`` is timed, too (rewards, ends, resets, commands, observations), against the physics along its motion:
+torques are copied in, and before each control step the state that the environment had, resets included. What the GPU
+takes for the copies of the state, and of the friction that effects write, is measured alone and taken off. ``--effect``
+gives the drives an effect at its start values, ``--own_reward`` the task a reward that is not this package's.
+``--plain`` leaves every operation of torch a kernel of its own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pace_envs.managers import RewardTermCfg
 from pace_envs.managers.manager_base import term_items
 from pace_envs.warp_simulation import WarpSimulation
 
-REPEATS = 5
+REPEATS, COPIES = 5, 50
 STATE = ("qpos", "qvel", "qacc_warmstart")
 PASSIVE = ("dof_frictionloss", "dof_damping")
 
@@ -95,11 +95,15 @@ class Motion:
             self._copy(k * self._decimation + i, 0)
             self._step()
 
-    def extra(self, k: int) -> None:
-        """The copies in it that are no torques."""
-        self.put(k)
-        for i in range(self._decimation):
-            self._copy(k * self._decimation + i, 1)
+    def extra_s(self) -> float:
+        """Time that a GPU takes for the copies in it that are no torques [s]."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            for _ in range(COPIES):
+                self.put(0)
+                for i in range(self._decimation):
+                    self._copy(i, 1)
+        return seconds(lambda _: graph.replay(), COPIES) / COPIES
 
     def _keep(self) -> None:
         self._given.append([field.clone() for field in self._inputs])
@@ -125,11 +129,11 @@ def part_of_bare(
     env.cfg.sim.graphs = graphs
     for action in actions[:20]:
         call(action)
-    whole, alone = [], []
+    extra, whole, alone = motion.extra_s(), [], []
     for _ in range(REPEATS):
         motion.put(0)
         whole.append(seconds(lambda k: call(actions[k]), count))
-        alone.append(seconds(motion.bare, count) - seconds(motion.extra, count))
+        alone.append(seconds(motion.bare, count) - extra)
     ratio = statistics.median(a / b for a, b in zip(alone, whole, strict=True))
     return steps / statistics.median(whole), steps / statistics.median(alone), ratio
 

@@ -148,7 +148,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             self.simulate(action)
             results = self._after_physics()
         if self._log_names:
-            self.extras["log"] = dict(zip(self._log_names, results["log"].clone(), strict=True))
+            self.extras["log"] = dict(zip(self._log_names, results["log"], strict=True))
         if self.final_observations:
             final = {name: results[f"final_obs/{name}"] for name in self.observation_manager.group_obs_dim}
             self.extras |= {"final_obs": final, "_final_obs": results["done"]}
@@ -170,7 +170,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             "reward": reward,
             "terminated": self.termination_manager.terminated,
             "time_outs": self.termination_manager.time_outs,
-            "log": self._log,
+            "log": self._log.clone(),
             **{f"final_obs/{name}": value for name, value in final.items()},
             **{f"obs/{name}": value for name, value in self.observation_manager.compute().items()},
         }
@@ -215,15 +215,15 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.event_manager.reset_where(done)
         log |= self.command_manager.reset_where(done)
         self.episode_length_buf.masked_fill_(done, 0)
-        self._keep_log(log, done.any())
+        self._keep_log(log, done)
 
-    def _keep_log(self, log: dict[str, torch.Tensor], some: torch.Tensor) -> None:
+    def _keep_log(self, log: dict[str, torch.Tensor], done: torch.Tensor) -> None:
         """Take numbers to log, where an episode has ended."""
         if not log:
             return
         if list(log) != self._log_names:
             self._log_names, self._log = list(log), zeros_like(torch.stack([value.float() for value in log.values()]))
-        torch.where(some, torch.stack([value.float() for value in log.values()]), self._log, out=self._log)
+        torch.where(done.any(), torch.stack([value.float() for value in log.values()]), self._log, out=self._log)
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         self.curriculum_manager.compute(env_ids)

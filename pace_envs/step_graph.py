@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from pace_envs.fused import Fusion
+from pace_envs.kernels.copies import Copies
 
 _RUNS_BEFORE = 3
 """Runs before a capture: constants are copied to the GPU, every tensor has found its place, kernels are compiled."""
@@ -46,7 +47,8 @@ class StepGraph:
         self._homes = homes
         self._generator = generator
         self._fused: AbstractContextManager[Any] = contextlib.nullcontext() if fusion is None else fusion
-        self._results: dict[str, torch.Tensor] = {}
+        self._names: list[str] = []
+        self._copies = Copies([])
         self._key: Hashable = None
         self._runs = 0
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -84,30 +86,22 @@ class StepGraph:
             self._graph = torch.cuda.CUDAGraph()
             self._graph.register_generator_state(self._generator)
             with torch.cuda.graph(self._graph, capture_error_mode="relaxed"), self._fused:
-                self._results = self._function()
+                results = {name: value.contiguous() for name, value in self._function().items()}
                 self._homes.settle()
+            self._names, self._copies = list(results), Copies(list(results.values()))
             self._changes = self._homes.changes()
         self._graph.replay()
         for holder, name, value in self._changes:
             _set(holder, name, value)
-        return self._copies()
+        return dict(zip(self._names, self._copies(), strict=True))
 
     def _refuse(self) -> None:
         self.is_refused = True
         warnings.warn(
-            "A step of the environment waits for the GPU, so that it is not replayed from a CUDA graph. Its kernels are "
-            "launched one by one, which takes longer. Write the task's terms without .item(), .nonzero() and branches "
-            "over a tensor's values. [W26]",
+            "A step of the environment waits for the GPU. So it is not replayed from a CUDA graph, and takes longer. "
+            "Write the task's terms without .item(), .nonzero() and branches over a tensor's values. [W26]",
             stacklevel=3,
         )
-
-    def _copies(self) -> dict[str, torch.Tensor]:
-        """The results in memory of their own, by one kernel for each type."""
-        copies = {name: torch.empty_like(value) for name, value in self._results.items()}
-        for dtype in {value.dtype for value in copies.values()}:
-            names = [name for name, value in copies.items() if value.dtype == dtype]
-            torch._foreach_copy_([copies[name] for name in names], [self._results[name] for name in names])
-        return copies
 
 
 class Homes:
