@@ -135,6 +135,9 @@ class Effect:
     """What a person would see in the data."""
     source: ClassVar[str] = ""
     """Where the equation comes from."""
+    memory: ClassVar[Mapping[str, float]] = {}
+    """What it keeps from step to step: attributes (rows, num_joints) by name, with the value that they begin with. A
+    step assigns new tensors to them."""
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
@@ -210,6 +213,8 @@ class Effect:
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
+        for name, value in self.memory.items():
+            setattr(self, name, self.full(value))
         self.prepare()
 
     # ---- what a subclass overrides -------------------------------------------------------------------------------
