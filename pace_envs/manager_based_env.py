@@ -106,7 +106,6 @@ class ManagerBasedEnv(gym.Env):
         self.common_step_counter = 0
         self._renderer: Any = None
         self._graphs: dict[str, StepGraph] = {}
-        self._homes: Homes | None = None
         self.load_managers()
         self._configure_spaces()
         self.event_manager.apply("startup")
@@ -208,7 +207,7 @@ class ManagerBasedEnv(gym.Env):
         """Only the physics of a step: take the action and advance all environments by ``step_dt``."""
         self._check_open()
         self.action_manager.take_action(action)
-        self._replayed("simulate", self._advance)
+        self._replayed("simulate", self._advance, lambda: Homes(self._moving_parts()))
         self.common_step_counter += 1
 
     def _advance(self) -> dict[str, torch.Tensor]:
@@ -221,19 +220,25 @@ class ManagerBasedEnv(gym.Env):
             self.scene.update()
         return {}
 
-    def _replayed(self, name: str, function: Callable[[], dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
-        """Do what a function of the environment does; on a GPU from a CUDA graph."""
+    def _replayed(
+        self, name: str, function: Callable[[], dict[str, torch.Tensor]], homes: Callable[[], Homes]
+    ) -> dict[str, torch.Tensor]:
+        """Do what a function of the environment does; on a GPU from a CUDA graph.
+
+        Args:
+            name: Of the graph.
+            function: What is done.
+            homes: Makes the places of what it may replace.
+        """
         if self.device.type != "cuda" or not self.cfg.sim.graphs:
             return function()
         self.sim.update_constants()
-        if self._homes is None:
-            self._homes = Homes(self._parts(), self)
         if name not in self._graphs:
-            self._graphs[name] = StepGraph(function, self._homes, self._generator, self._fusion())
+            self._graphs[name] = StepGraph(function, homes(), self._generator, self._fusion())
         return self._graphs[name](self._graph_key())
 
-    def _parts(self) -> list[object]:
-        """The objects that keep something from step to step beside the simulation."""
+    def _moving_parts(self) -> list[object]:
+        """The objects that keep something from physics step to physics step beside the simulation."""
         robots = self.scene.articulations.values()
         drives = [drive for robot in robots for drive in robot.actuators.values()]
         parts = [part for drive in drives for part in (*drive.parts(), *drive.delays())]

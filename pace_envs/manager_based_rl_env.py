@@ -22,6 +22,7 @@ from pace_envs.managers import (
     TerminationManager,
     TerminationTermCfg,
 )
+from pace_envs.step_graph import Homes
 
 
 @dataclass(kw_only=True)
@@ -142,7 +143,9 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """A step without anybody waiting for a GPU; from a CUDA graph where all terms allow it."""
         if self.can_be_captured:
             self.action_manager.take_action(action)
-            results = self._replayed("step", lambda: self._advance() | self._after_physics())
+            results = self._replayed(
+                "step", lambda: self._advance() | self._after_physics(), lambda: Homes(self._step_parts(), self)
+            )
             self.common_step_counter += 1
         else:
             self.simulate(action)
@@ -175,7 +178,8 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             **{f"obs/{name}": value for name, value in self.observation_manager.compute().items()},
         }
 
-    def _parts(self) -> list[object]:
+    def _step_parts(self) -> list[object]:
+        """The objects that keep something from step to step beside the simulation and the environment."""
         managers = (self.termination_manager, self.reward_manager, self.command_manager)
         terms = [
             term.func
@@ -189,7 +193,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             for term in manager.terms
             if isinstance(term.func, ManagerTermBase)
         ]
-        return [*super()._parts(), *managers, *self.command_manager.terms, *terms]
+        return [*self._moving_parts(), *managers, *self.command_manager.terms, *terms]
 
     def _graph_key(self) -> Hashable:
         constants = self.reward_manager.constants, self.observation_manager.constants

@@ -107,12 +107,12 @@ class StepGraph:
 class Homes:
     """Keeps the tensors that objects have as attributes, or in dictionaries that are attributes, at fixed places."""
 
-    def __init__(self, parts: Sequence[object], owner: object):
+    def __init__(self, parts: Sequence[object], owner: object | None = None):
         """Look at objects.
 
         Args:
             parts: Of these, all that can be compared is in :meth:`key`.
-            owner: Of this one the tensors alone.
+            owner: Of this one the tensors alone; ``None`` for none.
         """
         self._parts, self._owner = list(parts), owner
         self._homes: dict[Place, torch.Tensor] = {}
@@ -136,11 +136,12 @@ class Homes:
 
     def changes(self) -> list[tuple[dict[str, Any], str, Any]]:
         """All else that was changed since :meth:`key`, as it is now."""
+        before = {place: _comparable(value) for place, value in self._seen.items()}
         now = [(holder, name, _comparable(value)) for holder, name, value in self._attributes()]
         return [
             (holder, name, value)
-            for (holder, name, value), (*_, old) in zip(now, self._key, strict=False)
-            if not isinstance(holder[name], torch.Tensor) and value != old
+            for holder, name, value in now
+            if not isinstance(holder[name], torch.Tensor) and before.get((id(holder), name), value) != value
         ]
 
     def _move(self, places: Mapping[Place, Any]) -> None:
@@ -166,7 +167,7 @@ class Homes:
 
     def _attributes(self) -> Iterator[tuple[dict[str, Any], str, Any]]:
         """Tensors, and of the parts numbers, flags, names and sets of them."""
-        for part in (*self._parts, self._owner):
+        for part in (*self._parts, *([] if self._owner is None else [self._owner])):
             for name, value in list(vars(part).items()):
                 if isinstance(value, torch.Tensor) or (part is not self._owner and isinstance(value, _PLAIN)):
                     yield vars(part), name, value
