@@ -125,7 +125,10 @@ class Homes:
         if self._fingerprint() == self._ids:
             return self._key
         self._move(self._homes)
-        self._seen = {(id(holder), name): value for holder, name, value in self._attributes()}
+        self._seen = {
+            (id(holder), name): value if isinstance(value, torch.Tensor) else _comparable(value)
+            for holder, name, value in self._attributes()
+        }
         self._ids = self._fingerprint()
         self._key = tuple((*place, _comparable(value)) for place, value in self._seen.items())
         return self._key
@@ -136,12 +139,11 @@ class Homes:
 
     def changes(self) -> list[tuple[dict[str, Any], str, Any]]:
         """All else that was changed since :meth:`key`, as it is now."""
-        before = {place: _comparable(value) for place, value in self._seen.items()}
         now = [(holder, name, _comparable(value)) for holder, name, value in self._attributes()]
         return [
             (holder, name, value)
             for holder, name, value in now
-            if not isinstance(holder[name], torch.Tensor) and before.get((id(holder), name), value) != value
+            if not isinstance(holder[name], torch.Tensor) and self._seen.get((id(holder), name), value) != value
         ]
 
     def _move(self, places: Mapping[Place, Any]) -> None:
