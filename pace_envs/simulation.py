@@ -73,7 +73,7 @@ class SimulationCfg:
     """Where it runs: ``"cpu"`` in float64, or ``"cuda:0"``, ``"cuda:1"``, … in float32 by MuJoCo Warp."""
 
     graphs: bool = True
-    """Whether drives and physics are replayed from CUDA graphs on a GPU; else every kernel is launched by itself."""
+    """Whether a step is replayed from a CUDA graph on a GPU; else every kernel is launched by itself."""
 
     fused: bool = True
     """Whether what is captured of drives and managers becomes a few kernels (:mod:`pace_envs.fused`); else each of
