@@ -206,7 +206,9 @@ def _waits(wanted: bool) -> Iterator[list[str]]:
         yield found
         return
     mode = torch.cuda.get_sync_debug_mode()
-    torch.cuda.set_sync_debug_mode("warn")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch calls the mode a prototype
+        torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -214,7 +216,7 @@ def _waits(wanted: bool) -> Iterator[list[str]]:
     finally:
         torch.cuda.set_sync_debug_mode(mode)
     for each in caught:
-        if "synchroniz" in str(each.message):
+        if "synchronizing CUDA operation" in str(each.message):
             found.append(str(each.message))
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
