@@ -196,7 +196,11 @@ class DelayBuffer:
         if self._on_device:
             self._row.copy_(torch.where(self._row == self._length - 1, 0, self._row + 1))
             self._age.add_(1).clamp_(max=self._length - 1)
-            history.scatter_(0, self._row.expand_as(data)[None], data[None])
+            place = self._row.expand_as(data)[None]
+            if torch.is_grad_enabled() and (data.requires_grad or history.requires_grad):
+                self._storage = history.scatter(0, place.clone(), data[None]).view_as(self._storage)
+            else:
+                history.scatter_(0, place, data[None])
             return
         if self._any_stale:
             rows = self._stale.nonzero()[:, 0]
