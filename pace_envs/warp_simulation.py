@@ -192,9 +192,11 @@ class WarpSimulation(Simulation):
     def _unchanged_state(self) -> Iterator[None]:
         fields = [self._warp.to_torch(getattr(self.data, name)) for name in _STATE]
         saved = [field.clone() for field in fields]
+        launch_pending()
         yield
         for field, value in zip(fields, saved, strict=True):
             field.copy_(value)
+        launch_pending()
 
     def _forget_graphs(self) -> None:
         self._graphs.clear()
