@@ -191,7 +191,7 @@ def breakdown(settings: RunSettings, iterations: int, learning_threads: int | No
     watch.watch(base.sim, "step", "physics")
     watch.watch(base.sim, "forward", "physics of resets")
     watch.watch(base.scene, "write_data_to_sim", "drives")
-    watch.watch(base.action_manager, "process_action", "action manager")
+    watch.watch(base.action_manager, "process_taken", "action manager")
     watch.watch(base.action_manager, "apply_action", "action manager")
     watch.watch(base.scene, "update_sensors", "contact sensors")
     watch.watch(base.termination_manager, "compute", "termination manager")

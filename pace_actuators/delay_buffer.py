@@ -42,6 +42,9 @@ class DelayBuffer:
 
     After a reset, the first sample stands for everything before it. Gradients flow back through the history, to the
     last reset of all environments.
+
+    On a GPU, where the buffer is in the ring and how old its history is are tensors, one number per environment: a
+    CUDA graph repeats a step, and nothing is counted in Python.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class DelayBuffer:
         device: str | torch.device = "cpu",
         interpolation: Interpolation = "linear",
         parts: int = 1,
+        counts_on_device: bool | None = None,
     ):
         """Create the buffer with all lags at zero.
 
@@ -60,6 +64,7 @@ class DelayBuffer:
             device: Device of the signal.
             interpolation: ``"linear"`` or ``"hold"``.
             parts: Into how many parts a step is divided.
+            counts_on_device: Whether the place in the ring is a tensor; ``None`` for a GPU's alone.
 
         Raises:
             ValueError: If ``max_delay`` is negative or not finite, or the interpolation is unknown.
@@ -83,9 +88,12 @@ class DelayBuffer:
         self._length = math.ceil(max_delay + _LARGEST_LEAD) + 2
         self._lag = torch.zeros(num_envs, 1, dtype=torch.float64, device=self._device)
         self._storage: torch.Tensor | None = None  # (length * num_envs, num_joints)
+        self._on_device = self._device.type == "cuda" if counts_on_device is None else counts_on_device
         self._head = 0
         self._stale = torch.ones(num_envs, dtype=torch.bool, device=self._device)
         self._any_stale = True
+        self._row = torch.zeros(num_envs, 1, dtype=torch.long, device=self._device)  # of the newest sample
+        self._age = torch.full_like(self._row, -1)  # steps from the oldest sample to the newest; -1: no sample
         self._all_zero = True
         self._index_lags()
 
@@ -136,12 +144,14 @@ class DelayBuffer:
             self._index_lags()
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
-        """Forget the history of all or some environments."""
-        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
-            self._stale |= env_ids  # nobody has to count them
+        """Forget the history of all or some environments: indices, or (num_envs,) bool."""
+        if self._on_device:
+            self._age[slice(None) if env_ids is None else env_ids] = -1
+        elif isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+            self._stale |= env_ids
         else:
             self._stale[slice(None) if env_ids is None else env_ids] = True
-        self._any_stale = True
+        self._any_stale = not self._on_device
         if env_ids is None and self._storage is not None and self._storage.requires_grad:
             self._storage = self._storage.detach()  # gradients end here too
 
@@ -156,25 +166,49 @@ class DelayBuffer:
         """
         if self._storage is None or self._storage.shape[1:] != data.shape[1:]:
             with torch.inference_mode(False):  # as above
-                self._storage = data.new_empty((self._length * self._num_envs, *data.shape[1:]))
+                self._storage = data.new_zeros((self._length * self._num_envs, *data.shape[1:]))
             self.reset()
-        if self._any_stale:
-            history = self._storage.view(self._length, *data.shape)
-            if data.is_cuda and not (data.requires_grad or history.requires_grad):
-                torch.where(self._stale[:, None], data, history, out=history)  # without waiting for the GPU to count
-            else:
-                rows = self._stale.nonzero()[:, 0]
-                history[:, rows] = data[rows]
-            self._stale[:] = False
-            self._any_stale = False
-        self._head = (self._head + 1) % self._length
-        start = self._head * self._num_envs
-        self._storage[start : start + self._num_envs] = data
+        self._push(data)
         if self._all_zero:
             return data
         if self.parts > 1 and self.interpolation == "linear":
             return self.part(0)
         return self.mean()
+
+    def history(self) -> torch.Tensor:
+        """The samples, (length, num_envs, num_joints): the newest, then those before it from the oldest on.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        if self._storage is None:
+            raise ValueError("The delay has no sample yet: call compute first.")
+        samples = self._storage.view(self._length, self._num_envs, -1)
+        if not self._on_device:
+            return samples.roll(-self._head, dims=0)
+        back = (self._length - torch.arange(self._length, device=self._device)) % self._length
+        return torch.cat([self._seen(each.expand_as(self._row))[None] for each in back])
+
+    def _push(self, data: torch.Tensor) -> None:
+        """Put a sample into the ring."""
+        assert self._storage is not None
+        history = self._storage.view(self._length, *data.shape)
+        if self._on_device:
+            self._row.copy_(torch.where(self._row == self._length - 1, 0, self._row + 1))
+            self._age.add_(1).clamp_(max=self._length - 1)
+            place = self._row.expand_as(data)[None]
+            if torch.is_grad_enabled() and (data.requires_grad or history.requires_grad):
+                self._storage = history.scatter(0, place.clone(), data[None]).view_as(self._storage)
+            else:
+                history.scatter_(0, place, data[None])
+            return
+        if self._any_stale:
+            rows = self._stale.nonzero()[:, 0]
+            history[:, rows] = data[rows]
+            self._stale[:] = False
+            self._any_stale = False
+        self._head = (self._head + 1) % self._length
+        history[self._head] = data
 
     def changes(self, part: int) -> bool:
         """Whether a part of a step shows something else than the part before it."""
@@ -185,18 +219,13 @@ class DelayBuffer:
         if part not in self._at:
             return self.mean()
         newer, older, weight = self._at[part]
-        shown = _look_up(self._storage, older[self._head])
-        return (
-            shown if weight is None else _look_up(self._storage, newer[self._head]).lerp_(shown, weight.to(shown.dtype))
-        )
+        shown = self._seen(older)
+        return shown if weight is None else self._seen(newer).lerp_(shown, weight.to(shown.dtype))
 
     def mean(self) -> torch.Tensor:
         """The mean of what the present step shows, same shape as the samples."""
-        newer = _look_up(self._storage, self._newer[self._head])
-        if self._whole:
-            return newer
-        older = _look_up(self._storage, self._older[self._head])
-        return newer.lerp_(older, self._fraction.to(newer.dtype))
+        newer = self._seen(self._newer)
+        return newer if self._whole else newer.lerp_(self._seen(self._older), self._fraction.to(newer.dtype))
 
     def jump(self, part: int) -> Jump | None:
         """By how much the signal rises within a part of the present step; ``None`` where it does not change there."""
@@ -208,7 +237,7 @@ class DelayBuffer:
             newer, older, share = self._newer, self._older, None if self._whole else self._fraction
         if share is None:
             return None
-        rise = _look_up(self._storage, newer[self._head]) - _look_up(self._storage, older[self._head])
+        rise = self._seen(newer) - self._seen(older)
         return Jump(rise, share.to(rise.dtype))
 
     def _index_lags(self) -> None:
@@ -240,7 +269,9 @@ class DelayBuffer:
             before = back, weight
 
     def _rows(self, steps: torch.Tensor) -> torch.Tensor:
-        """Rows of the storage so many steps back, for every head position."""
+        """What :meth:`_seen` takes for the samples so many steps back."""
+        if self._on_device:
+            return steps.long()
         heads = torch.arange(self._length, device=self._device)[:, None]
         envs = torch.arange(self._num_envs, device=self._device)
         if steps.shape[1] == 1:
@@ -249,8 +280,18 @@ class DelayBuffer:
             heads, back, envs = heads[..., None], steps.long(), envs[:, None]
         return ((heads - back) % self._length) * self._num_envs + envs
 
+    def _seen(self, rows: torch.Tensor) -> torch.Tensor:
+        """Samples of the past, (num_envs, num_joints).
 
-def _look_up(storage: torch.Tensor | None, index: torch.Tensor) -> torch.Tensor:
-    """Whole rows for one lag per environment, single entries for one per joint."""
-    assert storage is not None  # a sample was pushed before
-    return storage.index_select(0, index) if index.ndim == 1 else storage.gather(0, index)
+        Args:
+            rows: Of :meth:`_rows`: on a GPU steps back, (num_envs, 1 or num_joints); else rows of the storage for every
+                head position, whole ones or, with a lag per joint, of single entries.
+        """
+        assert self._storage is not None  # a sample was pushed before
+        if not self._on_device:
+            index = rows[self._head]
+            return self._storage.index_select(0, index) if index.ndim == 1 else self._storage.gather(0, index)
+        history = self._storage.view(self._length, self._num_envs, -1)
+        place = self._row - torch.minimum(rows, self._age)
+        place = torch.where(place < 0, place + self._length, place)
+        return history.gather(0, place.expand(history.shape[1:])[None])[0]

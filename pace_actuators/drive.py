@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from pace_actuators.base_parameters import CARRIED
-from pace_actuators.delay_buffer import Jump
+from pace_actuators.delay_buffer import DelayBuffer, Jump
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.identified import delay_in_steps, step_notes
@@ -398,17 +398,25 @@ class Drive:
             given = self.effects.state.enabled
             given.copy_(torch.ones_like(given) if self.torque_enable is None else self.torque_enable.expand_as(given))
 
+    def parts(self) -> list[Any]:
+        """The objects that keep something from call to call: itself, its effects, and what delays; without buffers."""
+        stack = self.effects
+        return [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
+
+    def delays(self) -> list[DelayBuffer]:
+        """The buffers of its own delay and of its effects'."""
+        held = [value for each in self.parts() for value in vars(each).values() if isinstance(value, DelayBuffer)]
+        return [*self._delays.buffers, *held]
+
     def flags(self) -> list[tuple]:
         """Everything of the drive and its effects that is no tensor and can be compared: what Python branches over."""
-        stack = self.effects
-        things: list[Any] = [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
         return [
             tuple(
                 (key, frozenset(value) if isinstance(value, set) else value)
                 for key, value in vars(each).items()
                 if value is None or isinstance(value, (bool, int, float, str, set))
             )
-            for each in things
+            for each in self.parts()
         ]
 
     def _check_shapes(self, **given: torch.Tensor | None) -> None:

@@ -47,6 +47,11 @@ class DriveDelays:
         self._silent: set[str] = set()  # signals that were not given at the last run
 
     @property
+    def buffers(self) -> list[DelayBuffer]:
+        """The delay of each signal."""
+        return list(self._buffers.values())
+
+    @property
     def time_lags(self) -> torch.Tensor:
         """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
         return next(iter(self._buffers.values())).time_lags / self._runs

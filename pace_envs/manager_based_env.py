@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,7 @@ from pace_envs.managers import (
 )
 from pace_envs.scene import InteractiveScene, InteractiveSceneCfg
 from pace_envs.simulation import EnvIds, SimulationCfg
-from pace_envs.step_graphs import StepGraphs
+from pace_envs.step_graph import Homes, StepGraph
 
 
 @dataclass(kw_only=True)
@@ -105,8 +105,7 @@ class ManagerBasedEnv(gym.Env):
         """Whether environments are reset where a mask says so, without anybody waiting for the GPU to count them."""
         self.common_step_counter = 0
         self._renderer: Any = None
-        self._drive_graphs: StepGraphs | None = None
-        self._graphs_version = 0
+        self._graphs: dict[str, StepGraph] = {}
         self.load_managers()
         self._configure_spaces()
         self.event_manager.apply("startup")
@@ -207,27 +206,47 @@ class ManagerBasedEnv(gym.Env):
     def simulate(self, action: torch.Tensor) -> None:
         """Only the physics of a step: take the action and advance all environments by ``step_dt``."""
         self._check_open()
-        self.action_manager.process_action(action)
-        for _ in range(self.cfg.decimation):
-            self.action_manager.apply_action()
-            self._drive()
-            self.sim.step()
-            self.scene.update()
+        self.action_manager.take_action(action)
+        self._replayed("simulate", self._advance, lambda: Homes(self._moving_parts()))
         self.common_step_counter += 1
 
-    def _drive(self) -> None:
-        """Run the drives; on a GPU from CUDA graphs."""
-        if self.device.type != "cuda" or not self.cfg.sim.graphs:
+    def _advance(self) -> dict[str, torch.Tensor]:
+        """Actions, drives and physics of a step."""
+        self.action_manager.process_taken()
+        for _ in range(self.cfg.decimation):
+            self.action_manager.apply_action()
             self.scene.write_data_to_sim()
-            return
-        version = self.sim.version
-        if self._drive_graphs is None:
-            owners = [part for robot in self.scene.articulations.values() for part in (robot.data, robot.actuators)]
-            self._drive_graphs = StepGraphs(self.scene.write_data_to_sim, owners, self.device, self._fusion())
-        elif version != self._graphs_version:
-            self._drive_graphs.clear()
-        self._graphs_version = version
-        self._drive_graphs()
+            self.sim.step()
+            self.scene.update()
+        return {}
+
+    def _replayed(
+        self, name: str, function: Callable[[], dict[str, torch.Tensor]], homes: Callable[[], Homes]
+    ) -> dict[str, torch.Tensor]:
+        """Do what a function of the environment does; on a GPU from a CUDA graph.
+
+        Args:
+            name: Of the graph.
+            function: What is done.
+            homes: Makes the places of what it may replace.
+        """
+        if self.device.type != "cuda" or not self.cfg.sim.graphs:
+            return function()
+        self.sim.update_constants()
+        if name not in self._graphs:
+            self._graphs[name] = StepGraph(function, homes(), self._generator, self._fusion())
+        return self._graphs[name](self._graph_key())
+
+    def _moving_parts(self) -> list[object]:
+        """The objects that keep something from physics step to physics step beside the simulation."""
+        robots = self.scene.articulations.values()
+        drives = [drive for robot in robots for drive in robot.actuators.values()]
+        parts = [part for drive in drives for part in (*drive.parts(), *drive.delays())]
+        return [*parts, *(robot.data for robot in robots), self.action_manager, *self.action_manager.terms]
+
+    def _graph_key(self) -> Hashable:
+        """All that steps read of Python beside what is on the parts."""
+        return self.sim.version
 
     def _fusion(self) -> Fusion | None:
         """What makes few kernels of many operations, where that is wanted and can be had."""

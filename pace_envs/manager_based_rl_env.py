@@ -11,17 +11,18 @@ import torch
 
 from pace_envs.indexing import zeros_like
 from pace_envs.manager_based_env import ManagerBasedEnv, ManagerBasedEnvCfg
-from pace_envs.manager_graph import ManagerGraph
 from pace_envs.managers import (
     CommandManager,
     CommandTermCfg,
     CurriculumManager,
     CurriculumTermCfg,
+    ManagerTermBase,
     RewardManager,
     RewardTermCfg,
     TerminationManager,
     TerminationTermCfg,
 )
+from pace_envs.step_graph import Homes
 
 
 @dataclass(kw_only=True)
@@ -62,11 +63,6 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """Whether steps compute ``extras["final_obs"]``."""
         self._log, self._log_names = torch.zeros(0, device=self.device), list[str]()
         self.masks_resets = self.device.type != "cpu" and self.takes_masks
-        self._manager_graph: ManagerGraph | None = None
-        if self.masks_resets and cfg.sim.graphs and self.can_be_captured:
-            self._manager_graph = ManagerGraph(
-                lambda: self._after_physics(with_drives=False), self._generator, self._fusion()
-            )
 
     @property
     def max_episode_length_s(self) -> float:
@@ -95,18 +91,8 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
 
     @property
     def can_be_captured(self) -> bool:
-        """Whether all that follows the physics is this package's, and none of the drives' effects is asked then."""
-        managers = (
-            self.curriculum_manager,
-            self.event_manager,
-            self.observation_manager,
-            self.reward_manager,
-            self.termination_manager,
-        )
-        drives = [drive for robot in self.scene.articulations.values() for drive in robot.actuators.values()]
-        own = self.command_manager.is_own and all(term.is_own for manager in managers for term in manager.terms)
-        due = all(term.changes_state_only for term in self.event_manager.terms)
-        return self.takes_masks and own and due and all(drive.effects is None for drive in drives)
+        """Whether nothing of a step has to wait for the GPU to count environments."""
+        return self.takes_masks and all(term.changes_state_only for term in self.event_manager.terms)
 
     def load_managers(self) -> None:
         """Build the managers."""
@@ -133,9 +119,9 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """
         self._check_action(action)
         self.extras = {}
-        self.simulate(action)
         if self.masks_resets:
-            return self._step_where()
+            return self._step_where(action)
+        self.simulate(action)
         self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()
@@ -151,30 +137,35 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         self.event_manager.apply("interval", dt=self.step_dt)
         return self.observation_manager.compute(), reward, terminated, truncated, self.extras
 
-    def _step_where(self) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """What follows the physics without anybody waiting for a GPU; from a CUDA graph where all terms allow it."""
-        if self._manager_graph is None or self.final_observations:
-            results = self._after_physics(with_drives=True)
-            if self._manager_graph is not None:
-                self._manager_graph.clear()
+    def _step_where(
+        self, action: torch.Tensor
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """A step without anybody waiting for a GPU; from a CUDA graph where all terms allow it."""
+        if self.can_be_captured:
+            self.action_manager.take_action(action)
+            results = self._replayed(
+                "step", lambda: self._advance() | self._after_physics(), lambda: Homes(self._step_parts(), self)
+            )
+            self.common_step_counter += 1
         else:
-            results = self._manager_graph(self._graph_key())
-            self.scene.reset_drives_where(results["done"])  # they count in Python
+            self.simulate(action)
+            results = self._after_physics()
         if self._log_names:
-            self.extras["log"] = dict(zip(self._log_names, results["log"].clone(), strict=True))
+            self.extras["log"] = dict(zip(self._log_names, results["log"], strict=True))
+        if self.final_observations:
+            final = {name: results[f"final_obs/{name}"] for name in self.observation_manager.group_obs_dim}
+            self.extras |= {"final_obs": final, "_final_obs": results["done"]}
         obs = {name: results[f"obs/{name}"] for name in self.observation_manager.group_obs_dim}
         return obs, results["reward"], results["terminated"], results["time_outs"], self.extras
 
-    def _after_physics(self, with_drives: bool) -> dict[str, torch.Tensor]:
+    def _after_physics(self) -> dict[str, torch.Tensor]:
         """Steps (2) to (7), with environments that are done told by a mask."""
         self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()
         reward = self.reward_manager.compute(self.step_dt)
-        self._keep_final_observations(done)
+        final = self.observation_manager.compute() if self.final_observations else {}
         self._reset_where(done)
-        if with_drives:
-            self.scene.reset_drives_where(done)
         self.command_manager.compute(self.step_dt)
         self.event_manager.apply("interval", dt=self.step_dt)
         return {
@@ -182,17 +173,31 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             "reward": reward,
             "terminated": self.termination_manager.terminated,
             "time_outs": self.termination_manager.time_outs,
-            "log": self._log,
+            "log": self._log.clone(),
+            **{f"final_obs/{name}": value for name, value in final.items()},
             **{f"obs/{name}": value for name, value in self.observation_manager.compute().items()},
         }
 
+    def _step_parts(self) -> list[object]:
+        """The objects that keep something from step to step beside the simulation and the environment."""
+        managers = (self.termination_manager, self.reward_manager, self.command_manager)
+        terms = [
+            term.func
+            for manager in (
+                self.termination_manager,
+                self.reward_manager,
+                self.observation_manager,
+                self.event_manager,
+                self.curriculum_manager,
+            )
+            for term in manager.terms
+            if isinstance(term.func, ManagerTermBase)
+        ]
+        return [*self._moving_parts(), *managers, *self.command_manager.terms, *terms]
+
     def _graph_key(self) -> Hashable:
-        """All that :meth:`_after_physics` reads and that is no tensor's content."""
-        robots = self.scene.articulations.values()
-        read = [value for robot in robots for value in vars(robot.data).values()]
-        read += [drive.encoder_bias for robot in robots for drive in robot.actuators.values()]
-        places = tuple(value.data_ptr() if isinstance(value, torch.Tensor) else None for value in read)
-        return self.sim.version, places, self.reward_manager.constants, self.observation_manager.constants
+        constants = self.reward_manager.constants, self.observation_manager.constants
+        return super()._graph_key(), *constants, self.final_observations
 
     def _keep_final_observations(self, done: torch.Tensor) -> None:
         if self.final_observations:
@@ -208,20 +213,21 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         with self.scene.only_where(done):
             self.scene.reset_where(done)
             self.event_manager.apply("reset")
+        self.scene.reset_drives_where(done)
         self.sim.forward(done)
         self.action_manager.reset(done)
         self.event_manager.reset_where(done)
         log |= self.command_manager.reset_where(done)
         self.episode_length_buf.masked_fill_(done, 0)
-        self._keep_log(log, done.any())
+        self._keep_log(log, done)
 
-    def _keep_log(self, log: dict[str, torch.Tensor], some: torch.Tensor) -> None:
+    def _keep_log(self, log: dict[str, torch.Tensor], done: torch.Tensor) -> None:
         """Take numbers to log, where an episode has ended."""
         if not log:
             return
         if list(log) != self._log_names:
             self._log_names, self._log = list(log), zeros_like(torch.stack([value.float() for value in log.values()]))
-        torch.where(some, torch.stack([value.float() for value in log.values()]), self._log, out=self._log)
+        torch.where(done.any(), torch.stack([value.float() for value in log.values()]), self._log, out=self._log)
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         self.curriculum_manager.compute(env_ids)

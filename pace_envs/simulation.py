@@ -73,7 +73,7 @@ class SimulationCfg:
     """Where it runs: ``"cpu"`` in float64, or ``"cuda:0"``, ``"cuda:1"``, … in float32 by MuJoCo Warp."""
 
     graphs: bool = True
-    """Whether drives and physics are replayed from CUDA graphs on a GPU; else every kernel is launched by itself."""
+    """Whether a step is replayed from a CUDA graph on a GPU; else every kernel is launched by itself."""
 
     fused: bool = True
     """Whether what is captured of drives and managers becomes a few kernels (:mod:`pace_envs.fused`); else each of
@@ -265,6 +265,11 @@ class Simulation:
         """Note that model fields were written: what derives from them is computed before the next step."""
         self._constants_changed = True
 
+    def update_constants(self) -> None:
+        """Compute now what derives from model fields that were written."""
+        if self._constants_changed:
+            self._update_constants()
+
     @property
     def state(self) -> list[torch.Tensor]:
         """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
@@ -272,8 +277,7 @@ class Simulation:
 
     def step(self) -> None:
         """Advance every simulation by one physics step."""
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         if self._drift is None:
             self._step()
         else:
@@ -307,8 +311,7 @@ class Simulation:
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
 
     def reset(self, env_ids: EnvIds = None) -> None:

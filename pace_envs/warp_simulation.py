@@ -66,8 +66,7 @@ class WarpSimulation(Simulation):
 
         For some environments, only where somebody reads it before the next step; then for all of them.
         """
-        if self._constants_changed:
-            self._update_constants()
+        self.update_constants()
         if env_ids is None or not self._bound <= _AFTER_RESETS.union(_STATE):
             self._run("forward")
 
@@ -193,9 +192,11 @@ class WarpSimulation(Simulation):
     def _unchanged_state(self) -> Iterator[None]:
         fields = [self._warp.to_torch(getattr(self.data, name)) for name in _STATE]
         saved = [field.clone() for field in fields]
+        launch_pending()
         yield
         for field, value in zip(fields, saved, strict=True):
             field.copy_(value)
+        launch_pending()
 
     def _forget_graphs(self) -> None:
         self._graphs.clear()

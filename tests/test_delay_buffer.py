@@ -145,3 +145,26 @@ def test_a_lag_outside_of_the_buffer_is_refused(lag):
 def test_an_impossible_buffer_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         DelayBuffer(num_envs=1, **kwargs)
+
+
+@pytest.mark.parametrize(("interpolation", "parts", "columns"), [("linear", 1, 1), ("linear", 4, 3), ("hold", 1, 3)])
+def test_a_buffer_that_counts_in_tensors_gives_what_one_gives_that_counts_in_python(interpolation, parts, columns):
+    """As on a GPU, where a CUDA graph repeats the same step."""
+    random = np.random.default_rng(0)
+    both = [DelayBuffer(4.0, 5, interpolation=interpolation, parts=parts, counts_on_device=d) for d in (False, True)]
+    lags = torch.as_tensor(random.uniform(0.0, 4.0, (5, columns)))
+    for buffer in both:
+        buffer.set_time_lag(lags)
+    for k in range(30):
+        sample, some = torch.as_tensor(random.normal(size=(5, 3))), torch.as_tensor(random.random(5) < 0.2)
+        given = []
+        for buffer in both:
+            if k in (7, 20):
+                buffer.reset(some)
+            if k == 13:
+                buffer.reset([0, 3])
+            if k == 25:
+                buffer.set_time_lag(lags.flip(0))
+            first = buffer.compute(sample)
+            given.append([first, *(buffer.part(part) for part in range(parts)), buffer.mean(), buffer.history()])
+        assert all(torch.equal(a, b) for a, b in zip(*given, strict=True)), k

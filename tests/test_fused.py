@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 import torch
 from test_masked_resets import NUM_ENVS, without_chance
 
+from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators.effects import EffectCfg, get_effect
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.fused import Fusion, fusion_for, launch_pending
 from pace_envs.kernels import host_kernels
 
 pytestmark = pytest.mark.skipif(host_kernels() is None, reason="needs a compiler of C++")
 N = 37
+DRIVE = {
+    "stiffness": 85.0,
+    "damping": 0.6,
+    "armature": 0.1,
+    "friction": 0.5,
+    "viscous_friction": 2.0,
+    "delay": 2.4,
+    "max_delay": 6.0,
+    "saturation_effort": 120.0,
+    "effort_limit": 80.0,
+    "velocity_limit": 7.5,
+}
 
 
 @pytest.fixture
@@ -97,6 +113,42 @@ def test_rows_that_read_other_rows_wait_for_them(fusion):
     both(fusion, function, numbers(2 * N, 3))
 
 
+def test_rows_find_their_entries_by_numbers_and_write_them(fusion):
+    place = torch.arange(N)[:, None] % 4
+
+    def function(ring, x):
+        table = ring.view(5, N, 3)
+        table.scatter_(0, (place + 1).expand_as(x)[None], x[None])
+        return (table.gather(0, place.expand_as(x)[None])[0] * 2.0,)
+
+    both(fusion, function, numbers(5 * N, 3), numbers(N, 3))
+
+
+@pytest.mark.parametrize("effects", [(), ("stribeck_friction", "drive_bandwidth", "other_delay", "joint_elasticity")])
+def test_a_drive_is_one_kernel_a_call_with_effects_too(fusion, effects):
+    """As on a GPU: delays and effects count in tensors, and are reset by a mask."""
+    wanted = [EffectCfg(effect=name, values={p.name: p.start for p in get_effect(name).parameters}) for name in effects]
+    cfg = PaceDCMotorCfg(joint_names_expr=".*", effects=wanted, physics_dt=0.0025, **DRIVE)
+    plain, own = (PaceDCMotor(cfg, ["hip", "knee"], slice(None), N, dtype=torch.float64) for _ in range(2))
+    for each in (*own.delays(), *(own.effects.effects if own.effects else ())):
+        each._on_device = True
+    for buffer in own.delays():
+        buffer._index_lags()
+    launched = []
+    for k in range(12):
+        target, q, v = (0.1 * (k + 1) * numbers(N, 2) * scale for scale in (1.0, 0.9, 3.0))
+        before = fusion.launched
+        for drive, context in ((plain, contextlib.nullcontext()), (own, fusion)):
+            with context:
+                if k == 7:
+                    drive.reset(torch.arange(N) % 3 == 0)
+                drive.compute(ActuatorActions(target, None, None), q, v)
+        torch.testing.assert_close(own.applied_effort, plain.applied_effort, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(own.joint_friction, plain.joint_friction, rtol=1e-10, atol=1e-10)
+        launched.append(fusion.launched - before)
+    assert not fusion.left and launched[-1] == 1
+
+
 def test_what_a_kernel_cannot_do_is_done_by_torch_in_its_order(fusion):
     x = numbers(N, 3)
     with fusion:
@@ -130,9 +182,9 @@ def test_what_follows_the_physics_is_the_same_in_few_kernels():
         env.episode_length_buf[:] = torch.arange(NUM_ENVS) + 15
     after, rows, reset, forward = fused._after_physics, fused.sim.rows, fused.sim.reset, fused.sim.forward
 
-    def in_few_kernels(with_drives: bool) -> dict[str, torch.Tensor]:
+    def in_few_kernels() -> dict[str, torch.Tensor]:
         with fusion:
-            return after(with_drives)
+            return after()
 
     fused._after_physics = in_few_kernels  # type: ignore[method-assign]
     fused.sim.rows = lambda ids: ids if isinstance(ids, torch.Tensor) else rows(ids)  # type: ignore[method-assign]

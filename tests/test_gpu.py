@@ -9,7 +9,9 @@ import torch
 from problems import BENCH, record
 from test_masked_resets import NUM_ENVS, without_chance
 
+from pace_actuators.effects import EffectCfg, get_effect
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs.managers import ManagerTermBase, RewardTermCfg
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.comparison import compare
 from pace_optim.identification.fit import fit
@@ -57,7 +59,7 @@ def test_both_devices_and_both_ways_move_the_same(task: str):
     reference = cpu.sim.qpos.float()
     assert torch.allclose(graphs.sim.qpos.cpu(), reference, rtol=0.0, atol=2e-5)
     assert torch.allclose(plain.sim.qpos.cpu(), reference, rtol=0.0, atol=2e-5)
-    assert graphs._drive_graphs is not None and graphs._drive_graphs.num_graphs
+    assert graphs._graphs["simulate"].is_captured and not plain._graphs
 
 
 @on_gpu
@@ -113,9 +115,67 @@ def test_what_follows_the_physics_is_the_same_from_a_graph():
         assert torch.allclose(graph[1], plain[1], rtol=0.0, atol=1e-2) and torch.equal(graph[3], plain[3]), k
         for name, value in graph[4]["log"].items():
             assert float(value) == pytest.approx(float(plain[4]["log"][name]), abs=2e-2), (k, name)
-    assert envs[0]._manager_graph is not None and envs[0]._manager_graph.is_captured
-    assert envs[0]._manager_graph._fused.launched  # by kernels of several operations
-    assert envs[1]._manager_graph is None and bool(graph[3].any() or (envs[0].episode_length_buf < 25).any())
+    assert envs[0]._graphs["step"].is_captured and not envs[1]._graphs
+    assert envs[0]._graphs["step"]._fused.launched  # by kernels of several operations
+    assert bool(graph[3].any() or (envs[0].episode_length_buf < 25).any())
+
+
+class Smooth(ManagerTermBase):
+    """A user's reward that remembers torques."""
+
+    before: torch.Tensor | None = None
+
+    def __call__(self, env: ManagerBasedRLEnv) -> torch.Tensor:
+        torque = env.scene["robot"].data.applied_torque
+        change = torch.zeros_like(torque) if self.before is None else torque - self.before
+        self.before = torque.clone()
+        return -change.square().mean(dim=1)
+
+
+def _with_terms_of_ones_own(graphs: bool, reward: object, effects: tuple[str, ...] = ()) -> ManagerBasedRLEnv:
+    cfg = load_env_cfg("Pace-AnymalD-v0")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.device, cfg.sim.graphs = 8, 0, "cuda:0", graphs
+    cfg.episode_length_s = 0.1
+    cfg.rewards = {"smooth": RewardTermCfg(func=reward, weight=1.0)}
+    for drive in cfg.scene.robot.actuators.values():
+        drive.effects = [
+            EffectCfg(effect=name, values={each.name: each.start for each in get_effect(name).parameters})
+            for name in effects
+        ]
+        drive.delay = 2.5
+    env = ManagerBasedRLEnv(cfg)
+    env.reset(seed=0)
+    env.episode_length_buf.copy_(torch.arange(8, device="cuda:0"))
+    return env
+
+
+@on_gpu
+@pytest.mark.parametrize("effects", [(), ("stribeck_friction", "drive_bandwidth", "command_filter", "velocity_filter")])
+def test_effects_and_rewards_with_memory_are_the_same_from_a_graph(effects: tuple[str, ...]):
+    graph, plain = (_with_terms_of_ones_own(graphs, Smooth, effects) for graphs in (True, False))
+    rewards, ended = [], 0
+    for k in range(90):
+        action = torch.full((8, 12), 0.3 * (-1) ** (k // 7), device="cuda:0")
+        got, expected = graph.step(action), plain.step(action)
+        assert torch.allclose(graph.sim.qpos, plain.sim.qpos, rtol=0.0, atol=1e-5), k
+        assert torch.allclose(got[1], expected[1], rtol=1e-3, atol=1e-6), k
+        rewards.append(got[1])
+        ended += int(got[3].sum())
+    assert graph._graphs["step"].is_captured and ended >= 8
+    assert len({float(reward[0]) for reward in rewards[20:]}) > 20
+
+
+@on_gpu
+def test_a_reward_that_waits_for_the_gpu_is_told_and_runs_without_a_graph():
+    def waits(env: ManagerBasedRLEnv) -> torch.Tensor:
+        torque = env.scene["robot"].data.applied_torque
+        return torque.sum(dim=1) * float(torque.max() > 0.0)
+
+    env = _with_terms_of_ones_own(True, waits)
+    with pytest.warns(UserWarning, match=r"waits for the GPU.*\[W26\]"):
+        for _ in range(8):
+            env.step(torch.full((8, 12), 0.3, device="cuda:0"))
+    assert env._graphs["step"].is_refused
 
 
 @on_gpu

@@ -66,7 +66,7 @@ def test_terms_of_one_s_own_are_told_the_environments_unless_they_say_that_they_
     assert not counted.takes_masks
     cfg.events["shift"].func = state_only(shift)
     masked = ManagerBasedRLEnv(cfg)
-    assert masked.takes_masks and not masked.can_be_captured
+    assert masked.takes_masks and masked.can_be_captured
     masked.masks_resets = True
     assert step_both(counted, masked, steps=35)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -22,6 +23,8 @@ class CommandRateLimit(Effect):
 
     name = "command_rate_limit"
     stage = "command"
+    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    _target: torch.Tensor
     parameters = (
         EffectParameter(
             name="velocity",
@@ -45,8 +48,6 @@ class CommandRateLimit(Effect):
     def prepare(self) -> None:
         """Largest move per control step."""
         self._step = self.velocity * self.control_dt
-        if not hasattr(self, "_target"):
-            self._target = self.zeros()
 
     def command(self, s: DriveState) -> None:
         """Follow the target at the limit; the first counts as reached."""
@@ -70,6 +71,9 @@ class CommandAccelerationLimit(Effect):
 
     name = "command_acceleration_limit"
     stage = "command"
+    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0, "_speed": 0.0}
+    _target: torch.Tensor
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="acceleration",
@@ -98,8 +102,6 @@ class CommandAccelerationLimit(Effect):
         self._h = self.control_dt / self._steps
         self._off = off(self.acceleration)
         self._gain = torch.where(self._off, 1.0, self.acceleration) * self._h
-        if not hasattr(self, "_target"):
-            self._target, self._speed = self.zeros(), self.zeros()
 
     def command(self, s: DriveState) -> None:
         """Follow the target on the profile; the first counts as reached."""
@@ -124,6 +126,8 @@ class CommandFilter(Effect):
 
     name = "command_filter"
     stage = "command"
+    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    _target: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
     equation = "T dx/dt + x = q*, the controller follows x"
     looks = "late and too small in the fast parts; rounded steps"
@@ -136,8 +140,6 @@ class CommandFilter(Effect):
     def prepare(self) -> None:
         """Weight of a command in the target, one control step after it."""
         self._weight = -torch.expm1(-self.control_dt / self.time_constant)
-        if not hasattr(self, "_target"):
-            self._target = self.zeros()
 
     def command(self, s: DriveState) -> None:
         """Follow the command; the first counts as reached."""
@@ -279,6 +281,9 @@ class FastLoop(Effect):
 
     name = "fast_loop"
     stage = "controller"
+    memory: ClassVar[Mapping[str, float]] = {"_seen": 0.0, "_speed": 0.0}
+    _seen: torch.Tensor
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="share", unit="1", lower=0.0, upper=1.0, null=0.0, start=0.5, possible=(0.0, 1.0),
@@ -292,11 +297,6 @@ class FastLoop(Effect):
     two_sided = False
     separates = "recordings at another proportional gain"
     share: torch.Tensor
-
-    def prepare(self) -> None:
-        """Where the controller last ran."""
-        if not hasattr(self, "_seen"):
-            self._seen, self._speed = self.zeros(), self.zeros()
 
     def controller(self, s: DriveState) -> None:
         """Remember what it sees."""
@@ -322,6 +322,8 @@ class IntegralGain(Effect):
 
     name = "integral_gain"
     stage = "controller"
+    memory: ClassVar[Mapping[str, float]] = {"_integral": 0.0}
+    _integral: torch.Tensor
     parameters = (
         EffectParameter(name="gain", unit="N m/(rad s)", lower=0.0, upper=1000.0, null=0.0, start=10.0, meaning="ki"),
         EffectParameter(
@@ -347,8 +349,6 @@ class IntegralGain(Effect):
     def prepare(self) -> None:
         """What an error adds in a control step."""
         self._per_step = self.gain * self.control_dt
-        if not hasattr(self, "_integral"):
-            self._integral = self.zeros()
 
     def controller_effort(self, s: DriveState) -> None:
         """Add the integral's torque; it begins empty."""

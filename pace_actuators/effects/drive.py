@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -44,6 +45,9 @@ class TorqueFade(Effect):
 
     name = "torque_fade"
     stage = "drive"
+    memory: ClassVar[Mapping[str, float]] = {"_heat": 0.0, "_first": 0.0}
+    _heat: torch.Tensor
+    _first: torch.Tensor
     parameters = (
         EffectParameter(
             name="effort",
@@ -72,8 +76,6 @@ class TorqueFade(Effect):
         """What the heat takes, and how fast it follows."""
         self._per_heat = 1.0 / self.effort.square()
         self._weight = -torch.expm1(-self.dt / self.time_constant)
-        if not hasattr(self, "_heat"):
-            self._heat, self._first = self.zeros(), self.zeros()
 
     def remember(self, heat: Heat) -> None:
         """Begin as warm as the session has made the motor."""
@@ -133,6 +135,8 @@ class DriveBandwidth(Effect):
 
     name = "drive_bandwidth"
     stage = "drive"
+    memory: ClassVar[Mapping[str, float]] = {"_torque": 0.0}
+    _torque: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
     equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
     looks = "phase falls beyond what the delay explains"
@@ -147,8 +151,6 @@ class DriveBandwidth(Effect):
         decay = self.dt / self.time_constant
         self._weight = -torch.expm1(-decay)
         self._mean_weight = torch.where(decay.isinf(), 1.0, 1 - self._weight / decay)
-        if not hasattr(self, "_torque"):
-            self._torque = self.zeros()
 
     def current_loop(self, s: DriveState) -> None:
         """Give the mean torque over the coming step; the first counts as settled."""

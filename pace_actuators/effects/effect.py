@@ -118,7 +118,7 @@ class Effect:
         dt: Time between two calls of the drive (the physics step) [s].
         control_dt: Time between two runs of the controller [s], the control step unless the drive has its own.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
-        new_rows: Which rows have no history yet, (rows, 1) bool; ``None`` if all have.
+        new_rows: Which rows have no history yet, (rows, 1) bool; on the CPU ``None`` if all have.
     """
 
     name: ClassVar[str]
@@ -135,6 +135,9 @@ class Effect:
     """What a person would see in the data."""
     source: ClassVar[str] = ""
     """Where the equation comes from."""
+    memory: ClassVar[Mapping[str, float]] = {}
+    """What it keeps from step to step: attributes (rows, num_joints) by name, with the value that they begin with. A
+    step assigns new tensors to them."""
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
@@ -205,10 +208,13 @@ class Effect:
         self.dt, self.control_dt, self.delay_mode = dt, control_dt, delay_mode
         self.is_trapezoidal = False
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
+        self._on_device = torch.device(device).type == "cuda"
         self.new_rows: torch.Tensor | None = ~self._no_rows()
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
+        for name, value in self.memory.items():
+            setattr(self, name, self.full(value))
         self.prepare()
 
     # ---- what a subclass overrides -------------------------------------------------------------------------------
@@ -217,7 +223,7 @@ class Effect:
         """Compute what follows from the parameters; called after each change of them."""
 
     def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Forget the history of some of its rows: :meth:`take_new_rows` then tells of them."""
+        """Forget the history of some of its rows, (rows,) bool or a slice: :meth:`take_new_rows` then tells of them."""
         if self.new_rows is None:
             self.new_rows = self._no_rows()
         self.new_rows[rows] = True
@@ -292,7 +298,11 @@ class Effect:
             if new is not None:
                 self._target = torch.where(new, s.joint_pos_target, self._target)
         """
-        new, self.new_rows = self.new_rows, None
+        if self.new_rows is None or not self._on_device:
+            new, self.new_rows = self.new_rows, None
+            return new
+        new = self.new_rows.clone()  # a CUDA graph repeats it, and nobody asks whether there are some
+        self.new_rows.fill_(False)
         return new
 
     def full(self, value: float) -> torch.Tensor:

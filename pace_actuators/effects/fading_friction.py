@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -17,12 +18,9 @@ class _FadingFriction(Effect):
     stage = "friction"
     two_sided = False
     smooths_friction = True
+    memory: ClassVar[Mapping[str, float]] = {"_before": 0.0}
+    _before: torch.Tensor
     separates = "a staircase that holds each of its steps longer, and a slow triangle"
-
-    def prepare(self) -> None:
-        """Where it acts."""
-        if not hasattr(self, "_before"):
-            self._before = self.zeros()
 
     def middle_speed(self, s: DriveState) -> torch.Tensor:
         """The speed in the middle of the step, as the last two let expect [rad/s]; once per step."""

@@ -6,6 +6,8 @@ The simulator applies Coulomb friction itself, so that a stuck joint sticks; an 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 
@@ -191,6 +193,9 @@ class PreslidingFriction(Effect):
 
     name = "presliding_friction"
     stage = "friction"
+    memory: ClassVar[Mapping[str, float]] = {"_bristle": 0.0, "_position": 0.0}
+    _bristle: torch.Tensor
+    _position: torch.Tensor
     parameters = (
         EffectParameter(
             name="stiffness",
@@ -216,8 +221,6 @@ class PreslidingFriction(Effect):
         """Where it acts."""
         self._on = ~off(self.stiffness)
         self._sigma = torch.where(self._on, self.stiffness, 0.0)
-        if not hasattr(self, "_bristle"):
-            self._bristle, self._position = self.zeros(), self.zeros()
 
     def transmission(self, s: DriveState) -> None:
         """Take the Coulomb level over from the simulator.

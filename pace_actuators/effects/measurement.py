@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -67,6 +70,8 @@ class VelocityFilter(Effect):
 
     name = "velocity_filter"
     stage = "measurement"
+    memory: ClassVar[Mapping[str, float]] = {"_seen": 0.0}
+    _seen: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.003),)
     equation = "T dv_ctrl/dt + v_ctrl = v"
     looks = "too little damping above a few Hz"
@@ -79,8 +84,6 @@ class VelocityFilter(Effect):
     def prepare(self) -> None:
         """Weight of the newest speed."""
         self._weight = -torch.expm1(-self.control_dt / self.time_constant)
-        if not hasattr(self, "_seen"):
-            self._seen = self.zeros()
 
     def sensed_velocity(self, s: DriveState) -> None:
         """Filter the speed; the first counts as settled."""

@@ -15,6 +15,9 @@ Source: two-inertia system; EFFECTS of PACE on MuJoCo.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -34,6 +37,20 @@ class MountCompliance(Effect):
     changes_armature = True
     reads_load = True
     two_sided = False
+    memory: ClassVar[Mapping[str, float]] = {
+        "_angle": 0.0,
+        "_speed": 0.0,
+        "_joint_speed": 0.0,
+        "_rest": 0.0,
+        "_link": 0.0,
+        "_total": 1.0,
+    }
+    _angle: torch.Tensor
+    _speed: torch.Tensor
+    _joint_speed: torch.Tensor
+    _rest: torch.Tensor
+    _link: torch.Tensor
+    _total: torch.Tensor
     parameters = (
         EffectParameter(
             name="stiffness",
@@ -63,10 +80,6 @@ class MountCompliance(Effect):
         """Where it acts."""
         self._on = ~off(self.stiffness)
         self._k = torch.where(self._on, self.stiffness, 0.0)
-        if not hasattr(self, "_angle"):
-            zeros = self.zeros
-            self._angle, self._speed, self._joint_speed = zeros(), zeros(), zeros()
-            self._rest, self._link, self._total = zeros(), zeros(), zeros() + 1
 
     def advance(self, s: DriveState) -> None:
         """The base's step, now that the joint's speed after it is known; it begins at rest under its load."""

@@ -25,7 +25,7 @@ Source: Newmark 1959; Spong 1987 for the flexible joint.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -62,6 +62,15 @@ class _TwoMass(Effect):
     two_sided = False
     parts_motor_and_link = True
     reads_load = True
+    memory: ClassVar[Mapping[str, float]] = dict.fromkeys(
+        ("_angle", "_speed", "_drive", "_coupling", "_direction"), 0.0
+    ) | {"_inertia": 1.0}
+    _angle: torch.Tensor
+    _speed: torch.Tensor
+    _drive: torch.Tensor
+    _coupling: torch.Tensor
+    _direction: torch.Tensor
+    _inertia: torch.Tensor
     numerical_damping: ClassVar[float] = 0.05
     """Part of k h below which c does not fall (half of what it says is added there, so that a fit feels it): what is
     too fast for the step dies out, a resonance inside the band does not."""
@@ -86,10 +95,6 @@ class _TwoMass(Effect):
         self._on = self.switched_on()
         self._softness, self._loss = self.zeros(), self.zeros()
         self._take_sides()
-        if not hasattr(self, "_angle"):
-            zeros = self.zeros
-            self._angle, self._speed, self._link_speed = zeros(), zeros(), zeros()
-            self._drive, self._coupling, self._inertia, self._direction = zeros(), zeros(), zeros() + 1, zeros()
 
     def _take_sides(self) -> None:
         self._any, self._all = bool(self._on.any()), bool(self._on.all())

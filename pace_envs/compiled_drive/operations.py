@@ -8,84 +8,30 @@ from typing import Any
 import torch
 
 from pace_envs.compiled_drive.tape import Kind, Node, NotTraceableError, Tape
+from pace_envs.kernels.expressions import BINARY, COMPARED, LERP, UNARY, WHERE, power
 
-_UNARY = {
-    "neg": "-{0}",
-    "negative": "-{0}",
-    "positive": "{0}",
-    "abs": "fabs({0})",
-    "absolute": "fabs({0})",
-    "square": "({0} * {0})",
-    "sqrt": "sqrt({0})",
-    "rsqrt": "(1.0 / sqrt({0}))",
-    "reciprocal": "(1.0 / {0})",
-    "exp": "exp({0})",
-    "exp2": "exp2({0})",
-    "expm1": "expm1({0})",
-    "log": "log({0})",
-    "log2": "log2({0})",
-    "log10": "log10({0})",
-    "log1p": "log1p({0})",
-    "sin": "sin({0})",
-    "cos": "cos({0})",
-    "tan": "tan({0})",
-    "asin": "asin({0})",
-    "acos": "acos({0})",
-    "atan": "atan({0})",
-    "arctan": "atan({0})",
-    "sinh": "sinh({0})",
-    "cosh": "cosh({0})",
-    "tanh": "tanh({0})",
-    "erf": "erf({0})",
-    "floor": "floor({0})",
-    "ceil": "ceil({0})",
-    "trunc": "trunc({0})",
-    "round": "rint({0})",
-    "sign": "sign_of({0})",
-    "sgn": "sign_of({0})",
-    "sigmoid": "(1.0 / (1.0 + exp(-{0})))",
-    "relu": "larger({0}, 0.0)",
+_SAME = {
+    "negative": "neg",
+    "absolute": "abs",
+    "arctan": "atan",
+    "multiply": "mul",
+    "true_divide": "div",
+    "truediv": "div",
+    "mod": "remainder",
+    "less": "lt",
+    "greater": "gt",
+    "and": "logical_and",
+    "or": "logical_or",
+    "xor": "logical_xor",
+    "bitwise_and": "logical_and",
+    "bitwise_or": "logical_or",
+    "bitwise_xor": "logical_xor",
+    "bitwise_not": "logical_not",
+    "invert": "logical_not",
+    "subtract": "sub",
+    "clip": "clamp",
 }
-_BINARY = {
-    "mul": "({0} * {1})",
-    "multiply": "({0} * {1})",
-    "div": "({0} / {1})",
-    "true_divide": "({0} / {1})",
-    "truediv": "({0} / {1})",
-    "rdiv": "({1} / {0})",
-    "rtruediv": "({1} / {0})",
-    "minimum": "smaller({0}, {1})",
-    "maximum": "larger({0}, {1})",
-    "fmin": "fmin({0}, {1})",
-    "fmax": "fmax({0}, {1})",
-    "copysign": "copysign({0}, {1})",
-    "atan2": "atan2({0}, {1})",
-    "hypot": "hypot({0}, {1})",
-    "fmod": "fmod({0}, {1})",
-    "remainder": "remainder_of({0}, {1})",
-    "mod": "remainder_of({0}, {1})",
-}
-_COMPARE = {
-    "eq": "({0} == {1})",
-    "ne": "({0} != {1})",
-    "lt": "({0} < {1})",
-    "le": "({0} <= {1})",
-    "gt": "({0} > {1})",
-    "ge": "({0} >= {1})",
-    "less": "({0} < {1})",
-    "greater": "({0} > {1})",
-}
-_LOGIC = {
-    "logical_and": "({0} & {1})",
-    "logical_or": "({0} | {1})",
-    "logical_xor": "({0} != {1})",
-    "bitwise_and": "({0} & {1})",
-    "bitwise_or": "({0} | {1})",
-    "and": "({0} & {1})",
-    "or": "({0} | {1})",
-    "xor": "({0} != {1})",
-}
-_ASKS = {"isinf": "isinf({0})", "isnan": "isnan({0})", "isfinite": "isfinite({0})"}
+"""Other names of operations, and Python's; what is not a floating-point number is true or false."""
 
 
 class Operations:
@@ -97,10 +43,8 @@ class Operations:
         self._own: dict[str, Callable[..., Node]] = {
             "add": self.add,
             "sub": self.sub,
-            "subtract": self.sub,
             "rsub": lambda a, b, alpha=1: self.sub(b, a, alpha),
             "clamp": self.clamp,
-            "clip": self.clamp,
             "clamp_min": lambda a, min: self.clamp(a, min=min),
             "clamp_max": lambda a, max: self.clamp(a, max=max),
             "where": self.where,
@@ -110,18 +54,14 @@ class Operations:
             "pow": self.pow,
             "rpow": lambda a, b: self.pow(b, a),
             "nan_to_num": self.nan_to_num,
-            "logical_not": lambda a: self._bool("!{0}", a),
-            "bitwise_not": lambda a: self._bool("!{0}", a),
-            "invert": lambda a: self._bool("!{0}", a),
+            "rdiv": lambda a, b: self.of("div", b, a),
+            "rtruediv": lambda a, b: self.of("div", b, a),
+            "positive": self.double,
             "zeros_like": lambda a, **_: self._tape.constant(0.0),
             "ones_like": lambda a, **_: self._tape.constant(1.0),
             "full_like": lambda a, value, **_: self.node(value),
             "double": self.double,
         }
-
-    def knows(self, name: str) -> bool:
-        """Whether there is such an operation."""
-        return any(name in each for each in (self._own, _UNARY, _BINARY, _COMPARE, _LOGIC, _ASKS))
 
     def of(self, name: str, *arguments: Any, **options: Any) -> Node:
         """The result of an operation.
@@ -129,21 +69,18 @@ class Operations:
         Raises:
             NotTraceableError: If it is not known.
         """
+        name = _SAME.get(name, name)
         if name in self._own:
             return self._own[name](*arguments, **options)
         nodes = [self.node(each) for each in arguments]
         if options:
             raise NotTraceableError(f"{name} with {', '.join(options)}")
-        if name in _UNARY:
-            return self._tape.add(_UNARY[name], self.double(nodes[0]))
-        if name in _BINARY:
-            return self._tape.add(_BINARY[name], *map(self.double, nodes))
-        if name in _COMPARE:
-            return self._tape.add(_COMPARE[name], *map(self.double, nodes), kind="bool")
-        if name in _LOGIC:
-            return self._bool(_LOGIC[name], *nodes)
-        if name in _ASKS:
-            return self._tape.add(_ASKS[name], self.double(nodes[0]), kind="bool")
+        if name in UNARY or name in BINARY:
+            return self._tape.add({**UNARY, **BINARY}[name], *map(self.double, nodes))
+        if name.startswith("logical_"):
+            return self._bool(COMPARED[name], *nodes)
+        if name in COMPARED:
+            return self._tape.add(COMPARED[name], *map(self.double, nodes), kind="bool")
         raise NotTraceableError(f"torch's {name}")
 
     def node(self, value: Any) -> Node:
@@ -182,9 +119,9 @@ class Operations:
             return self._whole_clamp(node, min, max)
         node = self.double(node)
         if min is not None:
-            node = self._tape.add(_BINARY["maximum"], node, self.double(min))
+            node = self._tape.add(BINARY["maximum"], node, self.double(min))
         if max is not None:
-            node = self._tape.add(_BINARY["minimum"], node, self.double(max))
+            node = self._tape.add(BINARY["minimum"], node, self.double(max))
         return node
 
     def where(self, condition: Any, a: Any, b: Any) -> Node:
@@ -193,19 +130,17 @@ class Operations:
         kind: Kind = "bool" if one.kind == other.kind == "bool" else "double"
         if kind == "double":
             one, other = self.double(one), self.double(other)
-        return self._tape.add("({0} ? {1} : {2})", self._as_bool(condition), one, other, kind=kind)
+        return self._tape.add(WHERE, self._as_bool(condition), one, other, kind=kind)
 
     def lerp(self, a: Any, b: Any, weight: Any) -> Node:
         """From a to b, as torch does it."""
-        return self._tape.add("between({0}, {1}, {2})", self.double(a), self.double(b), self.double(weight))
+        return self._tape.add(LERP, self.double(a), self.double(b), self.double(weight))
 
     def pow(self, a: Any, b: Any) -> Node:
-        """Powers; squares as torch has them."""
-        if isinstance(b, (int, float)) and b == 2:
-            return self.of("square", a)
-        if isinstance(b, (int, float)) and b == 1:
-            return self.double(a)
-        return self._tape.add("pow({0}, {1})", self.double(a), self.double(b))
+        """Powers."""
+        if isinstance(b, (int, float)):
+            return self._tape.add(power("{0}", b), self.double(a))
+        return self._tape.add(power("{0}", "{1}"), self.double(a), self.double(b))
 
     def nan_to_num(self, a: Any, nan: float = 0.0, posinf: float | None = None, neginf: float | None = None) -> Node:
         """Numbers for what are none."""

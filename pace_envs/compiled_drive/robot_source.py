@@ -9,8 +9,9 @@ from itertools import accumulate
 import torch
 
 from pace_envs.compiled_drive.robot import STATE, WRITTEN, DriveProgram
-from pace_envs.compiled_drive.source import BEGIN, Names, changing_nodes, needed_nodes
+from pace_envs.compiled_drive.source import Names, changing_nodes, needed_nodes
 from pace_envs.compiled_drive.tape import Node, NotTraceableError
+from pace_envs.kernels.expressions import PRELUDE
 from pace_envs.moving_frame import COLUMNS, SOURCE
 
 ARGUMENTS = {
@@ -51,7 +52,7 @@ where its specific force was measured (recordings, 3), what is added to that (en
 of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
-_BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + BEGIN
+_BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + PRELUDE
 
 
 @dataclass(frozen=True, kw_only=True)

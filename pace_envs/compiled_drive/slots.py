@@ -130,9 +130,7 @@ class Places:
 
         def read() -> torch.Tensor:
             own: DelayBuffer = place.get()
-            assert own._storage is not None
-            whole = own._storage.view(own._length, own._num_envs, -1)[:, rows]
-            return whole.roll(-own._head, dims=0).expand(-1, *shape)
+            return own.history()[:, rows].expand(-1, *shape)
 
         self.delays.append((symbolic, read))
         self.put(holder, key, symbolic)

@@ -6,36 +6,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 from pace_envs.compiled_drive.tape import Node, Tape
+from pace_envs.kernels.expressions import PRELUDE
 
-BEGIN = """
-#ifdef __CUDACC_RTC__
-#define FUNCTION __device__ __forceinline__
-#else
-#include <math.h>
-#define FUNCTION static inline
-#endif
-FUNCTION double infinite() { return 1.0 / 0.0; }
-FUNCTION double not_a_number() { return 0.0 / 0.0; }
-FUNCTION double larger(double a, double b) { return a != a ? a : b != b ? b : a > b ? a : b; }
-FUNCTION double smaller(double a, double b) { return a != a ? a : b != b ? b : a < b ? a : b; }
-FUNCTION double sign_of(double a) { return (double)((a > 0.0) - (a < 0.0)); }
-FUNCTION double between(double a, double b, double w) {
-  return fabs(w) < 0.5 ? a + w * (b - a) : b - (b - a) * (1.0 - w);
-}
-FUNCTION double number_for(double a, double nan, double most, double least) {
-  return a != a ? nan : isinf(a) ? (a > 0.0 ? most : least) : a;
-}
-FUNCTION double remainder_of(double a, double b) {
-  double r = fmod(a, b);
-  return r != 0.0 && ((r < 0.0) != (b < 0.0)) ? r + b : r;
-}
-"""
 _ARGUMENTS = (
     "int count, int first, int last, int steps, int stride, const int* place, const double* leaves, "
     "const double* rings, const double* series, const int* slot, double* out"
 )
 _END = """
-#ifdef __CUDACC_RTC__
+#ifdef __CUDACC__
 extern "C" __global__ void simulate(ARGUMENTS) {
   const int e = blockIdx.x * blockDim.x + threadIdx.x;
   if (e < count) joint(e, NAMES);
@@ -110,7 +88,7 @@ def source_of(tape: Tape, updates: Mapping[int, Node], shown: Node, entries: Seq
     ]
     top, loop = "\n  ".join(before), "\n    ".join(inside)
     return (
-        f"{BEGIN}FUNCTION void joint(int e, {_ARGUMENTS}) {{\n  {top}\n"
+        f"{PRELUDE}FUNCTION void joint(int e, {_ARGUMENTS}) {{\n  {top}\n"
         f"  for (int k = first; k < last; ++k) {{\n    {loop}\n  }}\n}}\n{_END}"
     ), used
 

@@ -107,8 +107,8 @@ class Tape:
 def _text(value: float) -> str:
     """A number in C, to its last digit."""
     if math.isnan(value):
-        return "not_a_number()"
+        return "(INF - INF)"
     if math.isinf(value):
-        return "infinite()" if value > 0 else "(-infinite())"
+        return "INF" if value > 0 else "(-INF)"
     text = repr(value)
     return f"({text})" if value < 0 else text

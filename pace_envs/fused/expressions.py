@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from pace_envs.fused.writer import TYPES
+from pace_envs.kernels.expressions import BINARY, BITS, COMPARED, LERP, UNARY, WHERE, power
 
 
 def literal(value: float | bool | int, kind: str) -> str:
@@ -27,61 +27,16 @@ def cast(value: str, source: torch.dtype, target: torch.dtype) -> str:
     return f"({value} != 0)" if target == torch.bool else f"(({TYPES[target]}){value})"
 
 
-def _pow(x: str, exponent: Any) -> str:
-    if exponent == 2:
-        return f"{x} * {x}"
-    if exponent == 3:
-        return f"{x} * {x} * {x}"
-    return f"sqrt({x})" if exponent == 0.5 else f"pow({x}, {exponent})"
-
-
-def _clamp(x: str, least: str | None, most: str | None, kind: str) -> str:
-    low = x if least is None else f"({x} < {least} ? {least} : {x})"
-    return low if most is None else f"({low} > {most} ? {most} : {low})"
-
-
-def _infix(sign: str) -> Callable[..., str]:
-    return lambda a, b: f"({a} {sign} {b})"
-
-
-SAME: dict[str, Callable[..., str]] = {
-    "clone": lambda a: a,
-    "copy": lambda a: a,
-    "neg": lambda a: f"(-{a})",
-    "exp": lambda a: f"exp({a})",
-    "sin": lambda a: f"sin({a})",
-    "cos": lambda a: f"cos({a})",
-    "tanh": lambda a: f"tanh({a})",
-    "sqrt": lambda a: f"sqrt({a})",
-    "reciprocal": lambda a: f"(1 / {a})",
-    "floor": lambda a: f"floor({a})",
-    "ceil": lambda a: f"ceil({a})",
-    "mul": _infix("*"),
-    "div": _infix("/"),
-    "minimum": lambda a, b: f"({a} != {a} || {a} < {b} ? {a} : {b})",
-    "maximum": lambda a, b: f"({a} != {a} || {a} > {b} ? {a} : {b})",
-    "bitwise_and": _infix("&"),
-    "bitwise_or": _infix("|"),
-    "bitwise_xor": _infix("^"),
-    "addcmul": lambda a, b, c: f"fused({b}, {c}, {a})",
-    "lerp": lambda a, b, w: (
-        f"({w} < 0.5f && {w} > -0.5f ? fused({w}, {b} - {a}, {a}) : fused({a} - {b}, 1 - {w}, {b}))"
-    ),
+SAME = {
+    **UNARY,
+    **BINARY,
+    **BITS,
+    "clone": "{0}",
+    "copy": "{0}",
+    "addcmul": "fused({1}, {2}, {0})",
+    "lerp": LERP,
 }
-"""Of values of the result's type; ``fused(a, b, c)`` is a b + c, rounded once on a GPU, as torch's kernels there do."""
-
-COMPARED: dict[str, Callable[..., str]] = {
-    "gt": _infix(">"),
-    "ge": _infix(">="),
-    "lt": _infix("<"),
-    "le": _infix("<="),
-    "eq": _infix("=="),
-    "ne": _infix("!="),
-    "logical_and": lambda a, b: f"({a} != 0 && {b} != 0)",
-    "logical_or": lambda a, b: f"({a} != 0 || {b} != 0)",
-    "logical_not": lambda a: f"({a} == 0)",
-}
-"""Of values of the type that theirs have together; the result is a bool."""
+"""Of values of the result's type."""
 
 KNOWN = frozenset(
     {"add", "sub", "rsub", "abs", "_to_copy", "bitwise_not", "pow", "where", "masked_fill", "clamp", "clamp_min"}
@@ -108,12 +63,11 @@ def element(name: str, arguments: list[Any], options: dict[str, Any], kind: torc
             return None
         if name == "div" and options.get("rounding_mode") is not None:
             return None
-        if name == "copy":
-            return arguments[1:2], SAME[name], False
-        wanted = 3 if name in ("addcmul", "lerp") else 2 if _is_binary(name) else 1
-        return arguments[:wanted], SAME[name], False
+        if name == "abs" and not kind.is_floating_point:
+            return arguments[:1], lambda a: f"({a} < 0 ? -{a} : {a})", False
+        return (arguments[1:2] if name == "copy" else arguments[: 1 + _most(SAME[name])]), SAME[name].format, False
     if name in COMPARED:
-        return arguments[: 1 if name == "logical_not" else 2], COMPARED[name], True
+        return arguments[: 1 + _most(COMPARED[name])], COMPARED[name].format, True
     if name in ("add", "sub", "rsub"):
         alpha = arguments[2] if len(arguments) > 2 else options.get("alpha", 1)
         signed = literal(alpha if name == "add" else -alpha, c)
@@ -124,25 +78,23 @@ def element(name: str, arguments: list[Any], options: dict[str, Any], kind: torc
         if exact:
             return arguments[:2], lambda a, b: f"fused({signed}, {b}, {a})", False
         return (arguments[:2], lambda a, b: f"({a} {sign} {b})", False) if alpha == 1 else None
-    if name == "abs":
-        return arguments[:1], (lambda a: f"fabs({a})" if kind.is_floating_point else f"({a} < 0 ? -{a} : {a})"), False
     if name == "_to_copy":
         return arguments[:1], lambda a: a, False
     if name == "bitwise_not":
         return arguments[:1], (lambda a: f"(!{a})" if kind == torch.bool else f"(~{a})"), False
     if name == "pow" and isinstance(arguments[1], int | float):
-        return arguments[:1], lambda a: f"({_pow(a, arguments[1])})", False
+        return arguments[:1], lambda a: power(a, arguments[1]), False
     if name == "where" and len(arguments) == 3:
-        return arguments, lambda a, b, d: f"({a} ? {b} : {d})", False
+        return arguments, WHERE.format, False
     if name == "masked_fill":
-        return [arguments[1], arguments[2], arguments[0]], lambda a, b, d: f"({a} ? {b} : {d})", False
+        return [arguments[1], arguments[2], arguments[0]], WHERE.format, False
     if name in ("clamp", "clamp_min", "clamp_max"):
         least, most = [*arguments[1:3], None, None][:2] if name != "clamp_max" else (None, arguments[1])
         least, most = options.get("min", least), options.get("max", most)
         bounds = [bound for bound in (least, most) if bound is not None]
-        if least is None:
-            return [arguments[0], *bounds], lambda a, b: _clamp(a, None, b, c), False
-        return [arguments[0], *bounds], lambda a, b, d=None: _clamp(a, b, d, c), False
+        low = "{0}" if least is None else BINARY["maximum"].format("{0}", "{1}")
+        form = low if most is None else BINARY["minimum"].format(low, f"{{{len(bounds)}}}")
+        return [arguments[0], *bounds], form.format, False
     if name in ("zero", "zeros_like", "new_zeros"):
         return [0.0], lambda a: a, False
     if name == "ones_like":
@@ -152,5 +104,6 @@ def element(name: str, arguments: list[Any], options: dict[str, Any], kind: torc
     return None
 
 
-def _is_binary(name: str) -> bool:
-    return name in ("mul", "div", "minimum", "maximum", "bitwise_and", "bitwise_or", "bitwise_xor")
+def _most(form: str) -> int:
+    """The last operand of a form."""
+    return max(i for i in range(3) if f"{{{i}}}" in form)

@@ -8,7 +8,7 @@ import torch
 
 from pace_envs.fused.elementwise import Plan, elementwise, fits, loop_over, operation_of
 from pace_envs.fused.expressions import cast
-from pace_envs.fused.memory import Array, Mode, row_axis
+from pace_envs.fused.memory import Array, Index, Mode, elements, row_axis
 from pace_envs.fused.writer import Writer
 
 if TYPE_CHECKING:
@@ -108,3 +108,57 @@ def put(fusion: Fusion, func: Any, args: tuple, kwargs: dict[str, Any], target: 
 
     more: list[tuple[Array, Mode]] = [(at, ("shared", at.dtype))]
     return field, operation_of(emit, [from_], [to], axis, more=more)
+
+
+def _entries(
+    fusion: Fusion, table: torch.Tensor, dim: int, index: torch.Tensor
+) -> tuple[int, list[tuple[Index, int]]] | None:
+    """The axis of rows, and of an index's elements the cell where the table's place in other axes begins."""
+    axis = row_axis(tuple(index.shape), fusion.rows)
+    is_own = axis == row_axis(tuple(table.shape), fusion.rows) and table.ndim == index.ndim
+    if axis is None or not is_own or dim % table.ndim == table.ndim + axis or index.dtype != torch.int64:
+        return None
+    strides = [0 if d in (dim % table.ndim, table.ndim + axis) else each for d, each in enumerate(table.stride())]
+    begin = int(table.storage_offset())
+    every = elements(tuple(index.shape), axis)
+    return axis, [(each, begin + sum(i * stride for i, stride in zip(each, strides, strict=True))) for each in every]
+
+
+def gathered(fusion: Fusion, func: Any, args: tuple, kwargs: dict[str, Any], target: Any) -> Plan:
+    """Each row's entries of a table by their numbers along another axis."""
+    table, dim, index = args[:3]
+    found = _entries(fusion, table, dim, index)
+    if found is None or target is not None:
+        return None
+    axis, cells = found
+    result = torch.empty(index.shape, dtype=table.dtype, device=fusion.device)
+    from_, to, at = fusion.array(table), fusion.array(result, is_own=True), fusion.array(index)
+    if not loop_over(fusion, result, table, index)[0]:
+        return None
+
+    def emit(writer: Writer) -> None:
+        for each, cell in cells:
+            place = f"(long long)r * {table.stride(axis)} + {writer.load(at, each, axis)} * {table.stride(dim)}"
+            writer.store(to, each, axis, writer.load_at(from_, place, cell))
+
+    return result, operation_of(emit, [at, from_], [to], axis)
+
+
+def scattered(fusion: Fusion, func: Any, args: tuple, kwargs: dict[str, Any], target: Any) -> Plan:
+    """Write each row's entries of a table by their numbers along another axis."""
+    table, dim, index, source = args[:4]
+    found = None if kwargs or target is not table else _entries(fusion, table, dim, index)
+    if found is None or not isinstance(source, torch.Tensor) or source.shape != index.shape:
+        return None
+    axis, cells = found
+    to, from_, at = fusion.array(table), fusion.array(source), fusion.array(index)
+    if not loop_over(fusion, table, source, index)[0] or source.dtype != table.dtype:
+        return None
+
+    def emit(writer: Writer) -> None:
+        values = [(each, cell, writer.load(from_, each, axis)) for each, cell in cells]
+        for each, cell, value in values:
+            place = f"(long long)r * {table.stride(axis)} + {writer.load(at, each, axis)} * {table.stride(dim)}"
+            writer.store_at(to, place, cell, value)
+
+    return table, operation_of(emit, [at, from_], [to], axis)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pace_envs.fused.elementwise import Plan, elementwise, result_for
 from pace_envs.fused.expressions import KNOWN, element
-from pace_envs.fused.indexed import put, selected, taken
+from pace_envs.fused.indexed import gathered, put, scattered, selected, taken
 from pace_envs.fused.joined import cross, joined, repeat
 from pace_envs.fused.sums import norm, reduction
 
@@ -52,4 +52,6 @@ _OWN: dict[str, Callable[..., Plan]] = {
     "index": taken,
     "index_select": selected,
     "index_put": put,
+    "gather": gathered,
+    "scatter": scattered,
 }

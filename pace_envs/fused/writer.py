@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from pace_envs.fused.memory import Array, Index, Memory, Operation
+from pace_envs.kernels.expressions import PRELUDE
 
 TYPES = {
     torch.float32: "float",
@@ -21,8 +22,9 @@ TYPES = {
 SINGLE_WIDTH = 1024
 """Threads of the one block that goes over all rows."""
 
-_HEAD = """
-#define INF (1e300 * 1e300)
+_HEAD = (
+    PRELUDE
+    + """
 #ifdef __CUDACC__
 template <typename T> __device__ T whole(T value, int is_any) {
   __shared__ T parts[32];
@@ -37,23 +39,19 @@ template <typename T> __device__ T whole(T value, int is_any) {
   for (int i = 1; i < blockDim.x / 32; i++) value = is_any ? (T)(value || parts[i]) : (T)(value + parts[i]);
   return value;
 }
-__device__ float fused(float a, float b, float c) { return fmaf(a, b, c); }
-__device__ double fused(double a, double b, double c) { return fma(a, b, c); }
 #define KERNEL extern "C" __global__ void
 #define EACH_ROW int r = blockIdx.x * blockDim.x + threadIdx.x; if (r < rows)
 #define ALL_ROWS for (int r = threadIdx.x; r < rows; r += blockDim.x)
 #define ONCE __syncthreads(); if (threadIdx.x == 0)
 #else
-#include <cmath>
-using namespace std;
 template <typename T> static T whole(T value, int is_any) { return value; }
-template <typename T> static T fused(T a, T b, T c) { return a * b + c; }
 #define KERNEL extern "C" void
 #define EACH_ROW for (int r = 0; r < rows; r++)
 #define ALL_ROWS for (int r = 0; r < rows; r++)
 #define ONCE
 #endif
 """
+)
 
 
 class Writer:
@@ -163,5 +161,7 @@ def kernels(operations: Sequence[Operation]) -> list[tuple[int, str, list[Any]]]
         for operation in operations:
             if operation.phase == phase:
                 operation.emit(writer)
-        result.append((phase, writer.source(phase), writer.arguments()))
+        source = writer.source(phase)
+        if arguments := writer.arguments():  # else nothing of it is wanted
+            result.append((phase, source, arguments))
     return result

@@ -59,7 +59,7 @@ class ActionManager:
         self._terms = {name: term.class_type(term, env) for name, term in term_items(cfg).items()}
         self._sizes = [term.action_dim for term in self._terms.values()]
         self.action = torch.zeros(env.num_envs, sum(self._sizes), dtype=env.dtype, device=env.device)
-        self.prev_action = self.action.clone()
+        self.prev_action, self._given = self.action.clone(), self.action.clone()
 
     @property
     def total_action_dim(self) -> int:
@@ -72,6 +72,11 @@ class ActionManager:
         return list(self._terms)
 
     @property
+    def terms(self) -> list[ActionTerm]:
+        """The terms."""
+        return list(self._terms.values())
+
+    @property
     def takes_masks(self) -> bool:
         """Whether :meth:`reset` takes environments that are not counted, (num_envs,) bool, too."""
         return all(type(term).reset is ActionTerm.reset for term in self._terms.values())
@@ -81,15 +86,27 @@ class ActionManager:
         return self._terms[name]
 
     def process_action(self, action: torch.Tensor) -> None:
-        """Take an action, (num_envs, total_action_dim), where either may be 1 (:func:`checked_values`).
+        """Take an action, (num_envs, total_action_dim), where either may be 1, and hand it to the terms.
 
         Raises:
-            ValueError: If it is no tensor, or its shape is wrong.
+            ValueError: If it is no tensor, or its shape is wrong (:func:`checked_values`).
+        """
+        self.take_action(action)
+        self.process_taken()
+
+    def take_action(self, action: torch.Tensor) -> None:
+        """Copy an action to where :meth:`process_taken` finds it.
+
+        Raises:
+            ValueError: If it is no tensor, or its shape is wrong (:func:`checked_values`).
         """
         shape = (self.action.shape[0], self.action.shape[1])
-        checked = torch.as_tensor(checked_values(action, shape, "the action"))
+        self._given.copy_(torch.as_tensor(checked_values(action, shape, "the action")))
+
+    def process_taken(self) -> None:
+        """Hand the action that was taken to the terms."""
         self.prev_action.copy_(self.action)
-        self.action.copy_(checked)
+        self.action.copy_(self._given)
         start = 0
         for term, size in zip(self._terms.values(), self._sizes, strict=True):
             term.process_actions(self.action[:, start : start + size])

@@ -119,9 +119,9 @@ class CommandManager:
             term.compute(dt)
 
     @property
-    def is_own(self) -> bool:
-        """Whether all terms are this package's."""
-        return all(type(term).__module__.startswith("pace_envs.") for term in self._terms.values())
+    def terms(self) -> list[CommandTerm]:
+        """The terms."""
+        return list(self._terms.values())
 
     @property
     def takes_masks(self) -> bool:

@@ -100,7 +100,6 @@ def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
     return func
 
 
-_OWN = f"{__name__.partition('.')[0]}."
 CfgT = TypeVar("CfgT", bound=ManagerTermBaseCfg)
 
 
@@ -136,11 +135,6 @@ class Term(Generic[CfgT]):
     def changes_state_only(self) -> bool:
         """Whether it is an event that :func:`state_only` marks."""
         return getattr(self.func, "changes_state_only", False)
-
-    @property
-    def is_own(self) -> bool:
-        """Whether it is one of this package's: none of those waits for a GPU or keeps anything in Python."""
-        return (type(self.func) if isinstance(self.func, ManagerTermBase) else self.func).__module__.startswith(_OWN)
 
     @property
     def keeps_state(self) -> bool:

@@ -76,6 +76,8 @@ class RewardManager:
 
     def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
         """:meth:`reset` of environments that are not counted, (num_envs,) bool; not a number where there is none."""
+        if not self._terms:
+            return {}
         mean = torch.where(done, self._totals, 0.0).sum(dim=1) / (done.sum() * self._max_episode_length_s)
         self._totals.masked_fill_(done, 0.0)
         return {f"Episode_Reward/{name}": value for name, value in zip(self._sums, mean, strict=True)}
