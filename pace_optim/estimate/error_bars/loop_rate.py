@@ -20,6 +20,7 @@ from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, fil
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
+from pace_optim.terminal.parallel import parallel_map
 
 _RATES = (1e3, 2e3, 4e3, 8e3)
 """Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
@@ -159,7 +160,10 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
     periods = sorted({control, fitted, *(p for p in _SIMULATED if p < control), *slower, *continuous}, reverse=True)
     finest = min(*_SIMULATED, control) / _FINER
-    found = {p: end for p in periods if (end := _refitted(problem.with_loop(p, finest), x, there, known)) is not None}
+    ends = parallel_map(
+        lambda some: [_refitted(problem.with_loop(period, finest), x, there, known) for period in some], periods
+    )
+    found = {period: end for period, end in zip(periods, ends, strict=True) if end is not None}
     least = min((end.score for end in found.values()), default=math.inf)
     coarser = problem.physics_dt > _COARSE * _FINER * finest
     if fitted not in found or (coarser and float(there.residuals.score[0]) <= least):
