@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pace_actuators import JointValue, PaceDCMotorCfg
 from pace_actuators.config import Config
-from pace_envs.link_inertia import LinkInertia
+from pace_actuators.drive_result import LinkInertia
 
 
 @dataclass(kw_only=True)

@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 import torch
 
+from pace_actuators.drive_result import LinkInertia
 from pace_envs.quaternions import multiply
 from pace_envs.simulation import Simulation
 
@@ -54,24 +55,6 @@ PRIOR = 0.25
 _THINNEST = 0.01
 """Smallest radius of gyration of a reference, in parts of the largest: a rod of the file has none across."""
 _FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkInertia:
-    """A body's inertial parameters, in its own frame."""
-
-    mass: float
-    """[kg]."""
-    com: tuple[float, float, float]
-    """Centre of mass [m]."""
-    inertia: tuple[float, float, float, float, float, float]
-    """xx, yy, zz, xy, xz, yz about the centre of mass [kg m²]."""
-
-    def write(self, body: mujoco.MjsBody) -> None:
-        """Write them to a body of a model that is to be compiled."""
-        body.explicitinertial = True
-        body.mass, body.ipos, body.iquat = self.mass, self.com, (1.0, 0.0, 0.0, 0.0)
-        body.fullinertia = self.inertia
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,8 +128,8 @@ class Reference:
         pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
         return LinkInertia(
             mass=mass,
-            com=tuple(com.tolist()),  # type: ignore[arg-type]
-            inertia=tuple(float(tensor[pair]) for pair in pairs),  # type: ignore[arg-type]
+            com=com.tolist(),
+            inertia=[float(tensor[pair]) for pair in pairs],
         )
 
 
@@ -160,7 +143,10 @@ def write_links(spec: mujoco.MjSpec, links: Mapping[str, LinkInertia], source: o
     for name, link in links.items():
         if name not in names:
             raise ValueError(f"{source} has no link {name}, whose inertial parameters were identified: it has {names}.")
-        link.write(spec.body(name))
+        body = spec.body(name)
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat = link.mass, link.com, (1.0, 0.0, 0.0, 0.0)
+        body.fullinertia = link.inertia
 
 
 class LinkInertias:

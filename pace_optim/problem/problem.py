@@ -12,11 +12,11 @@ from typing import Any, Literal
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
+from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
-from pace_envs.link_inertia import LinkInertia
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
