@@ -154,7 +154,16 @@ def run_case(case: Case, options: list[str], label: str, diagnose: bool, cache: 
     runs = cache / "runs" / "links" / label / case.robot / case.name
     runs.mkdir(parents=True, exist_ok=True)
     words = [sys.executable, ROOT / "scripts" / "fit.py", "--task", wrong_file(case, cache), "--data", data]
-    words += ["--validation", held_out, "--log_dir", runs, *options, *(["--diagnose"] if diagnose else [])]
+    words += [
+        "--validation",
+        held_out,
+        "--log_dir",
+        runs,
+        "--drive_dt",
+        "0.001",
+        *options,
+        *(["--diagnose"] if diagnose else []),
+    ]
     started = time.monotonic()
     with (runs / "output.log").open("w") as output:
         code = subprocess.run(list(map(str, words)), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
@@ -191,7 +200,10 @@ def drive_errors(result: dict, truth: dict) -> dict[str, float]:
 
 def table(rows: list[dict]) -> str:
     """What is done, as Markdown."""
-    lines = ["| robot | file | fit | held out [mrad] | mass error | centre off [mm] | drives off | named |", "|" + "---|" * 8]
+    lines = [
+        "| robot | file | fit | held out [mrad] | mass error | centre off [mm] | drives off | named |",
+        "|" + "---|" * 8,
+    ]
     for row in rows:
         drives = ", ".join(f"{name} {100 * value:.1f} %" for name, value in row.get("drive_error", {}).items())
         mass = f"{100 * row['mass_error']:+.1f} %" if "mass_error" in row else ""

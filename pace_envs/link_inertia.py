@@ -144,9 +144,13 @@ def write_links(spec: mujoco.MjSpec, links: Mapping[str, LinkInertia], source: o
         if name not in names:
             raise ValueError(f"{source} has no link {name}, whose inertial parameters were identified: it has {names}.")
         body = spec.body(name)
+        xx, yy, zz, xy, xz, yz = link.inertia
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        turn = np.zeros(4)
+        mujoco.mju_mat2Quat(turn, (axes * [np.linalg.det(axes), 1.0, 1.0]).ravel())
         body.explicitinertial = True
-        body.mass, body.ipos, body.iquat = link.mass, link.com, (1.0, 0.0, 0.0, 0.0)
-        body.fullinertia = link.inertia
+        body.mass, body.ipos = link.mass, link.com
+        body.inertia, body.iquat, body.fullinertia = moments, turn, np.full(6, np.nan)
 
 
 class LinkInertias:
@@ -284,8 +288,8 @@ class LinkInertias:
             mujoco.mju_quat2Mat(turn, model.body_quat[b])
             back = turn.reshape(3, 3).T
             axis, anchor = back @ axis, back @ (anchor - model.body_pos[b])
-        options = {"dtype": torch.float64, "device": self.sim.device}
-        return torch.tensor(axis, **options), torch.tensor(anchor, **options)
+        found = np.stack([axis, anchor])
+        return tuple(torch.tensor(found, dtype=torch.float64, device=self.sim.device))  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False)

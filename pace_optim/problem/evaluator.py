@@ -256,7 +256,8 @@ class Evaluator:
         if not bool(std.isfinite().any()):
             return None
         if self._noise is None:
-            trained = [self.dataset.recordings[r] for r in self.dataset.trained()]
+            recordings = self.dataset.recordings
+            trained = [recordings[r] for r in self.dataset.trained()] or recordings
             self._noise = max(noise_variance(trained), _LEAST_NOISE**2)
         x = self.space.to_normalised(physical.to("cpu", torch.float64))
         return Prior(x=x, precision=std.pow(-2), noise=self._noise)

@@ -197,6 +197,16 @@ def _found_links(problem: Problem, values: dict[str, dict[str, float]]) -> dict[
     return {**problem.env_cfg.scene.robot.links, **found}
 
 
+def _file_values(problem: Problem) -> dict[str, dict[str, float]]:
+    """What the model file states of the parameters of links that were fitted, shaped as these."""
+    links = problem.env_cfg.sim2real.links
+    return {
+        name: {link.link: link.values[NAMES.index(name)] for link in links if name in link.names}
+        for name in NAMES
+        if name in problem.space.slices
+    }
+
+
 def make_result(
     problem: Problem,
     x: torch.Tensor,
@@ -250,11 +260,7 @@ def make_result(
         + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
         + notes_by_kind(data.recordings),
         links=_found_links(problem, values),
-        file_values={
-            name: {link.link: link.values[NAMES.index(name)] for link in problem.env_cfg.sim2real.links if name in link.names}
-            for name in NAMES
-            if name in values
-        },
+        file_values=_file_values(problem),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         **facts,
     )

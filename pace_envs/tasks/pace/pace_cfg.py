@@ -157,7 +157,7 @@ class PaceCfg(Config):
         self.bounds = {**self.bounds, name: torch.stack(ends, dim=1)}
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
-        """The same for some of the joints, in their order here; effects, links and parameters of one's own are left out."""
+        """The same for some of the joints, in their order here; without effects, links and extra parameters."""
         self.prepare()
         kept = [i for i, name in enumerate(self.joint_order) if name in joint_names]
         names = tuple(self.joint_order[i] for i in kept)

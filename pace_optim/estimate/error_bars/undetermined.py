@@ -212,9 +212,7 @@ def prior(problem: Problem) -> torch.Tensor:
             if (value := getattr(drive, name)) is not None and name in space.slices:
                 values = resolve_joint_values(value, own, field=name).to(torch.float64)
                 result[space[name]][[joints.index(joint) for joint in own]] = values
-    for parameter in space.parameters:
-        if parameter.prior is not None:
-            result[space[parameter.name]] = torch.tensor(parameter.start, dtype=torch.float64)
+    result = torch.where(space.prior.isfinite(), space.to_physical(torch.zeros(space.size)).double(), result)
     for cfg in effect_cfgs(problem.env_cfg.sim2real.effects):
         kind = cfg.effect_class
         for parameter in kind.parameters:

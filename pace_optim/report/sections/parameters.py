@@ -62,7 +62,8 @@ def _card(run: RunData, name: str) -> Markup:
         titles[key] += f" (file {file:.4g})"
     rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
-    head = ["link" if name in run.result.link_parameters else "joint", "value", "± std", "value and 95 % interval", "between its bounds", ""]
+    what = "link" if name in run.result.link_parameters else "joint"
+    head = [what, "value", "± std", "value and 95 % interval", "between its bounds", ""]
     return _article(in_words(name), unit, table(head, rows, "values"))
 
 
