@@ -148,7 +148,8 @@ def test_parameters_in_a_simulation_are_those_in_its_file_also_beside_a_load(tmp
         env.scene["robot"].add_body_mass("fore", 0.3, place=(0.05, 0.0, -0.2))
     for name, value in values.items():
         at_file = link.values[NAMES.index(name)]
-        written.scene["robot"].write_link_parameter_to_sim([link], name, torch.tensor([[at_file], [value]], dtype=torch.float64))
+        both = torch.tensor([[at_file], [value]], dtype=torch.float64)
+        written.scene["robot"].write_link_parameter_to_sim([link], name, both)
     for env in (written, compiled):
         env.sim.qpos[:] = torch.tensor([0.4, -0.7])
         env.sim.forward()

@@ -17,6 +17,7 @@ from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
+from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
@@ -172,13 +173,19 @@ class Problem:
         finest = longest / max(1, math.ceil(longest / (physics_dt or self.physics_dt) * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, finest, self.env_cfg.sim2real.effects))
 
-    def with_links(self, links: Mapping[str, LinkInertia]) -> Problem:
-        """The same with these inertial parameters of links, which are not identified any more."""
+    def seeking(self, links: Sequence[Reference]) -> Problem:
+        """The same with the inertial parameters of these links identified."""
         plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
         for each in (plain, cfg):
-            each.scene.robot.links = {**each.scene.robot.links, **links}
-            each.sim2real.links = ()
+            each.sim2real.links = tuple(links)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    def with_links(self, links: Mapping[str, LinkInertia]) -> Problem:
+        """The same with these inertial parameters of links, which are not identified any more."""
+        known = self.seeking(())
+        for each in (known.plain_cfg, known.env_cfg):
+            each.scene.robot.links = {**each.scene.robot.links, **links}
+        return known
 
     @property
     def loop_dt(self) -> float:

@@ -201,9 +201,9 @@ def _added_mass_at(value: Any, masses: Mapping[str, float], source: str) -> dict
     if isinstance(value, str):  # in an .npz
         with suppress(ValueError):  # the message below shows what is no JSON
             value = parsed_json(value)
-    places = {body: as_array(place) for body, place in value.items()} if isinstance(value, Mapping) else {"": None}
+    places = {body: as_array(at) for body, at in (value if isinstance(value, Mapping) else {"": ""}).items()}
     for body, place in places.items():
-        if place is None or place.dtype.kind not in "iuf" or place.shape != (3,) or not np.isfinite(place).all():
+        if place.dtype.kind not in "iuf" or place.shape != (3,) or not np.isfinite(place).all():
             raise ValueError(
                 f"{source}: added_mass_at is {value!r}; expected {{body: [x, y, z]}} in m (in an .npz as JSON text). "
                 'Write it as {"body_name": [0, 0, 0.08]}.'
