@@ -7,8 +7,8 @@ and g = Jᵀr of the base parameters and of what is tried, a part of a link woul
 
     Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
 
-The most promising are fitted to the whole robot. A link is named if nothing is left: with all that is named the error
-on samples that were not fitted is at the noise. What also leaves nothing on a single joint is its look-alike.
+The most promising are fitted to the whole robot. Links are named if little is left: the error on samples that were not
+fitted is at the noise, or a small part of what it was. What leaves as little on a single joint is a look-alike.
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ class LinksCfg:
     """Nothing is looked for where the error is less than this many times the noise."""
     left: float = 1.15
     """At this many times the noise nothing is left."""
+    clear: float = 5.0
+    """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
+    a link."""
     pays: float = 1.5
     """What a link must lower the error by."""
     alike: float = 1.10
@@ -144,11 +147,14 @@ def find_wrong_links(
         if best is None or best.rmse * cfg.pays > now.rmse:
             break
         now, found = best, best.problem.env_cfg.sim2real.links
-    if not found or now.rmse > cfg.left * noise:
+    if not found or now.rmse > max(cfg.left * noise, base.rmse / cfg.clear):
         return LinkFindings()
     say("fitting what looks like a wrong link")
-    likes = _look_alikes(base, now, noise, cfg)
-    if likes:
+    likes = _look_alikes(base, cfg)
+    left = max(now.rmse, noise)
+    if any(rmse * cfg.alike < left for rmse in likes.values()):
+        return LinkFindings()
+    if likes := {name: rmse for name, rmse in likes.items() if rmse <= cfg.alike * left}:
         names = ", ".join(reference.link for reference in found)
         return LinkFindings(
             sentences=[
@@ -254,9 +260,9 @@ def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[i
     return float(g @ inverse_of(hessian[at[:, None], at].numpy())[0] @ g)
 
 
-def _look_alikes(base: _Fitted, now: _Fitted, noise: float, cfg: LinksCfg) -> list[str]:
-    """Effects on a single joint that leave as little as the wrong links."""
-    problem, found = base.problem, []
+def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
+    """The error with each effect on the joint where it explains most, {effect on joint: RMSE [rad]}."""
+    problem, found = base.problem, dict[str, float]()
     values = problem.space.to_dict(problem.space.to_physical(base.x))
     had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
     for effect in LOOK_ALIKES:
@@ -276,8 +282,7 @@ def _look_alikes(base: _Fitted, now: _Fitted, noise: float, cfg: LinksCfg) -> li
         }
         joint = max(gains, key=lambda each: gains[each])
         alone = _fit(problem.with_effects([*problem.effects, f"{effect}@{re.escape(joint)}"]), values, cfg)
-        if alone.rmse <= cfg.alike * max(now.rmse, noise):
-            found.append(f"{effect} on {joint}")
+        found[f"{effect} on {joint}"] = alone.rmse
     return found
 
 
