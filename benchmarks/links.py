@@ -28,7 +28,11 @@ import numpy as np
 from wheel_plant import Drives, Plant, commands, draw, load, log
 from wheel_robots import CACHE, GROUPS, ROOT, Robot, _write_log, model_file
 
-SECONDS, HELD_OUT_SECONDS = 20.0, 8.0
+from pace_optim.diagnosis.wrong_links import find_wrong_links
+from pace_optim.run.open import open_problem
+from pace_optim.run.result import FitResult
+
+SECONDS, HELD_OUT_SECONDS = 10.0, 6.0
 _ERD = "cmeel.prefix/share/example-robot-data/robots"
 _SUITE = "robosuite/models/assets/robots"
 ROBOTS = {
@@ -131,7 +135,7 @@ def make_logs(case: Case, cache: Path) -> tuple[Path, Path, Drives]:
     seed = zlib.crc32(case.robot.encode()) % 10_000 + case.seed
     drives = draw(load(path), seed)
     drives = replace(drives, rate=400.0)
-    kind = case.name if case.kind == "tool" else f"clean_{case.seed}"
+    kind = f"{case.name if case.kind == 'tool' else f'clean_{case.seed}'}_{SECONDS:g}s"
     files = folder / f"{kind}.csv", folder / f"{kind}_held_out.csv"
     for number, (file, seconds) in enumerate(zip(files, (SECONDS, HELD_OUT_SECONDS), strict=True), start=1):
         if not file.is_file():
@@ -148,8 +152,8 @@ def truth_of(case: Case, path: Path) -> tuple[float, np.ndarray]:
     return float(model.body_mass[b]), model.body_ipos[b].copy()
 
 
-def run_case(case: Case, options: list[str], label: str, diagnose: bool, cache: Path) -> dict:
-    """Fit one robot as a user would; returns its line."""
+def run_case(case: Case, options: list[str], label: str, name: bool, cache: Path) -> dict:
+    """Fit one robot as a user would, and perhaps ask which link is wrong; returns its line."""
     data, held_out, drives = make_logs(case, cache)
     runs = cache / "runs" / "links" / label / case.robot / case.name
     runs.mkdir(parents=True, exist_ok=True)
@@ -162,7 +166,6 @@ def run_case(case: Case, options: list[str], label: str, diagnose: bool, cache: 
         "--drive_dt",
         "0.001",
         *options,
-        *(["--diagnose"] if diagnose else []),
     ]
     started = time.monotonic()
     with (runs / "output.log").open("w") as output:
@@ -181,10 +184,20 @@ def run_case(case: Case, options: list[str], label: str, diagnose: bool, cache: 
         row["mass_error"] = found["mass"] / mass - 1
         row["com_error_mm"] = 1e3 * float(np.linalg.norm(np.array(found["com"]) - com))
     row["links"] = sorted(result.get("links", {}))
-    if (Path(folder) / "diagnosis.json").is_file():
-        diagnosis = json.loads((Path(folder) / "diagnosis.json").read_text())
-        row |= {"verdict": diagnosis["verdict"], "added": diagnosis["added"], "named_links": diagnosis.get("links", [])}
-    return row
+    return row | (named(folder) if name else {})
+
+
+def named(run: str) -> dict:
+    """What the first step of a diagnosis says of the links, from a fit with the file alone."""
+    started = time.monotonic()
+    result = FitResult.load(run)
+    problem = open_problem(run)
+    found = find_wrong_links(problem, problem.space.from_dict(result.parameters))
+    return {
+        "named": [each.label for each in found.wrong],
+        "said": [*(each.sentence for each in found.wrong), *found.sentences],
+        "named_s": time.monotonic() - started,
+    }
 
 
 def drive_errors(result: dict, truth: dict) -> dict[str, float]:
@@ -208,7 +221,7 @@ def table(rows: list[dict]) -> str:
         drives = ", ".join(f"{name} {100 * value:.1f} %" for name, value in row.get("drive_error", {}).items())
         mass = f"{100 * row['mass_error']:+.1f} %" if "mass_error" in row else ""
         com = f"{row['com_error_mm']:.2g}" if "com_error_mm" in row else ""
-        named = ", ".join([*row.get("named_links", []), *row.get("added", [])]) or row.get("verdict", "")
+        named = ", ".join(row["named"]) or "nothing" if "named" in row else ""
         held_out = f"{row['held_out_mrad']:.3g}" if "held_out_mrad" in row else f"exit {row['exit']}"
         lines.append(
             f"| {row['robot']} | {row['case']} | {row['label']} | {held_out} | {mass} | {com} | {drives} | {named} |"
@@ -221,7 +234,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), metavar="ROBOT")
     parser.add_argument("--kinds", nargs="+", default=["clean", "mass", "com", "tool"], metavar="KIND")
-    parser.add_argument("--labels", nargs="+", default=["file", "links"], help="file: the file alone; links; diagnose")
+    parser.add_argument(
+        "--labels", nargs="+", default=["file", "links"], help="file: with the file alone; links: with --links"
+    )
     parser.add_argument("--table", action="store_true", help="print what is done, run nothing")
     parser.add_argument("--cache", type=Path, default=CACHE)
     args = parser.parse_args()
@@ -235,7 +250,7 @@ def main() -> None:
                 continue
             parts = {"mass": "mass", "com": "com", "tool": "mass,com,inertia"}.get(case.kind)
             options = ["--links", f"{case.link}@{parts}"] if label == "links" else []
-            row = run_case(case, options, label, label == "diagnose", args.cache)
+            row = run_case(case, options, label, label == "file", args.cache)
             rows = [r for r in rows if (r["robot"], r["case"], r["label"]) != (case.robot, case.name, label)] + [row]
             done.write_text("".join(json.dumps(r) + "\n" for r in rows))
             print(json.dumps(row), flush=True)

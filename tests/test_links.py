@@ -17,6 +17,7 @@ from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_en
 from pace_envs.identified import use_identified
 from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
+from pace_optim.diagnosis.wrong_links import LinkFindings, LinksCfg, find_wrong_links
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined
@@ -103,7 +104,13 @@ def drawn(link: Reference, seed: int) -> dict[str, float]:
     return found
 
 
-def fit(problem, iterations: int = 6):
+def fit(problem, iterations: int = 10, held: tuple[str, ...] = ()):
+    if held:
+        physical = problem.space.to_physical(problem.space.start)
+        for name in held:
+            physical[problem.space[name]] = TRUE[name]
+        labels = [label for label in problem.space.labels if label.split("/")[0] in held]
+        problem = dataclasses.replace(problem, space=problem.space.holding(labels, physical))
     colouring = colour(problem.space, problem.trees, problem.joint_names)
     evaluator = problem.training_evaluator()
     start = problem.space.start.clone()
@@ -193,7 +200,7 @@ def test_a_wrong_mass_and_centre_are_found(tmp_path):
     link = reference("fore")
     true = link.inertia({"link_mass": 0.92, "link_com_x": 0.02})
     problem = make_problem(recorded(tmp_path, {"fore": true}), cfg=arm_cfg(tmp_path, ["fore@mass,com"]))
-    x, uncertainty = fit(problem)
+    x, uncertainty = fit(problem, held=("armature", "viscous_friction", "friction", "delay"))
     found = problem.space.to_dict(problem.space.to_physical(x))
     std = problem.space.to_dict(torch.as_tensor(uncertainty.std))
     assert found["link_mass"]["fore"] * abs(found["link_com_z"]["fore"]) == pytest.approx(0.92 * 0.12, rel=0.02)
@@ -267,3 +274,21 @@ def test_a_load_s_place_is_read_and_refused_where_it_means_nothing():
 
 def test_nothing_is_sought_without_being_asked_for():
     assert env_cfg().sim2real.links == ()
+
+
+@pytest.mark.slow
+def test_a_diagnosis_names_a_wrong_link_and_what_is_wrong_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("pace_optim.diagnosis.wrong_links.LOOK_ALIKES", ("torque_gain",))
+    true = reference("fore").inertia({"link_mass": 0.92})
+    recording = recorded(tmp_path, {"fore": true}, noise=1e-4)
+    problem = make_problem(recording, cfg=arm_cfg(tmp_path), train_fraction=0.6)
+    x, _ = fit(problem)
+    found = find_wrong_links(problem, problem.space.to_physical(x), cfg=LinksCfg(tried=2))
+    assert [each.label for each in found.wrong] == ["fore@mass"]
+    assert found.links["fore"].mass == pytest.approx(0.92, rel=1e-3) and found.after < 1.2e-4 < found.before
+    assert found.wrong[0].sentence.startswith("The model file is wrong about the link fore (mass): mass 0.92")
+
+
+def test_a_diagnosis_names_no_link_of_a_file_that_is_right(tmp_path):
+    problem = make_problem(recorded(tmp_path, {}, noise=1e-4), cfg=arm_cfg(tmp_path), train_fraction=0.6)
+    assert find_wrong_links(problem, problem.space.from_dict(TRUE)) == LinkFindings()

@@ -31,7 +31,7 @@ from pace_optim.estimate.error_bars.uncertainty import SURE, inverse_of
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.problem import Problem
 
-LOOK_ALIKES = ("torque_gain", "parallel_spring", "torque_offset")
+LOOK_ALIKES = ("torque_gain", "proportional_gain", "parallel_spring", "torque_offset")
 """Effects on one joint that look like a wrong link."""
 _CHOICES = (("mass",), ("com",), ("mass", "com"), tuple(PARTS))
 """What may be wrong with a link, the fewest parameters first."""
