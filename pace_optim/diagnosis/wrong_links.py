@@ -60,6 +60,8 @@ class LinksCfg:
     """Candidates of a round that are fitted, ..."""
     of_link: int = 3
     """and so many of them of one link."""
+    iterations: int = 8
+    """Of each fit, at most."""
     most: int = 3
     """Wrong links, at most."""
 
@@ -147,7 +149,10 @@ def find_wrong_links(
         if best is None or best.rmse * cfg.pays > now.rmse:
             break
         now, found = best, best.problem.env_cfg.sim2real.links
-    if not found or now.rmse > max(cfg.left * noise, base.rmse / cfg.clear):
+    if not found:
+        return LinkFindings()
+    now = _fit(now.problem, _values_of(now), cfg, whole=True)
+    if now.rmse > max(cfg.left * noise, base.rmse / cfg.clear):
         return LinkFindings()
     say("fitting what looks like a wrong link")
     likes = _look_alikes(base, cfg)
@@ -203,7 +208,7 @@ def _best_addition(
     # what is found stays as the file has it: its parameters begin where the last round left them
     every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
     whole = problem.seeking(tuple(replace(each, names=NAMES) for each in every))
-    values = problem.space.to_dict(problem.space.to_physical(now.x))
+    values = _values_of(now)
     candidates = _screened(whole, _values_in(whole, values), every, found, cfg)
     fitted: list[tuple[int, _Fitted]] = []
     for addition in sorted(candidates[: cfg.tried], key=lambda each: len(each.names)):
@@ -263,7 +268,7 @@ def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[i
 def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
     """The error with each effect on the joint where it explains most, {effect on joint: RMSE [rad]}."""
     problem, found = base.problem, dict[str, float]()
-    values = problem.space.to_dict(problem.space.to_physical(base.x))
+    values = _values_of(base)
     had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
     for effect in LOOK_ALIKES:
         if effect in had:
@@ -286,12 +291,12 @@ def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
     return found
 
 
-def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg) -> _Fitted:
-    """The problem fitted from near: on pieces, then on all that is trained on."""
-    colouring, x = _colouring(problem), _values_in(problem, values)
-    near = LeastSquaresCfg(max_iteration=12, score_tolerance=1e-3, noise_score=noise_score(problem))
-    for stage in (problem.on_pieces(cfg.share), problem):
-        x = least_squares(stage.training_evaluator(), colouring, [x], near)[0].x
+def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg, *, whole: bool = False) -> _Fitted:
+    """The problem fitted from near, on pieces, or on all that is trained on."""
+    near = LeastSquaresCfg(max_iteration=cfg.iterations, score_tolerance=1e-3, noise_score=noise_score(problem))
+    stage = problem if whole else problem.on_pieces(cfg.share)
+    start = _values_in(problem, values)
+    x = least_squares(stage.training_evaluator(), _colouring(problem), [start], near)[0].x
     return _Fitted(problem, x, _held_out(problem, problem.space.to_physical(x)))
 
 
@@ -304,6 +309,11 @@ def _values_in(problem: Problem, values: Mapping[str, Mapping[str, float]]) -> t
             if key in values.get(parameter.name, {}):
                 physical[i] = values[parameter.name][key]
     return space.to_normalised(physical).clamp(-1.0, 1.0)
+
+
+def _values_of(fitted: _Fitted) -> dict[str, dict[str, float]]:
+    space = fitted.problem.space
+    return space.to_dict(space.to_physical(fitted.x))
 
 
 def _held_out(problem: Problem, physical: torch.Tensor) -> float:
