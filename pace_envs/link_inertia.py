@@ -47,9 +47,9 @@ UNITS = dict(zip(NAMES, ("kg", *["m"] * 6, *["1"] * 3), strict=True))
 """Unit by name."""
 POSITIVE = (PARTS["mass"][0], *PARTS["inertia"][:3])
 """Those above 0: their prior is one of their logarithm."""
-MASS_FACTOR, RADIUS_FACTOR, SHEAR = 2.0, 1.5, 0.3
+MASS_FACTOR, RADIUS_FACTOR, SHEAR, LEAST_REACH = 2.0, 1.5, 0.3, 0.03
 """The prior's standard deviation: mass and radii by these factors, shears by this. That of the centre of mass is the
-link's largest radius of gyration in the file."""
+link's largest radius of gyration in the file, at least this [m]: a tool on a small flange moves it far."""
 PRIOR = 0.25
 """The same as part of half a bound range: bounds are four standard deviations from the file's value."""
 _THINNEST = 0.01
@@ -99,7 +99,7 @@ class Reference:
         if name in POSITIVE:
             factor = (MASS_FACTOR if name == POSITIVE[0] else RADIUS_FACTOR) ** far
             return value / factor, value * factor
-        reach = far * (max(self.values[4:7]) if name in PARTS["com"] else SHEAR)
+        reach = far * (max(LEAST_REACH, *self.values[4:7]) if name in PARTS["com"] else SHEAR)
         return value - reach, value + reach
 
     def pseudo_inertia(self, values: torch.Tensor) -> torch.Tensor:
