@@ -25,6 +25,20 @@ _LONGEST = 100.0
 """Delay, and time between two control steps [s]: of no drive, and so that numbers of steps are numbers."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class LinkInertia:
+    """A link's inertial parameters, in its own frame."""
+
+    mass: float
+    """[kg]."""
+
+    com: Sequence[float]
+    """Centre of mass, (3,) [m]."""
+
+    inertia: Sequence[float]
+    """xx, yy, zz, xy, xz, yz about the centre of mass, (6,) [kg m²]."""
+
+
 @dataclass(kw_only=True)
 class DriveResult:
     """What an identification says of the drives; field names are the file's keys."""
@@ -45,6 +59,8 @@ class DriveResult:
     """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
     drive: dict[str, dict[str, float]] = field(default_factory=dict)
     """Gains and limits per joint that were in force in every recording, as far as known."""
+    links: dict[str, LinkInertia] = field(default_factory=dict)
+    """Links whose inertial parameters were identified, by name."""
     undetermined: list[str] = field(default_factory=list)
     """Labels (``parameter/joint``) of what the recordings do not determine: it keeps its prior value."""
 
@@ -93,6 +109,9 @@ class DriveResult:
                 if value < 0 or (value == 0 and name in _ABOVE_ZERO):
                     bound = "above 0" if name in _ABOVE_ZERO else "of at least 0"
                     refuse(source, f"drive/{name} of {key} is {value:g}, expected a number {bound}", CURE)
+        for name, link in self.links.items():
+            if not link.mass > 0 or len(link.com) != 3 or len(link.inertia) != 6 or not min(link.inertia[:3]) > 0:
+                refuse(source, f"links/{name} is no rigid body: expected mass > 0, com (3) and inertia (6) > 0", CURE)
         if not 0 <= self.delay_s <= _LONGEST:
             refuse(source, f"delay_s is {self.delay_s:g}, expected 0 to {_LONGEST:g} [s]", CURE)
         if not 1e-9 < self.physics_dt <= self.control_dt * (1 + 1e-6) <= _LONGEST:

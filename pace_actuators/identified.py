@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pace_actuators.base_parameters import PER_JOINT
-from pace_actuators.drive_result import ALL, CURE, DriveResult, result_path
+from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia, result_path
 from pace_actuators.effects import EffectCfg, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
@@ -83,6 +83,9 @@ class IdentifiedDrives:
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Gains and limits per joint that were in force in every recording, as far as known."""
 
+    links: Mapping[str, LinkInertia] = field(default_factory=dict)
+    """Inertial parameters of links that were identified, by name."""
+
     undetermined: frozenset[str] = frozenset()
     """Labels ``parameter/joint`` that the recordings do not determine: their value is that of the configuration."""
 
@@ -126,6 +129,7 @@ class IdentifiedDrives:
             correlation=content.correlation,
             effects=tuple(_parsed(path, label) for label in content.effects),
             drive=content.drive,
+            links=content.links,
             undetermined=frozenset(content.undetermined),
             at_bound=tuple(content.at_bound),
             times_noise=content.times_noise,

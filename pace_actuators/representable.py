@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pace_actuators.identified import RIG_EFFECTS, IdentifiedDrives
+from pace_actuators.text import listed
 
 if TYPE_CHECKING:
     from pace_actuators.pace_dc_motor import PaceDCMotor
@@ -57,7 +58,7 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
     Raises:
         ValueError: If an effect changes friction or reads the inertia at every step, and the world has no way to do so.
     """
-    notes = []
+    notes = [] if world.bodies else link_notes(drives)
     for cfg in drives.effects:
         kind = cfg.effect_class
         if kind.name in RIG_EFFECTS:
@@ -84,6 +85,16 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             if world.friction_hook:
                 notes.append(f"{kind.name} changes the joint's friction at every physics step: {world.friction_hook}.")
     return notes
+
+
+def link_notes(drives: IdentifiedDrives) -> list[str]:
+    """What becomes of the inertial parameters of links where only drives are written, in words."""
+    if not drives.links:
+        return []
+    return [
+        f"the inertial parameters of {listed(list(drives.links))} are of links, not of drives: use the model that "
+        "pace export --format mjcf --joints_only writes, which has them."
+    ]
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:

@@ -10,8 +10,8 @@ from pace_actuators import ActuatorActions, PaceDCMotor
 from pace_actuators.base_parameters import BASE_PARAMETERS, CARRIED
 from pace_actuators.effects import Effect, effect_cfgs
 from pace_envs.articulation_cfg import ArticulationCfg
-from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, indices, pick
-from pace_envs.link_model import LinkModel
+from pace_envs.indexing import EnvIds, JointIds, checked_values, indices, pick
+from pace_envs.link_inertia import LinkInertias, Reference
 from pace_envs.robot_state import RobotState
 from pace_envs.simulation import Simulation
 
@@ -35,9 +35,8 @@ class Articulation(RobotState):
             ValueError: If names in the configuration do not fit the model.
         """
         super().__init__(cfg, sim)
-        self._link_model: LinkModel | None = None
+        self._links = LinkInertias(sim, self.joint_names)
         self._columns: dict[PaceDCMotor, torch.Tensor] = {}
-        self._added_mass = torch.zeros(sim.num_envs, sim.model.nbody, dtype=sim.dtype, device=sim.device)
         self._build_actuators()
         self.reset()
 
@@ -99,11 +98,35 @@ class Articulation(RobotState):
                 bias[:, local] = values[:, chosen]
                 actuator.update_encoder_bias(bias)
 
-    def add_body_mass(self, name_keys: str | Sequence[str], mass: float, env_ids: EnvIds = None) -> None:
-        """Add a known mass to bodies, at their centres of mass [kg]; effects on the model do not scale it."""
+    def add_body_mass(
+        self,
+        name_keys: str | Sequence[str],
+        mass: float,
+        env_ids: EnvIds = None,
+        place: Sequence[float] | None = None,
+    ) -> None:
+        """Add a known point mass to bodies [kg]; effects on the model and parameters of links do not change it.
+
+        Args:
+            name_keys: The bodies.
+            mass: [kg].
+            env_ids: The environments.
+            place: Where, in the body's frame, (3,) [m]; ``None``: at its centre of mass.
+        """
         rows, (ids, _) = indices(env_ids), self.find_bodies(name_keys)
-        for field in (self._added_mass, self._sim.expand("body_mass")):
-            assign(field, rows, torch.tensor(ids, device=field.device), field[rows][:, ids] + mass)
+        self._links.add_load(ids, mass, place, rows)
+        self._sim.constants_changed()
+
+    def write_link_parameter_to_sim(self, references: Sequence[Reference], name: str, values: torch.Tensor) -> None:
+        """Write an inertial parameter of links.
+
+        Args:
+            references: The links.
+            name: One of :data:`~pace_envs.link_inertia.NAMES`.
+            values: In its unit, (num_envs, len(references)).
+        """
+        for reference, value in zip(references, values.unbind(dim=1), strict=True):
+            self._links.write_parameter(reference, name, value)
         self._sim.constants_changed()
 
     def write_data_to_sim(self) -> None:
@@ -241,9 +264,8 @@ class Articulation(RobotState):
 
     def _write_model(self, actuator: PaceDCMotor, effect: Effect) -> None:
         """Write an effect on the rigid bodies; loads have been written before."""
-        self._link_model = self._link_model or LinkModel(self._sim, self.joint_names, self._added_mass)
         for local, joint in enumerate(self.joints_of(actuator)):
-            effect.write_model(self._link_model.of(effect.rows, joint), local)
+            effect.write_model(self._links.of(effect.rows, joint), local)
         self._sim.note_model_effect(effect, self._columns_of(actuator))
         self._sim.constants_changed()
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from pace_actuators import JointValue, PaceDCMotorCfg
 from pace_actuators.config import Config
+from pace_actuators.drive_result import LinkInertia
 
 
 @dataclass(kw_only=True)
@@ -64,6 +65,9 @@ class ArticulationCfg(Config):
 
     held_joints: Mapping[str, float] = field(default_factory=dict)
     """Joints of the model that do not move, and where they are held [rad, of slides m]: they are taken out of it."""
+
+    links: Mapping[str, LinkInertia] = field(default_factory=dict)
+    """Inertial parameters of links by name, in place of the file's: those that were identified."""
 
     soft_joint_pos_limit_factor: float = 1.0
     """Part of the joint range that counts as the soft limit, 0 to 1."""

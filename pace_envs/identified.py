@@ -42,7 +42,8 @@ def use_identified(
 ) -> list[str]:
     """Give the robot of an environment the drives that a fit identified.
 
-    Armature, frictions, encoder bias, delay, delay mode and effects become the identified ones. Gains and limits stay
+    Armature, frictions, encoder bias, delay, delay mode, effects and the inertial parameters of links become the
+    identified ones. Gains and limits stay
     the environment's: they are the policy's controller. Where the identification took steps of second order, so does
     the environment on the processor, and at its control step as fine ones; on a GPU drives take half a step back
     (``PaceDCMotorCfg.second_order``).
@@ -65,6 +66,7 @@ def use_identified(
     drives = IdentifiedDrives.of(identified)
     notes = check_representable(drives, HERE)
     cfg.scene.robot.actuators = groups = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
+    cfg.scene.robot.links = {**cfg.scene.robot.links, **drives.links}
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
         cfg.sim.integrator = "leapfrog"
         at = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])

@@ -11,6 +11,7 @@ import numpy as np
 
 from pace_actuators import match_names
 from pace_envs.articulation_cfg import ArticulationCfg
+from pace_envs.link_inertia import write_links
 from pace_envs.model_file import compile_model, read_model_file
 
 
@@ -31,6 +32,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
         for note in file.notes:
             warnings.warn(f"{cfg.mjcf_path}: {note}", stacklevel=2)
         _name_geoms(spec)
+    write_links(spec, cfg.links, cfg.mjcf_path)
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if cfg.fix_base:
         for joint in free:

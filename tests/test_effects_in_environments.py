@@ -71,7 +71,6 @@ def test_a_payload_of_nothing_keeps_a_loaded_robot_bit_for_bit():
         bench = Bench(load={"load_mass": 0.7})
         bench = Bench(effects, load={"load_mass": 0.7}) if effects else bench
         bench.robot.add_body_mass("load", 0.1)
-        bench.robot._link_model = None
         if effects:
             bench.robot.write_effect_parameter_to_sim("payload", "ratio", torch.zeros(1, 1, dtype=torch.float64))
         masses.append(bench.env.sim.expand("body_mass").clone())
@@ -258,7 +257,6 @@ def test_payload_and_com_offset_are_a_hand_changed_model():
 
 def test_payload_does_not_scale_a_known_added_mass():
     bench = Bench(["payload"], load=HEAVY)
-    bench.robot._link_model = None
     bench.robot.add_body_mass("load", 0.8)
     bench.robot.write_effect_parameter_to_sim("payload", "ratio", torch.full((1, 1), 0.5, dtype=torch.float64))
     load = bench.env.sim.model.body("load").id

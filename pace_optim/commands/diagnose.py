@@ -58,7 +58,8 @@ def run_and_tell(settings: DiagnosisSettings) -> None:
     diagnosis = diagnose(settings, on_verdict=_tell)
     if len(diagnosis.runs) > 1:
         before, after = (errors_of(FitResult.load(run), "all") for run in (diagnosis.runs[0], diagnosis.runs[-1]))
-        print(f"whole robot with {' and '.join(diagnosis.paying)}: {after} mrad (train / validation), before {before}")
+        with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
+        print(f"whole robot with {' and '.join(with_what)}: {after} mrad (train / validation), before {before}")
     for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
         print(f"report: {Path(run) / 'report.html'}")
     print(f"run: {diagnosis.runs[-1]}")

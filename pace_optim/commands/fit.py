@@ -52,6 +52,13 @@ def main() -> None:
         help="effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared",
     )
     parser.add_argument(
+        "--links",
+        nargs="+",
+        default=[],
+        metavar="REGEX",
+        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia with some of these",
+    )
+    parser.add_argument(
         "--unknown",
         nargs="+",
         default=[],

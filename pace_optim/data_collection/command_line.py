@@ -99,7 +99,7 @@ def make_collection_parser() -> Parser:
     robot.add_argument("--load_length", type=number, metavar="M", help="test bench: length of the arm")
     robot.add_argument("--arm_mass", type=number, metavar="KG", help="test bench: mass of the arm")
     robot.add_argument(
-        "--added_mass", action="extend", nargs="+", default=[], metavar="BODY=KG", help="masses added to bodies"
+        "--added_mass", action="extend", nargs="+", default=[], metavar="BODY=KG[@X,Y,Z]", help="masses added to bodies"
     )
     encoder = parser.add_argument_group("encoder")
     encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
@@ -125,13 +125,27 @@ def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
     """
     options = take_common_options(vars(args))
     drop_paces_options(options)
+    added = options.pop("added_mass")
     load = Load(
-        added_mass=_pairs("--added_mass", options.pop("added_mass"), "BODY=KG"),
+        added_mass=_pairs("--added_mass", [word.partition("@")[0] for word in added], "BODY=KG"),
+        added_mass_at=dict(_place(word) for word in added if "@" in word),
         **{key: options.pop(key) for key in ("load_mass", "load_length", "arm_mass")},
     )
     parameters = _pairs("--parameter", options.pop("parameter"), "NAME=VALUE or NAME/JOINT=VALUE")
     effects = tuple(options.pop("effect"))
     return CollectionCfg(load=load, parameters=parameters, effects=effects, **options)
+
+
+def _place(word: str) -> tuple[str, tuple[float, float, float]]:
+    """Body and place of BODY=KG@X,Y,Z."""
+    mass, _, text = word.partition("@")
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError(f"--added_mass {word}: expected BODY=KG@X,Y,Z with three numbers [m] in the body's frame.")
+    return mass.partition("=")[0], (x, y, z)
 
 
 def _pairs(option: str, words: Sequence[str], form: str) -> dict[str, float]:

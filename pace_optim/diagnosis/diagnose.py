@@ -11,12 +11,13 @@ from pathlib import Path
 from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
-from pace_optim.diagnosis.findings.findings import Findings, told
+from pace_optim.diagnosis.findings.findings import Findings, told, with_links
 from pace_optim.diagnosis.findings.result import FILE, Diagnosis
 from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.selection.decisions import FILE as DECISIONS
 from pace_optim.diagnosis.selection.decisions import Decision, as_lines
 from pace_optim.diagnosis.settings import DiagnosisSettings
+from pace_optim.diagnosis.wrong_links import LinkFindings, find_wrong_links
 from pace_optim.identification.fit import fit
 from pace_optim.joints.fits.fits import fits_on
 from pace_optim.joints.fits.labels import labels
@@ -56,8 +57,13 @@ def diagnose(
     candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
     fits = fits_on(settings.device, settings.cfg.fitting)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
-    problem = _as_found(run.problem(physics_dt=physics_dt, effects=()), result)
-    base = {name: result.parameters[name] for name in problem.space.slices}
+    whole = _as_found(run.problem(physics_dt=physics_dt), result).with_links(result.links)
+    values = {name: result.parameters[name] for name in whole.space.slices}
+    wrong = LinkFindings()
+    if not settings.only:
+        wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say)
+    problem = whole.with_effects(()).with_links(wrong.links)
+    base = {name: (wrong.values or values)[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)
     candidates = candidate_effects(settings.effects, only=settings.only, switched_off=off)
     decisions: list[Decision] = []
@@ -74,14 +80,16 @@ def diagnose(
         cfg=settings.cfg,
         fits=fits,
     )
-    diagnosis = told(found, fits, problem, result, folder, candidates)
+    diagnosis = with_links(told(found, fits, problem, result, folder, candidates), wrong, problem)
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()
     on_verdict(diagnosis)
     explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
-    if refit and found.paying and (path := _refit(found, problem, run, diagnosis, progress)) is not None:
+    refit = refit or (bool(wrong.wrong) and settings.refit is None)
+    pays = bool(found.paying or wrong.wrong)
+    if refit and pays and (path := _refit(found, wrong, problem, run, diagnosis, progress)) is not None:
         diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
         _save(diagnosis, decisions)
     return diagnosis
@@ -121,22 +129,27 @@ def _save(diagnosis: Diagnosis, decisions: Sequence[Decision]) -> None:
     write_together(files)
 
 
-def _refit(found: Findings, problem: Problem, run: Run, diagnosis: Diagnosis, progress: ProgressLine) -> Path | None:
+def _refit(
+    found: Findings, wrong: LinkFindings, problem: Problem, run: Run, diagnosis: Diagnosis, progress: ProgressLine
+) -> Path | None:
     """Fit the whole robot with what was found, from where the search ended; returns the new run's folder.
 
     ``None`` if the user breaks it off: the new folder keeps what it needs to go on, and the diagnosis.
     """
-    progress.say(f"fitting the whole robot with {', '.join(found.paying)}")
-    final = found.outcome.final
+    progress.say(f"fitting the whole robot with {', '.join([*(each.link for each in wrong.wrong), *found.paying])}")
+    final, before = found.outcome.final, FitResult.load(run.folder)
+    links = {name: dict(before.parameters[name]) for name in before.link_parameters}
+    for each in wrong.wrong:
+        for value in each.values:
+            links.setdefault(value["parameter"], {})[each.link] = value["found"]
     settings = replace(
         run.settings,
         effects=labels(final.model, problem.joint_names),
+        links=[*run.settings.links, *(each.label for each in wrong.wrong)],
         optimizer="least_squares",
         physics_dt=problem.physics_dt,
         start=started_from(
-            whole_values(final.model, final.x, problem.joint_names),
-            FitResult.load(run.folder).parameters,
-            problem.unknown,
+            whole_values(final.model, final.x, problem.joint_names) | links, before.parameters, problem.unknown
         ),
         check_consistency=False,  # the run has done it
         log_dir=str(run.folder.absolute().parent.parent),

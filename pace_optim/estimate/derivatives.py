@@ -227,8 +227,13 @@ class Jacobian:
                 result[entry] = by_joint[list(self.colouring.joints[entry])].sum()
         return result / self.residuals.where.sum()
 
+    def gradient_at(self, x: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+        """Half of the score's derivative, (size,), at another vector (size,) with its error (K, R, n) [rad]."""
+        gradient, prior = self.transposed_times(error), self.residuals.prior
+        return gradient if prior is None else gradient + prior.gradient_at(x) / self.residuals.where.sum()
+
     def normal_equations(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """JᵀJ (size, size) and Jᵀr (size,), divided by the number of samples as the score is."""
+        """JᵀJ (size, size) and Jᵀr (size,) with the prior's, divided by the number of samples as the score is."""
         size = len(self.colouring.joints)
         hessian, gradient = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
         row_of = {entry: c for c, entries in enumerate(self.colouring.colours) for entry in entries}
@@ -241,5 +246,7 @@ class Jacobian:
             at = torch.tensor(entries)
             hessian[at[:, None], at] += block @ block.T
             gradient[at] += block @ error
+        if (prior := self.residuals.prior) is not None:
+            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient
         samples = self.residuals.where.sum()
         return hessian / samples, gradient / samples

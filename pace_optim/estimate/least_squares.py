@@ -216,7 +216,7 @@ def _iterate(
         gain, error = step.take(evaluator, where)
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
-        step = _Step(descent, hessian, jacobian.transposed_times(error))
+        step = _Step(descent, hessian, jacobian.gradient_at(descent.x, error))
     if descent.scores[-1] < descent.scores[-2]:
         descent.gradient, descent.refused = None, 0
     else:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.files import write_atomically
+from pace_envs.link_inertia import NAMES
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf
 from pace_optim.export.mjlab_native import mjlab_native_python
@@ -36,7 +37,7 @@ class Export:
 def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """Values per joint, what all joints share written out, in SI units."""
     joints = drives.joint_names
-    names = [name for name in drives.parameters if name != "delay"]
+    names = [name for name in drives.parameters if name != "delay" and name not in NAMES]
     content = {
         "version": 1,
         "joint_names": list(joints),
@@ -46,6 +47,7 @@ def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         "physics_dt_s": drives.at.physics_dt,
         "drive": {name: dict(values) for name, values in drives.drive.items()},
         "effects": [effect.label for effect in drives.effects],
+        "links": {name: asdict(link) for name, link in drives.links.items()},
         "parameters": {name: drives.determined(name, joints) for name in names},
     }
     return json.dumps(content, indent=2) + "\n", []

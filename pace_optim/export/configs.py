@@ -10,7 +10,7 @@ from typing import Any
 from pace_actuators import IdentifiedAt, IdentifiedDrives, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
-from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable
+from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, link_notes
 from pace_envs.generated_python import Call, Word, python_page
 from pace_envs.identified import load_identified_cfg
 
@@ -102,6 +102,7 @@ ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS
 
 def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[str, Any]) -> tuple[str, list[str]]:
     notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
+    notes += link_notes(drives) if world is HERE else []
     if world.friction_hook and _is_implicit(drives):
         notes.append(
             f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."

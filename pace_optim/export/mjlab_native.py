@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.representable import link_notes
 from pace_envs.generated_python import Call, python_page
 from pace_optim.export import mjlab_native_template
 from pace_optim.export.configs import about, digits
@@ -30,7 +31,7 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         ValueError: If the environment of the identification is not available.
     """
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS), *link_notes(drives)]
     calls = [mjlab_actuator(drives, joint, drive) for joint, drive in plain.items()]
     values = {
         "_ABOUT_": about(drives, ", for mjlab 1.6 alone", notes),

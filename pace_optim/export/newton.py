@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 
 from pace_actuators import IdentifiedDrives
+from pace_actuators.representable import link_notes
 from pace_envs.generated_python import python_page
 from pace_optim.export import newton_template
 from pace_optim.export.configs import about, digits
@@ -31,7 +32,7 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         ValueError: If the environment of the identification is not available.
     """
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS)]
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS), *link_notes(drives)]
     names = {"armature": "armature", "friction": "friction", "viscous_friction": "damping"}
     joints = {
         joint: {

@@ -13,11 +13,50 @@ from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset
+from pace_optim.recording.noise import noise_variance
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
 _WIDEST = 512
+
+
+_LEAST_NOISE = 1e-7
+"""Noise that a prior is weighed by where recordings have less [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prior:
+    """What is known of parameters before the recordings, of m candidates: Gaussians around 0, normalised.
+
+    With the noise σ of a sample, Σ_samples error² + σ² Σ_i (x_i / std_i)² is least at the most probable parameters.
+    """
+
+    x: torch.Tensor
+    """The candidates, normalised (m, size)."""
+    precision: torch.Tensor
+    """1/std², (size,); 0 where there is no prior."""
+    noise: float
+    """σ² [rad²]."""
+
+    @property
+    def penalty(self) -> torch.Tensor:
+        """What it adds to the sum of squared errors, (m,) [rad²]."""
+        return self.noise * (self.x.square() @ self.precision)
+
+    @property
+    def gradient(self) -> torch.Tensor:
+        """Half of its derivative at the first candidate, (size,) [rad²]."""
+        return self.gradient_at(self.x[0])
+
+    def gradient_at(self, x: torch.Tensor) -> torch.Tensor:
+        """Half of its derivative, (size,) [rad²], at a candidate (size,)."""
+        return self.noise * self.precision * x
+
+    @property
+    def hessian(self) -> torch.Tensor:
+        """Half of its second derivative, (size, size) [rad²]."""
+        return self.noise * torch.diag(self.precision)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,15 +71,19 @@ class Residuals:
     """Control step of each of the K steps, (K,)."""
     weight: torch.Tensor | None = None
     """What errors were multiplied by, (K, R, n): see :attr:`~pace_optim.recording.dataset.Dataset.weight`."""
+    prior: Prior | None = None
+    """Of the candidates; ``None``: no parameter has one."""
 
     def rows(self, begin: int, end: int) -> Residuals:
         """Those of some of the candidates."""
-        return replace(self, error=self.error[begin:end])
+        prior = None if self.prior is None else replace(self.prior, x=self.prior.x[begin:end])
+        return replace(self, error=self.error[begin:end], prior=prior)
 
     @property
     def score(self) -> torch.Tensor:
-        """Mean over the samples of Σ_joints error², (m,) [rad²]; infinite where a simulation diverged."""
-        return self.joint_score.sum(dim=1)
+        """Mean over the samples of Σ_joints error², (m,) [rad²], with the prior's penalty; infinite if it diverged."""
+        score = self.joint_score.sum(dim=1)
+        return score if self.prior is None else score + self.prior.penalty / self.where.sum()
 
     @property
     def joint_score(self) -> torch.Tensor:
@@ -78,6 +121,7 @@ class Evaluator:
         self.phases = phases
         """What is not known of free phases; ``None`` where no base moves, or no candidate has been simulated yet."""
         self._phases_at: torch.Tensor | None = None
+        self._noise: float | None = None
         self._make_env = make_env
         self._nearby = nearby
         self._rollouts: dict[int, Rollout] = {}
@@ -201,10 +245,22 @@ class Evaluator:
             error.mul_(kept[:, None, :, None])
         error = error.permute(1, 0, 2, 3)
         if data.weight is None or self.phases is None:
-            return Residuals(error=error, where=kept, step=step)
+            return Residuals(error=error, where=kept, step=step, prior=self._prior(physical))
         weight = data.weight[step]
         error = self.phases.taken_out(error, step, mask).mul_(weight)
-        return Residuals(error=error, where=kept, step=step, weight=weight)
+        return Residuals(error=error, where=kept, step=step, weight=weight, prior=self._prior(physical))
+
+    def _prior(self, physical: torch.Tensor) -> Prior | None:
+        """What is known of candidates (m, size) beforehand."""
+        std = self.space.prior
+        if not bool(std.isfinite().any()):
+            return None
+        if self._noise is None:
+            recordings = self.dataset.recordings
+            trained = [recordings[r] for r in self.dataset.trained()] or recordings
+            self._noise = max(noise_variance(trained), _LEAST_NOISE**2)
+        x = self.space.to_normalised(physical.to("cpu", torch.float64))
+        return Prior(x=x, precision=std.pow(-2), noise=self._noise)
 
 
 def _same(one: torch.Tensor | None, other: torch.Tensor) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters, effect_parameters
+from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters, effect_parameters, link_parameters
 from pace_optim.problem.box import Box
 
 if TYPE_CHECKING:
@@ -45,11 +45,15 @@ class ParameterSpace:
         self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
         log = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
         self._box = Box(self.lower, self.upper, log)
+        self.prior = torch.tensor(
+            [float("inf") if p.prior is None else p.prior for p in parameters for _ in p.keys], dtype=torch.float64
+        )
+        """Standard deviation of each entry's prior around 0, normalised, (size,); infinite where there is none."""
 
     @classmethod
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
-        """The space of a robot's configuration: the base parameters, the effects', and the user's own."""
-        return cls((*base_parameters(cfg), *effect_parameters(cfg), *cfg.extra_parameters))
+        """The space of a robot's configuration: the base parameters, the effects', links', and the user's own."""
+        return cls((*base_parameters(cfg), *effect_parameters(cfg), *link_parameters(cfg), *cfg.extra_parameters))
 
     def by_magnitude(self) -> ParameterSpace:
         """The same entries, on a logarithmic scale where no value is negative and the bounds span magnitudes.
@@ -177,4 +181,4 @@ class ParameterSpace:
             trees: Groups of joint names.
         """
         tree_of = {joint: t for t, joints in enumerate(trees) for joint in joints}
-        return [None if key == GLOBAL else tree_of[key] for p in self.parameters for key in p.keys]
+        return [None if key == GLOBAL else tree_of[key] for p in self.parameters for key in p.joints or p.keys]

@@ -12,13 +12,15 @@ from typing import Any, Literal
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
+from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
+from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
-from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
+from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -171,6 +173,20 @@ class Problem:
         finest = longest / max(1, math.ceil(longest / (physics_dt or self.physics_dt) * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, finest, self.env_cfg.sim2real.effects))
 
+    def seeking(self, links: Sequence[Reference]) -> Problem:
+        """The same with the inertial parameters of these links identified."""
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            each.sim2real.links = tuple(links)
+        return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    def with_links(self, links: Mapping[str, LinkInertia]) -> Problem:
+        """The same with these inertial parameters of links, which are not identified any more."""
+        known = self.seeking(())
+        for each in (known.plain_cfg, known.env_cfg):
+            each.scene.robot.links = {**each.scene.robot.links, **links}
+        return known
+
     @property
     def loop_dt(self) -> float:
         """Shortest time between two runs of the drives' loops [s]; 0: one runs continuously."""
@@ -299,6 +315,7 @@ def load_problem(
     drive_dt: float | None = None,
     control_dt: float | None = None,
     effects: Sequence[EffectCfg | str] = (),
+    links: Sequence[str] = (),
     unknown: Sequence[str] = (),
     env_cfg: Any = None,
     joints: str | None = None,
@@ -321,6 +338,8 @@ def load_problem(
         control_dt: Time between two commands to a model file's robot [s]; ``None``: as logged, at most 2.5 ms.
         effects: Physical effects beyond the base model, ``"name"``, ``"name@joints"`` or ``"name@shared"``; none
             keeps the configuration's.
+        links: Links whose inertial parameters are identified, regular expressions of their names: ``"name"`` or
+            ``"name@mass,com,inertia"`` with some of these.
         unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
@@ -348,7 +367,7 @@ def load_problem(
         if facts is not stated:
             env.close()
             env = facts.make_env()
-        return _posed(facts, logs, env, effects, unknown, strict=strict, max_duration=max_duration, tell=tell)
+        return _posed(facts, logs, env, effects, links, unknown, strict=strict, max_duration=max_duration, tell=tell)
     finally:
         env.close()
 
@@ -358,6 +377,7 @@ def _posed(
     logs: Logs,
     env: ManagerBasedRLEnv,
     effects: Sequence[EffectCfg | str],
+    links: Sequence[str],
     unknown: Sequence[str],
     *,
     strict: bool,
@@ -369,6 +389,7 @@ def _posed(
     sim2real, robot, control_dt = cfg.sim2real, env.scene["robot"], facts.control_dt
     physics_dt = set_drive_step(cfg, env) if facts.physics_dt is None else facts.physics_dt
     sim2real.slide_joints = robot.slide_joints
+    sim2real.links = sought_links(env.sim.model, robot.joint_names, links)
     groups = [conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups]
     groups = [[on_moving_base(recording, env) for recording in group] for group in groups]
     groups = [[without_loops_of_torques(env, recording) for recording in group] for group in groups]

@@ -449,7 +449,7 @@ class Rollout:
         if load and apply_load is not None:
             apply_load(self.env, rows, load)
         for body, mass in recording.load.added_mass.items():
-            self.robot.add_body_mass(body, mass, rows)
+            self.robot.add_body_mass(body, mass, rows, place=recording.load.added_mass_at.get(body))
 
 
 def _changes(enable: torch.Tensor | None) -> frozenset[int]:

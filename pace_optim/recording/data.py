@@ -30,6 +30,8 @@ class Load:
 
     added_mass: Mapping[str, float] = field(default_factory=dict)
     """Mass added to a body, {body: kg}."""
+    added_mass_at: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Where it is, in the body's frame, {body: (x, y, z)} [m]; a mass without is at its body's centre of mass."""
     load_mass: float | None = None
     """Point mass at the end of the test bench's arm [kg]."""
     load_length: float | None = None

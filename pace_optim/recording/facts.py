@@ -80,7 +80,9 @@ def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], commanded:
 def load_of(fields: Mapping[str, Any], source: str) -> Load:
     """Read the load's facts."""
     bench = {key: _number(key, fields[key], source) for key in BENCH_FACTS if fields.get(key) is not None}
-    return Load(added_mass=_added_mass(fields.get("added_mass"), source), **bench)
+    masses = _added_mass(fields.get("added_mass"), source)
+    places = _added_mass_at(fields.get("added_mass_at"), masses, source)
+    return Load(added_mass=masses, added_mass_at=places, **bench)
 
 
 def imu_of(value: Any, source: str) -> ImuPose:
@@ -190,6 +192,28 @@ def _added_mass(value: Any, source: str) -> dict[str, float]:
     for body in value:
         check_one_line("a body of added_mass", body, source)
     return {body: _number("added_mass", mass, source, f"added_mass of {body}") for body, mass in value.items()}
+
+
+def _added_mass_at(value: Any, masses: Mapping[str, float], source: str) -> dict[str, tuple[float, float, float]]:
+    """Where added masses are, {body: (x, y, z)} [m]."""
+    if value is None:
+        return {}
+    if isinstance(value, str):  # in an .npz
+        with suppress(ValueError):  # the message below shows what is no JSON
+            value = parsed_json(value)
+    places = {body: as_array(at) for body, at in (value if isinstance(value, Mapping) else {"": ""}).items()}
+    for body, place in places.items():
+        if place.dtype.kind not in "iuf" or place.shape != (3,) or not np.isfinite(place).all():
+            raise ValueError(
+                f"{source}: added_mass_at is {value!r}; expected {{body: [x, y, z]}} in m (in an .npz as JSON text). "
+                'Write it as {"body_name": [0, 0, 0.08]}.'
+            )
+        if body not in masses:
+            raise ValueError(
+                f"{source}: added_mass_at names {body!r}, which has no added_mass (these have: "
+                f"{listed(list(masses)) or 'none'}). State its mass, or correct the name."
+            )
+    return {body: (float(x), float(y), float(z)) for body, (x, y, z) in places.items()}
 
 
 def _number(key: str, value: Any, source: str, label: str = "") -> float:

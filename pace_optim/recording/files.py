@@ -126,7 +126,7 @@ def _facts_of(recording: Recording) -> dict[str, Any]:
     for field in dataclass_fields(recording.load):
         value = getattr(recording.load, field.name)
         if value is not None and value != {}:
-            facts[field.name] = dict(value) if field.name == "added_mass" else value
+            facts[field.name] = dict(value) if field.name.startswith("added_mass") else value
     return facts
 
 

@@ -27,7 +27,8 @@ UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
 """Unit of each series of joints."""
 DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
-FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, "added_mass", *BENCH_FACTS, "feet", "imu", "comment")
+LOAD_FACTS = ("added_mass", "added_mass_at", *BENCH_FACTS)
+FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, *LOAD_FACTS, "feet", "imu", "comment")
 
 _OTHER_WORDS = {
     "time": ("t", "timestamp", "timestamps", "stamp"),

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from pace_optim.recording.data import Recording
+
 _DIFFERENCES = 4
 _SEGMENT = 128
 _FEWEST_SAMPLES = 64
@@ -46,6 +48,16 @@ def noise_floor(position: np.ndarray, dt: float) -> NoiseFloor:
     sigma = _spectral_sigma(position, dt)
     least = 0.0 if step is None else step / np.sqrt(12.0)
     return NoiseFloor(sigma=max(sigma, least), source="lattice" if least > sigma else "recording", lattice=step)
+
+
+def noise_variance(recordings: Sequence[Recording]) -> float:
+    """Mean variance of the noise of recordings' positions, over recordings and joints [rad²]."""
+    squares = [
+        noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
+        for recording in recordings
+        for j in range(recording.dof_pos.shape[1])
+    ]
+    return float(np.mean(squares))
 
 
 def with_repetitions(floors: Sequence[NoiseFloor], positions: Sequence[np.ndarray]) -> list[NoiseFloor]:

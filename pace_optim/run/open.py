@@ -162,6 +162,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         drive_dt=settings.drive_dt,
         control_dt=settings.control_dt,
         effects=settings.effects,
+        links=settings.links,
         unknown=settings.unknown,
         env_cfg=env_cfg,
         joints=settings.joints,

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from pace_actuators import match_names, resolve_joint_values
-from pace_actuators.drive_result import ALL, CURE, DriveResult
+from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia
 from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
+from pace_envs.link_inertia import NAMES
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.evaluator import Residuals
@@ -59,6 +60,8 @@ class FitResult(DriveResult):
     """What the torque in the recordings says of each drive, by joint and recording."""
     contested: list[str] = field(default_factory=list)
     """Facts that are stated and that the torque in a recording contradicts."""
+    file_values: dict[str, dict[str, float]] = field(default_factory=dict)
+    """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -108,6 +111,16 @@ class FitResult(DriveResult):
     def joint_type(self, joint: str) -> JointType:
         """Whether a joint turns or slides."""
         return "slide" if self.unit_of("encoder_bias", joint) == "m" else "hinge"
+
+    @property
+    def joint_parameters(self) -> list[str]:
+        """Names of the parameters that joints have, one value each."""
+        return [name for name, values in self.parameters.items() if set(values) != {ALL} and name not in NAMES]
+
+    @property
+    def link_parameters(self) -> list[str]:
+        """Names of the parameters that links have."""
+        return [name for name in self.parameters if name in NAMES]
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
@@ -175,6 +188,25 @@ def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
     return {name: values for name, values in found.items() if values}
 
 
+def _found_links(problem: Problem, values: dict[str, dict[str, float]]) -> dict[str, LinkInertia]:
+    """The links that were fitted, and those that the robot has had in place of its file's."""
+    found = {
+        link.link: link.inertia({name: values[name][link.link] for name in link.names})
+        for link in problem.env_cfg.sim2real.links
+    }
+    return {**problem.env_cfg.scene.robot.links, **found}
+
+
+def _file_values(problem: Problem) -> dict[str, dict[str, float]]:
+    """What the model file states of the parameters of links that were fitted, shaped as these."""
+    links = problem.env_cfg.sim2real.links
+    return {
+        name: {link.link: link.values[NAMES.index(name)] for link in links if name in link.names}
+        for name in NAMES
+        if name in problem.space.slices
+    }
+
+
 def make_result(
     problem: Problem,
     x: torch.Tensor,
@@ -227,6 +259,8 @@ def make_result(
         + list(problem.measured.notes)
         + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
         + notes_by_kind(data.recordings),
+        links=_found_links(problem, values),
+        file_values=_file_values(problem),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         **facts,
     )

@@ -32,6 +32,10 @@ class FitSettings:
     """Physical effects identified beside the base parameters: ``name``, ``name@joints``, ``name@shared`` or
     ``name@joints@shared``."""
 
+    links: list[str] = field(default_factory=list)
+    """Links whose inertial parameters are identified, regular expressions of their names: ``name`` or
+    ``name@mass,com,inertia`` with some of these."""
+
     unknown: list[str] = field(default_factory=list)
     """Facts of the drives that nobody knows (``stiffness``, ``damping``, ``effort_limit``, ``saturation_effort``,
     ``velocity_limit``): read from the recordings' torques where they have them, else identified."""
@@ -121,6 +125,11 @@ class FitSettings:
             )
         self.optimizer = absolute_reference(self.optimizer)
         check_unknown(self.unknown)
+        if self.links and self.only_searches:
+            raise ValueError(
+                f"links are identified by least squares, which know their prior, and the optimizer is "
+                f"{self.optimizer}. Choose hybrid or least_squares."
+            )
         for name, lowest in (("num_envs", 1), ("max_iteration", 1), ("seed", 0)):
             value = getattr(self, name)
             if value is not None and value < lowest:

@@ -9,12 +9,12 @@ from pace_optim.run.result import FitResult
 
 def summary(result: FitResult) -> list[str]:
     """The table of parameters with error bars, the errors and the warnings, a line each."""
-    names = [name for name, values in result.parameters.items() if set(values) != {ALL}]
     width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
         joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
-        lines += _table(result, names, joints, joint_type, width)
+        lines += _table(result, result.joint_parameters, joints, joint_type, width)
+    lines += _links(result)
     for name, values in result.parameters.items():
         if set(values) == {ALL}:
             text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
@@ -51,6 +51,21 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     for joint in joints:
         cells = [_value(result, name, joint).rjust(26) for name in names]
         lines.append("  ".join([joint.ljust(width), *cells, errors_of(result, joint).rjust(26)]))
+    return [*lines, ""]
+
+
+def _links(result: FitResult) -> list[str]:
+    """The inertial parameters of links, a line each, beside what the model file states."""
+    if not result.link_parameters:
+        return []
+    width = max(len(link) for link in [*result.links, "link"])
+    lines = ["  ".join(["link".ljust(width), "parameter".ljust(14), "file".rjust(12), "found".rjust(26)])]
+    for link in result.links:
+        for name in result.link_parameters:
+            if link in result.parameters[name]:
+                title = f"{name.removeprefix('link_')} [{result.unit_of(name, link)}]".ljust(14)
+                file = f"{result.file_values[name][link]:.5g}".rjust(12)
+                lines.append("  ".join([link.ljust(width), title, file, _value(result, name, link).rjust(26)]))
     return [*lines, ""]
 
 

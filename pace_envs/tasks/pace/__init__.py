@@ -2,7 +2,14 @@
 
 from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
-from pace_envs.tasks.pace.parameters import GLOBAL, Parameter, base_parameters, effect_parameters
+from pace_envs.tasks.pace.parameters import (
+    GLOBAL,
+    Parameter,
+    base_parameters,
+    effect_parameters,
+    link_parameters,
+    sought_links,
+)
 
 __all__ = [
     "GLOBAL",
@@ -13,4 +20,6 @@ __all__ = [
     "Parameter",
     "base_parameters",
     "effect_parameters",
+    "link_parameters",
+    "sought_links",
 ]

@@ -14,6 +14,7 @@ from pace_actuators.base_parameters import BASE_PARAMETERS, PER_JOINT
 from pace_actuators.config import Config
 from pace_actuators.effects import EffectCfg
 from pace_actuators.joint_values import resolve_joint_values
+from pace_envs.link_inertia import Reference
 
 
 @dataclass(kw_only=True)
@@ -78,6 +79,10 @@ class PaceCfg(Config):
     effect_bounds: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
     """Where an effect's parameters are sought, ``{"<effect>.<parameter>": {joint: (lower, start, upper)}}``, if not
     where the effect's own declaration says."""
+
+    links: tuple[Reference, ...] = ()
+    """Links whose inertial parameters are identified, as the model has them (:func:`~pace_envs.tasks.pace.sought_links`
+    finds them)."""
 
     extra_parameters: tuple[Any, ...] = ()
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
@@ -152,7 +157,7 @@ class PaceCfg(Config):
         self.bounds = {**self.bounds, name: torch.stack(ends, dim=1)}
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceCfg:
-        """The same for some of the joints, in their order here; effects and parameters of one's own are left out."""
+        """The same for some of the joints, in their order here; without effects, links and extra parameters."""
         self.prepare()
         kept = [i for i, name in enumerate(self.joint_order) if name in joint_names]
         names = tuple(self.joint_order[i] for i in kept)
@@ -171,6 +176,7 @@ class PaceCfg(Config):
             joint_efforts={name: each for name, each in self.joint_efforts.items() if name in names},
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
+            links=(),
             extra_parameters=(),
         )
 

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
+import mujoco
 import torch
 
+from pace_actuators import match_names
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, units_for
+from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, PRIOR, UNITS, Reference, moved_by
 from pace_envs.tasks.pace.pace_cfg import PaceCfg
 
 if TYPE_CHECKING:
@@ -54,6 +57,12 @@ class Parameter:
 
     units: tuple[str, ...] | None = None
     """Unit of each key, where they differ from ``unit``."""
+
+    prior: float | None = None
+    """Standard deviation of its prior in half a bound range, on its scale, around the middle; ``None``: it has none."""
+
+    joints: tuple[str, ...] | None = None
+    """The driven joint that moves what each key names, where keys are links; ``None``: keys are joints."""
 
     per_joint_copies: bool = False
     """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
@@ -155,6 +164,60 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     return tuple(result)
 
 
+def link_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
+    """The inertial parameters of the links that are identified: see :mod:`pace_envs.link_inertia`."""
+    result = []
+    for name in NAMES:
+        own = [link for link in cfg.links if name in link.names]
+        if not own:
+            continue
+        bounds = [link.bounds(name) for link in own]
+        result.append(
+            Parameter(
+                name=name,
+                unit=UNITS[name],
+                lower=tuple(low for low, _ in bounds),
+                upper=tuple(high for _, high in bounds),
+                apply=partial(_apply_link, references=own, name=name),
+                keys=tuple(link.link for link in own),
+                scale="log" if name in POSITIVE else "linear",
+                start=tuple(link.values[NAMES.index(name)] for link in own),
+                prior=PRIOR,
+                joints=tuple(link.joint for link in own),
+            )
+        )
+    return tuple(result)
+
+
+def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[str]) -> tuple[Reference, ...]:
+    """The links whose inertial parameters are to be identified.
+
+    Args:
+        model: The robot's model.
+        joints: The driven joints.
+        wanted: Regular expressions of links' names, each as ``NAME`` or ``NAME@mass,com,inertia`` with some of these.
+
+    Raises:
+        ValueError: If an expression matches nothing, a part is unknown, or a link does not move or has no mass.
+    """
+    moving = {model.body(b).name: moved_by(model, model.body(b).name, joints) for b in range(1, model.nbody)}
+    names = [name for name, joint in moving.items() if name and joint is not None and model.body(name).mass[0] > 0]
+    found: dict[str, tuple[str, ...]] = {}
+    for text in wanted:
+        pattern, at, parts = text.rpartition("@")
+        pattern, chosen = (pattern, parts.split(",")) if at else (text, list(PARTS))
+        if unknown := [part for part in chosen if part not in PARTS]:
+            raise ValueError(
+                f"--links {text!r} names {unknown[0]!r}. Available: {', '.join(PARTS)}; as in {pattern}@mass,com."
+            )
+        own = tuple(name for part in PARTS if part in chosen for name in PARTS[part])
+        for group in match_names([pattern], names, what="moving link with a mass"):
+            found |= {names[i]: own for i in group}
+    return tuple(
+        Reference.of(model, name, joint=moving[name] or "", names=found[name]) for name in names if name in found
+    )
+
+
 def _type(joint: str, cfg: PaceCfg) -> JointType:
     return "slide" if joint in cfg.slide_joints else "hinge"
 
@@ -168,6 +231,10 @@ def _apply_effect(
     env: ManagerBasedEnv, values: torch.Tensor, *, effect: str, parameter: str, joint_ids: list[int]
 ) -> None:
     env.scene["robot"].write_effect_parameter_to_sim(effect, parameter, values, joint_ids)
+
+
+def _apply_link(env: ManagerBasedEnv, values: torch.Tensor, *, references: Sequence[Reference], name: str) -> None:
+    env.scene["robot"].write_link_parameter_to_sim(references, name, values)
 
 
 def _apply_base(env: ManagerBasedEnv, values: torch.Tensor, *, name: str) -> None:

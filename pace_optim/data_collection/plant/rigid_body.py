@@ -147,7 +147,11 @@ class RigidBody:
             for name, kg in load.added_mass.items():
                 if name not in names:
                     raise ValueError(f"added_mass names {name!r}, which is no body. Available: {', '.join(names[1:])}.")
-                mass[row, names.index(name)] += kg
+                body = names.index(name)
+                if (place := load.added_mass_at.get(name)) is not None and kg > 0:
+                    _bolt_on(body, kg, np.array(place), row, mass, inertia, ipos, iquat)
+                else:
+                    mass[row, body] += kg
         bat.set_const()
 
 
@@ -171,6 +175,22 @@ def _write_bench_load(model, names, load, row, mass, inertia, ipos, pos) -> None
     ipos[row, arm] = (0.0, 0.0, -length / 2)
     mass[row, point] = max(load["load_mass"], _SMALLEST)
     pos[row, point] = (0.0, 0.0, -length)
+
+
+def _bolt_on(body, kg, place, row, mass, inertia, ipos, iquat) -> None:  # type: ignore[no-untyped-def]
+    """Add a point mass away from a body's centre: Steiner's rule about the new centre."""
+    own, com, turn = mass[row, body], ipos[row, body].copy(), np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.asarray(iquat[row, body]))
+    axes = turn.reshape(3, 3)
+    centre = (own * com + kg * place) / (own + kg)
+    tensor = axes @ np.diag(inertia[row, body]) @ axes.T
+    for part, at in ((own, com - centre), (kg, place - centre)):
+        tensor = tensor + part * (at @ at * np.eye(3) - np.outer(at, at))
+    moments, axes = np.linalg.eigh(tensor)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    mass[row, body], ipos[row, body], inertia[row, body], iquat[row, body] = own + kg, centre, moments, quat
 
 
 def _rotate_masses(model, body, joint, angle, row, ipos, iquat, pos, quat) -> None:  # type: ignore[no-untyped-def]

@@ -82,7 +82,7 @@ def check_data(
         coarse = max(steps, key=lambda name: steps[name])
         unit = units_for("mrad", [types[names.index(coarse)]])
         sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} {unit} ({coarse}).")
-    loads = {_key(r.load.added_mass, r.load.load_mass, r.load.load_length, r.load.arm_mass) for r in data.recordings}
+    loads = {_key(*vars(r.load).values()) for r in data.recordings}
     gains = {_key(r.drive.stiffness, r.drive.damping) for r in data.recordings}
     sentences.append(
         f"{plural(len(data.recordings), 'recording')} with {plural(len(loads), 'load')} and "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.names import Hint
 from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import likes, ranking
+from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
@@ -104,6 +105,22 @@ def told(
             cfg=cfg.judging,
         ),
         cfg=json.loads(json_text(asdict(cfg))),
+    )
+
+
+def with_links(diagnosis: Diagnosis, wrong: LinkFindings, problem: Problem) -> Diagnosis:
+    """The same with the links that the model file states wrongly; effects were then sought beside them."""
+    if not wrong.wrong:
+        return replace(diagnosis, data=[*wrong.sentences, *diagnosis.data])
+    unit = units_for("mrad", problem.joint_types)
+    said = [each.sentence for each in wrong.wrong]
+    fall = f"With that the validation error falls from {1e3 * wrong.before:.3g} to {1e3 * wrong.after:.3g} {unit}."
+    rest = [] if diagnosis.verdict == "nothing_missing" else [diagnosis.summary]
+    return replace(
+        diagnosis,
+        verdict="link" if diagnosis.verdict == "nothing_missing" else diagnosis.verdict,
+        summary=" ".join([*said, fall, *rest]),
+        links=[asdict(each) | {"label": each.label} for each in wrong.wrong],
     )
 
 

@@ -22,7 +22,7 @@ class Diagnosis:
     version: int = VERSION
     run: str
     verdict: str
-    """``effect``, ``nothing_missing`` or ``unknown``."""
+    """``link``, ``effect``, ``nothing_missing`` or ``unknown``."""
     summary: str
     """The verdict in a sentence or two."""
     explained: float = 1.0
@@ -30,6 +30,9 @@ class Diagnosis:
     added: list[str]
     """Effects that are what is missing, as ``fit.py --effects`` takes them, the largest share first; none unless the
     verdict is ``effect``."""
+    links: list[dict[str, Any]] = field(default_factory=list)
+    """Links whose inertial parameters the model file states wrongly: ``link``, which ``parts``, ``values`` with the
+    file's, and ``label`` as ``fit.py --links`` takes it. Effects were sought beside them."""
     paying: list[str] = field(default_factory=list)
     """Effects that the refit has: with the verdict ``unknown`` all that lower the error, otherwise those added."""
     free_form: list[str] = field(default_factory=list)

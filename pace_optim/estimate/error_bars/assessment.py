@@ -62,7 +62,7 @@ def assess(
         steps = train.any(dim=1)
         error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
         weight = None if every.weight is None else every.weight[steps][:, recordings]
-        trained = Residuals(error=error, where=train[steps], step=every.step[steps], weight=weight)
+        trained = Residuals(error=error, where=train[steps], step=every.step[steps], weight=weight, prior=every.prior)
         there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
         hessian, _ = there.normal_equations()
     initial = probes.initial(error)

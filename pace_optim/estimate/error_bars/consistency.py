@@ -125,7 +125,8 @@ def _of_recording(there: Jacobian, r: int) -> Jacobian:
     """Residuals and derivatives of one of the recordings."""
     whole = there.residuals
     at = whole.where[:, r]
-    own = Residuals(error=whole.error[:, at, r : r + 1], where=whole.where[at, r : r + 1], step=whole.step[at])
+    error, where = whole.error[:, at, r : r + 1], whole.where[at, r : r + 1]
+    own = Residuals(error=error, where=where, step=whole.step[at], prior=whole.prior)
     return replace(there, residuals=own, columns=there.columns[:, at, r : r + 1])
 
 

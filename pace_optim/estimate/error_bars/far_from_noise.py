@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from pace_actuators.joint_units import JointType, units_for
 from pace_optim.problem.problem import Problem
-from pace_optim.recording.noise import noise_floor
+from pace_optim.recording.noise import noise_variance
 from pace_optim.terminal.cli import command
 
 FAR_ABOVE_NOISE = 10.0
@@ -29,12 +27,7 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
 def noise_score(problem: Problem) -> float:
     """The score that the noise of what is trained on leaves, Σ_joints of its mean variance [rad²]."""
     trained = [problem.dataset.recordings[r] for r in problem.dataset.trained()]
-    squares = [
-        noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
-        for recording in trained
-        for j in range(recording.dof_pos.shape[1])
-    ]
-    return float(np.mean(squares)) * len(problem.joint_names)
+    return noise_variance(trained) * len(problem.joint_names)
 
 
 def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Sequence[JointType] = ()) -> list[str]:

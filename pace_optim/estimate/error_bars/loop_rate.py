@@ -219,7 +219,7 @@ def _refitted(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndar
         if not math.isfinite(score):
             return None
         best = x, residuals
-        gradient = there.transposed_times(residuals.error[0])[free]
+        gradient = there.gradient_at(x, residuals.error[0])[free]
         step = -inverse @ gradient
         if -float(step @ gradient) < _NOTHING_LEFT * score:
             break

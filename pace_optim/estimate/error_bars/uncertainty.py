@@ -84,7 +84,8 @@ def estimate_uncertainty(
         C = H⁻¹ (Jᵀ Σ J) H⁻¹
 
     (Huber's sandwich; Hansen 1982 for autocorrelated errors). Σ is taken as stationary for each joint of each
-    recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A
+    recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A prior of
+    precision P adds σ² P to H and σ⁴ P to the middle, so that what moves nothing keeps its prior's error bar. A
     simulation starts at the first measured position: that sample's noise moves all that follows, and is added to Σ.
 
     Args:
@@ -98,6 +99,8 @@ def estimate_uncertainty(
     samples = int(jacobian.residuals.where.sum())
     hessian, _ = jacobian.normal_equations()
     middle = _middle(jacobian)
+    if (prior := jacobian.residuals.prior) is not None:
+        middle += prior.noise * prior.hessian.numpy()
     if initial is not None:
         middle += _from_first_sample(jacobian, initial, initial_joints)
     return uncertainty_of(hessian.numpy() * samples, middle, samples, jacobian.colouring, space, x, held)

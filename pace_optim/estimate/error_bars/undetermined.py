@@ -84,8 +84,10 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
 
 
 def _wide(space: ParameterSpace, uncertainty: Uncertainty) -> set[str]:
-    """Labels of what has an error bar as wide as its bounds, or would have one but for being at a bound."""
-    wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * (space.upper - space.lower).numpy()
+    """Labels of what has an error bar as wide as its bounds or prior, or would have one but for being at a bound."""
+    prior = space.prior
+    width = torch.where(prior.isinf(), space.upper - space.lower, 2.0 * prior * space.slope(torch.zeros(space.size)))
+    wide = np.nan_to_num(uncertainty.std) > HARDLY_KNOWN * width.numpy()
     return {label for label, yes in zip(space.labels, wide, strict=True) if yes} | set(uncertainty.by_chance)
 
 
@@ -210,6 +212,7 @@ def prior(problem: Problem) -> torch.Tensor:
             if (value := getattr(drive, name)) is not None and name in space.slices:
                 values = resolve_joint_values(value, own, field=name).to(torch.float64)
                 result[space[name]][[joints.index(joint) for joint in own]] = values
+    result = torch.where(space.prior.isfinite(), space.to_physical(torch.zeros(space.size)).double(), result)
     for cfg in effect_cfgs(problem.env_cfg.sim2real.effects):
         kind = cfg.effect_class
         for parameter in kind.parameters:

@@ -10,6 +10,7 @@ import torch
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import conjoined
+from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
@@ -66,7 +67,11 @@ def _undetermined(labels: Sequence[str]) -> list[str]:
     return [
         f"{_first(name)}{_of(keys)} cannot be identified from these recordings: it has no influence, or its error bar "
         "is as large as its bounds or its value. The prior is kept, and exports omit it. [W10]"
-        for name, keys in _by_parameter(labels).items()
+        for name, keys in _by_parameter(_not_of_links(labels)).items()
+    ] + [
+        f"These recordings do not show {shown}: the error bar stays at the prior's. The model file's value is kept. "
+        "[W10]"
+        for shown in _of_links(labels)
     ]
 
 
@@ -76,8 +81,26 @@ def _unsure(labels: Sequence[str]) -> list[str]:
         f"{_first(name)}{_of(keys)} is barely identified by these recordings: its error bar is as large as its value "
         "or its bounds, or other parameters compensate for it. The value that fits best with this physics step is "
         "kept. [W11]"
-        for name, keys in _by_parameter(labels).items()
+        for name, keys in _by_parameter(_not_of_links(labels)).items()
+    ] + [
+        f"These recordings show only a combination of {shown} with other parameters: the error bar of each stays near "
+        "the prior's. The most probable value is kept. [W11]"
+        for shown in _of_links(labels)
     ]
+
+
+def _not_of_links(labels: Sequence[str]) -> list[str]:
+    return [label for label in labels if label.split("/")[0] not in NAMES]
+
+
+def _of_links(labels: Sequence[str]) -> list[str]:
+    """The inertial parameters of each link among labels, in words."""
+    found: dict[str, list[str]] = {}
+    for label in labels:
+        name, link = label.split("/", 1)
+        if name in NAMES:
+            found.setdefault(link, []).append(name.removeprefix("link_").replace("_", " "))
+    return [f"{conjoined(names)} of the link {link}" for link, names in found.items()]
 
 
 def _first(name: str) -> str:

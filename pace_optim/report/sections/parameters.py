@@ -58,9 +58,12 @@ def _card(run: RunData, name: str) -> Markup:
     unit = " or ".join(pretty_unit(u) for u in dict.fromkeys(run.result.unit_of(name, key) for key in values))
     mixed = " or " in unit
     titles = {key: f"{key} [{pretty_unit(run.result.unit_of(name, key))}]" if mixed else key for key in values}
+    for key, file in run.result.file_values.get(name, {}).items():
+        titles[key] += f" (file {file:.4g})"
     rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
-    head = ["joint", "value", "± std", "value and 95 % interval", "between its bounds", ""]
+    what = "link" if name in run.result.link_parameters else "joint"
+    head = [what, "value", "± std", "value and 95 % interval", "between its bounds", ""]
     return _article(in_words(name), unit, table(head, rows, "values"))
 
 

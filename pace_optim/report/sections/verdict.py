@@ -17,6 +17,7 @@ from ..markup import bullets, html, joined
 from ..run_data import RunData
 
 _HEADINGS = {
+    "link": ("good", "A link of the model file is wrong"),
     "effect": ("good", "An effect is missing, and it is known"),
     "nothing_missing": ("good", "Nothing is missing"),
     "unknown": ("bad", "Something is missing, and no known effect explains it"),
@@ -53,21 +54,24 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
     """What is missing, and how to add it to a run that had these effects."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
+    links = [link["label"] for link in content.get("links", [])]
     if content.get("free_form"):
         part_known = "only a part of it is known" if content["added"] else "no known effect explains it"
         css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
-    elif content["verdict"] != "nothing_missing" and effects and (not content["added"] or part < _PARTLY):
+    elif content["verdict"] not in ("nothing_missing", "link") and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
     return html(
         '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
-        "fit with it.</p>{% elif effects %}<p>{{ why }}: <code>{{ command }} … --effects "
-        "{{ effects }}</code></p>{% endif %}{{ more }}</div>",
+        "fit with it.</p>{% elif effects or links %}<p>{{ why }}: <code>{{ command }} …"
+        "{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}{% endif %}</code></p>"
+        "{% endif %}{{ more }}</div>",
         css=css,
         heading=heading,
         summary=content["summary"],
         has_it=bool(effects) and set(effects) <= set(had),
         effects=shlex.join(dict.fromkeys([*had, *effects])),
-        why="Add it" if content["added"] else "Until it is known, this lowers the error",
+        links=shlex.join(links),
+        why="Add it" if content["added"] or links else "Until it is known, this lowers the error",
         command=command("fit"),
         more=more,
     )

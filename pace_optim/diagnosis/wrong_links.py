@@ -1,0 +1,326 @@
+"""Which link of the model file is wrong, and what is wrong with it: mass, centre of mass or inertia.
+
+A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`), so one look covers all
+of them along the measured motion: the derivatives of the whole robot's residuals r by the base parameters and by the
+ten parameters of each link, and, as look-alikes, by a torque gain, a spring and an offset of each joint. With H = JᵀJ
+and g = Jᵀr of the base parameters and of what is tried, a part of a link would lower the score by
+
+    Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
+
+The most promising are fitted to the whole robot. Links are named if little is left: the error on samples that were not
+fitted is at the noise, or a small part of what it was. What leaves as little on a single joint is a look-alike.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from pace_actuators.drive_result import LinkInertia
+from pace_actuators.effects import effect_cfgs, get_effect
+from pace_envs.link_inertia import NAMES, PARTS, UNITS, Reference
+from pace_envs.tasks.pace import sought_links
+from pace_optim.estimate.derivatives import Colouring, colour, stencil
+from pace_optim.estimate.error_bars.assessment import assess
+from pace_optim.estimate.error_bars.far_from_noise import noise_score
+from pace_optim.estimate.error_bars.uncertainty import SURE, inverse_of
+from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.problem.problem import Problem
+
+LOOK_ALIKES = ("torque_gain", "proportional_gain", "parallel_spring", "torque_offset")
+"""Effects on one joint that look like a wrong link."""
+_CHOICES = (("mass",), ("com",), ("mass", "com"), tuple(PARTS))
+"""What may be wrong with a link, the fewest parameters first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinksCfg:
+    """Numbers of the search for wrong links; ratios are of RMSE."""
+
+    above: float = 1.15
+    """Nothing is looked for where the error is less than this many times the noise."""
+    left: float = 1.15
+    """At this many times the noise nothing is left."""
+    clear: float = 5.0
+    """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
+    a link."""
+    pays: float = 1.5
+    """What a link must lower the error by."""
+    alike: float = 1.10
+    """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
+    share: float = 0.25
+    """Share of each recording that candidates are screened and compared on."""
+    step: float = 1e-2
+    """Normalised step of the derivatives."""
+    tried: int = 4
+    """Candidates of a round that are fitted, ..."""
+    of_link: int = 3
+    """and so many of them of one link."""
+    iterations: int = 8
+    """Of each fit, at most."""
+    most: int = 3
+    """Wrong links, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongLink:
+    """A link whose inertial parameters the model file states wrongly."""
+
+    link: str
+    parts: tuple[str, ...]
+    """Which of mass, com and inertia."""
+    values: list[dict[str, Any]]
+    """Of each of its parameters ``parameter``, ``unit``, ``file``, ``found`` and ``std``."""
+
+    @property
+    def label(self) -> str:
+        """As ``fit.py --links`` takes it."""
+        return f"{re.escape(self.link)}@{','.join(self.parts)}"
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, in words."""
+        shown = [each for each in self.values if abs(each["found"] - each["file"]) > SURE * each["std"]] or self.values
+        said = [
+            f"{each['parameter'].removeprefix('link_').replace('_', ' ')} {each['found']:.4g} ± {each['std']:.1g} "
+            f"{each['unit']} instead of {each['file']:.4g}"
+            for each in shown
+        ]
+        what = {"mass": "mass", "com": "centre of mass", "inertia": "inertia"}
+        return f"The model file is wrong about the link {self.link} ({', '.join(what[p] for p in self.parts)}): " + (
+            f"{', '.join(said)}."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkFindings:
+    """What the search for wrong links found."""
+
+    wrong: list[WrongLink] = field(default_factory=list)
+    links: Mapping[str, LinkInertia] = field(default_factory=dict)
+    """Their inertial parameters."""
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """All parameters of the whole robot, fitted beside them."""
+    before: float = 0.0
+    """RMSE of all joints on what was not fitted, by the file [rad]."""
+    after: float = 0.0
+    """The same with what was found [rad]."""
+    sentences: list[str] = field(default_factory=list)
+    """What was noticed beside that."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A problem and its best parameters."""
+
+    problem: Problem
+    x: torch.Tensor
+    rmse: float
+    """On samples that were not fitted [rad]."""
+
+
+def find_wrong_links(
+    problem: Problem,
+    physical: torch.Tensor,
+    say: Callable[[str], None] = lambda _: None,
+    cfg: LinksCfg | None = None,
+) -> LinkFindings:
+    """Look for links whose inertial parameters the model file states wrongly.
+
+    Args:
+        problem: The whole robot, no link sought.
+        physical: Its parameters as they were fitted, (size,).
+        say: Shows how far it is.
+        cfg: Its numbers.
+    """
+    cfg = cfg or LinksCfg()
+    noise = (noise_score(problem) / len(problem.joint_names)) ** 0.5
+    base = _Fitted(problem, problem.space.to_normalised(physical), _held_out(problem, physical))
+    if not noise > 0 or base.rmse < cfg.above * noise:
+        return LinkFindings()
+    now, found = base, tuple[Reference, ...]()
+    while len(found) < cfg.most and now.rmse > cfg.left * noise:
+        say(f"screening the links of the model file ({len(found)} found to be wrong)")
+        best = _best_addition(now, found, noise, say, cfg)
+        if best is None or best.rmse * cfg.pays > now.rmse:
+            break
+        now, found = best, best.problem.env_cfg.sim2real.links
+    if not found:
+        return LinkFindings()
+    now = _fit(now.problem, _values_of(now), cfg, whole=True)
+    if now.rmse > max(cfg.left * noise, base.rmse / cfg.clear):
+        return LinkFindings()
+    say("fitting what looks like a wrong link")
+    likes = _look_alikes(base, cfg)
+    left = max(now.rmse, noise)
+    if any(rmse * cfg.alike < left for rmse in likes.values()):
+        return LinkFindings()
+    if likes := {name: rmse for name, rmse in likes.items() if rmse <= cfg.alike * left}:
+        names = ", ".join(reference.link for reference in found)
+        return LinkFindings(
+            sentences=[
+                f"Wrong inertial parameters of {names} explain the error too, and these recordings cannot separate "
+                f"them from {' or '.join(likes)}: record once with a known added mass (added_mass in the recording)."
+            ]
+        )
+    return _told(base, now, found)
+
+
+def _told(base: _Fitted, now: _Fitted, found: Sequence[Reference]) -> LinkFindings:
+    """What was found, with error bars."""
+    problem, space = now.problem, now.problem.space
+    values = space.to_dict(space.to_physical(now.x))
+    known = assess(problem, problem.evaluator(), _colouring(problem), now.x)
+    std = space.to_dict(torch.as_tensor(known.uncertainty.std))
+    wrong = [
+        WrongLink(
+            link=each.link,
+            parts=tuple(part for part, names in PARTS.items() if set(names) <= set(each.names)),
+            values=[
+                {
+                    "parameter": name,
+                    "unit": UNITS[name],
+                    "file": each.values[NAMES.index(name)],
+                    "found": values[name][each.link],
+                    "std": std[name][each.link],
+                }
+                for name in each.names
+            ],
+        )
+        for each in found
+    ]
+    links = {each.link: each.inertia({name: values[name][each.link] for name in each.names}) for each in found}
+    return LinkFindings(wrong=wrong, links=links, values=values, before=base.rmse, after=now.rmse)
+
+
+def _best_addition(
+    now: _Fitted, found: tuple[Reference, ...], noise: float, say: Callable[[str], None], cfg: LinksCfg
+) -> _Fitted | None:
+    """The model with one more wrong link that leaves least; of those alike, the one with the fewest parameters."""
+    problem = now.problem
+    env = problem.make_env(1)
+    every = sought_links(env.sim.model, problem.joint_names, [".*"])
+    env.close()
+    # what is found stays as the file has it: its parameters begin where the last round left them
+    every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
+    whole = problem.seeking(tuple(replace(each, names=NAMES) for each in every))
+    values = _values_of(now)
+    candidates = _screened(whole, _values_in(whole, values), every, found, cfg)
+    fitted: list[tuple[int, _Fitted]] = []
+    for addition in sorted(candidates[: cfg.tried], key=lambda each: len(each.names)):
+        if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
+            break
+        sought = (*(each for each in found if each.link != addition.link), addition)
+        say(f"fitting {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
+        fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg)))
+    if not fitted:
+        return None
+    least = max(min(each.rmse for _, each in fitted), noise)
+    alike = [(size, each.rmse, each) for size, each in fitted if each.rmse <= cfg.alike * least]
+    return min(alike, key=lambda each: each[:2])[2] if alike else None
+
+
+def _screened(
+    whole: Problem, x: torch.Tensor, every: Sequence[Reference], found: Sequence[Reference], cfg: LinksCfg
+) -> list[Reference]:
+    """Links with what may be wrong about each, the most promising first."""
+    hessian, gradient = _look(whole, x, cfg)
+    space = whole.space
+    own = [i for i, label in enumerate(space.labels) if label.split("/")[0] not in NAMES]
+    own += [space.labels.index(f"{name}/{each.link}") for each in found for name in each.names]
+    score = _score_of(gradient, hessian, own)
+    gains: list[tuple[float, Reference]] = []
+    for each in every:
+        if any(each.link == known.link for known in found):
+            continue
+        for parts in _CHOICES:
+            names = tuple(name for part in PARTS if part in parts for name in PARTS[part])
+            entries = [*own, *(space.labels.index(f"{name}/{each.link}") for name in names)]
+            gain = _score_of(gradient, hessian, entries) - score
+            gains.append((gain / len(names) ** 0.25, replace(each, names=names)))
+    result: list[Reference] = []
+    for _, each in sorted(gains, key=lambda each: -each[0]):
+        if sum(each.link == other.link for other in result) < cfg.of_link:
+            result.append(each)
+    return result
+
+
+def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor]:
+    """H and g at a normalised vector, on pieces."""
+    pieces, colouring = problem.on_pieces(cfg.share), _colouring(problem)
+    around = stencil(x, colouring, first=cfg.step)
+    vectors = torch.cat([x[None], around.vectors])
+    residuals = pieces.training_evaluator().residuals(problem.space.to_physical(vectors))
+    return around.jacobian(residuals).normal_equations()
+
+
+def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[int]) -> float:
+    """How much the score falls where these entries are free, gᵀ H⁻¹ g."""
+    at = torch.tensor([i for i in entries if float(hessian[i, i]) > 0])
+    g = gradient[at].numpy()
+    return float(g @ inverse_of(hessian[at[:, None], at].numpy())[0] @ g)
+
+
+def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
+    """The error with each effect on the joint where it explains most, {effect on joint: RMSE [rad]}."""
+    problem, found = base.problem, dict[str, float]()
+    values = _values_of(base)
+    had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
+    for effect in LOOK_ALIKES:
+        if effect in had:
+            continue
+        whole = problem.with_effects([*problem.effects, effect])
+        size = next(p for p in get_effect(effect).parameters if p.null is not None)
+        name = f"{effect}.{size.name}"
+        start = _values_in(whole, {**values, name: dict.fromkeys(problem.joint_names, size.null or 0.0)})
+        hessian, gradient = _look(whole, start, cfg)
+        labels = whole.space.labels
+        own = [i for i, label in enumerate(labels) if not label.startswith(f"{effect}.")]
+        gains = {
+            joint: _score_of(gradient, hessian, [*own, labels.index(f"{name}/{joint}")])
+            for joint in problem.joint_names
+            if f"{name}/{joint}" in labels
+        }
+        joint = max(gains, key=lambda each: gains[each])
+        alone = _fit(problem.with_effects([*problem.effects, f"{effect}@{re.escape(joint)}"]), values, cfg)
+        found[f"{effect} on {joint}"] = alone.rmse
+    return found
+
+
+def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg, *, whole: bool = False) -> _Fitted:
+    """The problem fitted from near, on pieces, or on all that is trained on."""
+    near = LeastSquaresCfg(max_iteration=cfg.iterations, score_tolerance=1e-3, noise_score=noise_score(problem))
+    stage = problem if whole else problem.on_pieces(cfg.share)
+    start = _values_in(problem, values)
+    x = least_squares(stage.training_evaluator(), _colouring(problem), [start], near)[0].x
+    return _Fitted(problem, x, _held_out(problem, problem.space.to_physical(x)))
+
+
+def _values_in(problem: Problem, values: Mapping[str, Mapping[str, float]]) -> torch.Tensor:
+    """Known values in the vector of a problem that may have more parameters, which are where they start, normalised."""
+    space = problem.space
+    physical = space.to_physical(space.start)
+    for parameter in space.parameters:
+        for i, key in enumerate(parameter.keys, start=space[parameter.name].start):
+            if key in values.get(parameter.name, {}):
+                physical[i] = values[parameter.name][key]
+    return space.to_normalised(physical).clamp(-1.0, 1.0)
+
+
+def _values_of(fitted: _Fitted) -> dict[str, dict[str, float]]:
+    space = fitted.problem.space
+    return space.to_dict(space.to_physical(fitted.x))
+
+
+def _held_out(problem: Problem, physical: torch.Tensor) -> float:
+    """RMSE of all joints on samples that are not trained on [rad]."""
+    residuals = problem.evaluator().residuals(physical[None], problem.dataset.validation)
+    return float(residuals.joint_score[0].mean() ** 0.5)
+
+
+def _colouring(problem: Problem) -> Colouring:
+    return colour(problem.space, problem.trees, problem.joint_names)
