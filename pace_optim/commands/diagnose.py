@@ -32,6 +32,7 @@ def main() -> None:
         metavar="FACT",
         help=f"facts that you measured ({', '.join(MEASURED_FACTS)}): effects that contradict them are not tried",
     )
+    parser.add_argument("--links", action="store_true", help="look for wrong links of the model file first")
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
     parser.add_argument("--physics_dt", type=number, metavar="S", help="physics step (default: half a control step)")
     refit = parser.add_mutually_exclusive_group()

@@ -60,7 +60,7 @@ def diagnose(
     whole = _as_found(run.problem(physics_dt=physics_dt), result).with_links(result.links)
     values = {name: result.parameters[name] for name in whole.space.slices}
     wrong = LinkFindings()
-    if not settings.only:
+    if settings.links:
         wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say)
     problem = whole.with_effects(()).with_links(wrong.links)
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}
