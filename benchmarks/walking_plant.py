@@ -12,13 +12,14 @@ import argparse
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-STEP, CONTROL = 0.00025, 0.0025
+STEP, CONTROL = 0.000125, 0.0025
 """Of the physics, and of the drives and the log [s]."""
 QUADRUPED = """
 <mujoco model="crawler">
@@ -57,15 +58,28 @@ def quadruped() -> str:
     return QUADRUPED.format(legs="".join(_LEG.format(leg=leg, x=x, y=y) for leg, x, y in places))
 
 
-def trot(time: float, legs: int = 4) -> np.ndarray:
-    """Targets of the small robot's joints in a trot, (2 legs,) [rad]: diagonal legs lift together."""
-    result = []
+def trot(time: float, legs: int = 4, rate: float = 1.4, lift: float = 0.45, stride: float = 0.15) -> np.ndarray:
+    """Targets of the small robot's joints in a trot, (2 legs,) [rad]: diagonal legs lift together.
+
+    Args:
+        time: [s].
+        legs: How many.
+        rate: Strides per second [Hz].
+        lift: Bend of a lifted leg [rad].
+        stride: Amplitude of the hips [rad].
+    """
+    result, grown = [], min(1.0, time)
     for leg in range(legs):
-        phase = 2 * np.pi * (1.4 * time + (0.5 if leg in (1, 2) else 0.0))
-        lift = max(0.0, np.sin(phase)) * min(1.0, time)
-        bend = 0.55 + 0.45 * lift + 0.03 * np.sin(2 * np.pi * 0.37 * time + leg)
-        result += [bend + 0.15 * np.cos(phase) * min(1.0, time), -2 * bend]
+        phase = 2 * np.pi * (rate * time + (0.5 if leg in (1, 2) else 0.0))
+        bend = 0.55 + lift * max(0.0, np.sin(phase)) * grown + 0.03 * np.sin(2 * np.pi * 0.37 * time + leg)
+        result += [bend + stride * np.cos(phase) * grown, -2 * bend]
     return np.array(result)
+
+
+def gait(seed: int) -> Callable[[float], np.ndarray]:
+    """Targets of a trot of drawn rate, lift and stride."""
+    rate, lift, stride = np.random.default_rng(seed).uniform((1.2, 0.35, 0.1), (1.8, 0.5, 0.2))
+    return partial(trot, rate=rate, lift=lift, stride=stride)
 
 
 @dataclass(kw_only=True)
@@ -99,7 +113,7 @@ class Plant:
         """Compile it."""
         spec = mujoco.MjSpec.from_string(self.xml)
         spec.option.timestep = STEP
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         for element in [*spec.actuators, *spec.keys, *spec.sensors]:
             spec.delete(element)
         if self.swing is not None:

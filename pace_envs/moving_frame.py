@@ -70,7 +70,8 @@ def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, 
 
         v₀ = (ω, ω × (c - P))        a₀ = (α, f + α × (c - P))
 
-    so that ω = α = 0 and f = -g gives ``qfrc_bias``.
+    so that ω = α = 0 and f = -g gives ``qfrc_bias``. A step of second order takes joint speeds of its middle,
+    v + h a / 2 with the acceleration a of the step before: forces of the motion grow with the square of the speed.
 
     Args:
         model: The model, whose base is fixed.

@@ -225,7 +225,9 @@ class Evaluator:
         shown = rollout.positions(torch.arange(rollout.duration_steps))
         shown = shown.view(len(shown), len(shift), self.dataset.num_recordings, -1)
         change = (shown[:, 1:] - shown[:, :1]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).permute(1, 0, 2, 3)
-        return free_phases(carried, self._trees, change)
+        bias = physical[self.space["encoder_bias"]]
+        error = shown[:, 0].to("cpu", torch.float64) - bias - self.dataset.measured[: len(shown)]
+        return free_phases(carried, self._trees, change, error)
 
     def _residuals(
         self, physical: torch.Tensor, where: torch.Tensor | None, initial_offset: torch.Tensor | None

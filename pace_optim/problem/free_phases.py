@@ -7,12 +7,25 @@ covariance
     C = σ² + A Aᵀ + B Bᵀ
 
 with σ the encoders' noise, A the derivatives of e by the beginning, each times the standard deviation of that part of
-it, and B those by the specific force in each control step, times its. Least squares of
+it, and B those by the specific force in each control step, times a root of its covariance. Least squares of
 
     e' = σ L⁻¹ e / σ,    C = σ² L Lᵀ
 
 is the estimate that knows of this (Aitken, Proceedings of the Royal Society of Edinburgh 55, 1936). L is lower
 triangular in time: e' is what a sample says beyond all those before it. The beginnings cost no parameter.
+
+What an accelerometer misses lasts. A drive holds its torque between two control steps, and the accelerometer shows the
+force at one instant of that time: its error repeats from step to step, and has a part that is a delay. So the force's
+error has, along each axis, the covariance
+
+    s_i s_k ((1 - w) δ_ik + w exp(-|i - k| / m)) + d² Δf_i Δf_k
+
+with s the standard deviation that the log shows, and Δf the change of the force in a step. On robots that trot in
+simulation, the mean force less the mean of its two samples has this correlation.
+
+A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground and no contact
+was logged. Its covariance is multiplied by the square of what its mean square is above theirs, so that it hardly counts
+(iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
 """
 
 from __future__ import annotations
@@ -28,8 +41,20 @@ from pace_optim.recording.moving_base import Carried
 
 _BLOCK = 160
 """Control steps of a phase whose errors are looked at together: those further apart are taken for independent."""
+_FEWEST = 64
+"""Samples from which the encoders' noise is estimated."""
 _KEPT = 3
 """Masks of samples that are remembered."""
+_LATE = 1.0
+"""d: standard deviation of the force's delay [control steps]."""
+_ALIKE = 0.85
+"""w: part of the variance of the force's error that lasts ..."""
+_LASTS = 10.0
+"""... m: for so many control steps."""
+_MORE = 1.4
+"""Times what second differences of the force show: errors have heavier tails than a normal distribution."""
+_DISTURBED = 1.5
+"""Times the usual mean square of a leg's phases from which one is disturbed."""
 FORCE = 0.1
 """Change of the specific force for a derivative [m/s²]."""
 
@@ -176,7 +201,34 @@ class PhaseProbes:
         return cls(shift=shift, push=push)
 
 
-def free_phases(carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor) -> FreePhases:
+def _correlated(count: int) -> torch.Tensor:
+    """Root of the correlation of the force's errors in so many control steps, R = rootᵀ root, (count, count)."""
+    apart = (torch.arange(count)[:, None] - torch.arange(count)).abs().double()
+    correlation = _ALIKE * torch.exp(-apart / _LASTS) + (1 - _ALIKE) * torch.eye(count, dtype=torch.float64)
+    return torch.linalg.cholesky(correlation).T
+
+
+def encoder_noise(carried: Carried, error: torch.Tensor) -> torch.Tensor:
+    """The encoders' noise, by what errors of free joints have that no motion has, (R, n) [rad].
+
+    White noise of standard deviation σ leaves fourth differences of √70 σ. The median of their size is taken: a foot
+    that hits the ground leaves a few large ones.
+
+    Args:
+        carried: R recordings.
+        error: Of a candidate, at all control steps, (T, R, n) [rad].
+    """
+    difference = error.diff(n=4, dim=0).abs()
+    free = carried.free[: len(error)].unfold(0, 5, 1).all(dim=-1)
+    size = torch.where(free, difference, torch.nan).nanmedian(dim=0).values
+    usual = carried.start_std[..., 0]
+    known = (free.sum(dim=0) >= _FEWEST) & (size > 0) & (usual > 0)
+    return torch.where(known, 1.4826 / 70**0.5 * size, usual)
+
+
+def free_phases(
+    carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor, error: torch.Tensor
+) -> FreePhases:
     """The phases, and the covariances of their errors.
 
     A push in a control step moves a joint later as one in the first step of the phase does: a leg changes its posture
@@ -186,8 +238,9 @@ def free_phases(carried: Carried, trees: Sequence[Sequence[int]], change: torch.
         carried: R recordings.
         trees: Groups of joints, by index.
         change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 3, T, R, n).
+        error: Of the candidate without those changes, (T, R, n) [rad].
     """
-    depth, noise = max(len(tree) for tree in trees), carried.start_std[..., 0]
+    depth, noise = max(len(tree) for tree in trees), encoder_noise(carried, error)
     most = carried.start_std.amax(dim=0)
     blocks, covariances = blocks_of(carried, trees), []
     for block in blocks:
@@ -199,13 +252,37 @@ def free_phases(carried: Carried, trees: Sequence[Sequence[int]], change: torch.
         columns = [begun.flatten(1)]
         response = change[2 * depth :, block.begin : block.end, r][..., joints] / (FORCE * sigma)
         kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
-        since = min(block.first - block.begin, 2 * _BLOCK)
-        for i in range(block.first - since, block.end - 1):
-            behind = torch.arange(block.first, block.end) - i - 1
-            felt = (behind >= 0) & (behind < kick.shape[1])
-            own = torch.zeros(3, count, len(joints), dtype=change.dtype)
-            own[:, felt] = kick[:, behind[felt]] * carried.force_std[i, r][:, None, None]
-            columns.append(own.flatten(1))
+        steps = torch.arange(block.first - min(block.first - block.begin, 2 * _BLOCK), block.end - 1)
+        behind = torch.arange(block.first, block.end)[:, None] - steps - 1
+        felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
+        felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (3, count, steps, joints)
+        felt = felt.transpose(1, 2).flatten(2)  # (3, steps, count joints)
+        late = carried.base[:, r, 3:].diff(dim=0)[steps].T[:, :, None]
+        columns.append(_LATE * (felt * late).sum(dim=1))
+        along = _correlated(len(steps)) @ (felt * (_MORE * carried.force_std[steps, r].T)[:, :, None])
+        columns.append(along.flatten(0, 1))
         every = torch.cat(columns)
         covariances.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
+    wide = _disturbed(blocks, covariances, error, noise)
+    covariances = [factor * covariance for factor, covariance in zip(wide, covariances, strict=True)]
     return FreePhases(blocks=blocks, covariances=tuple(covariances), noise=noise)
+
+
+def _disturbed(
+    blocks: Sequence[Block], covariances: Sequence[torch.Tensor], error: torch.Tensor, noise: torch.Tensor
+) -> list[float]:
+    """What the covariance of each block is multiplied by: more than 1 where its errors are far above its leg's."""
+    square = []
+    for block, covariance in zip(blocks, covariances, strict=True):
+        own = error[block.first : block.end, block.recording][:, block.joints] / noise[block.recording, block.joints]
+        own = own.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).flatten()[:, None]
+        left = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), own, upper=False)
+        square.append(float(left.square().mean()))
+    legs: dict[tuple[int, ...], list[float]] = {}
+    for block, each in zip(blocks, square, strict=True):
+        legs.setdefault(tuple(block.joints), []).append(each)
+    usual = {leg: max(1.0, float(np.median(values))) for leg, values in legs.items()}
+    return [
+        max(1.0, (each / (_DISTURBED * usual[tuple(block.joints)])) ** 2)
+        for block, each in zip(blocks, square, strict=True)
+    ]

@@ -87,6 +87,7 @@ def estimate_uncertainty(
     recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A prior of
     precision P adds σ² P to H and σ⁴ P to the middle, so that what moves nothing keeps its prior's error bar. A
     simulation starts at the first measured position: that sample's noise moves all that follows, and is added to Σ.
+    Residuals of a walking robot's swings are whitened: there Σ is diagonal, with a variance for each swing.
 
     Args:
         jacobian: At x.
@@ -198,11 +199,19 @@ def _middle(jacobian: Jacobian) -> np.ndarray:
             own = [entry for entry in row if joint in colouring.joints[entry]]
             columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
-            counts = 1.0  # a sample that counts s² times is one all the same: of the mean over all of s², none is new
-            if residuals.weight is not None:
-                counts = float(residuals.weight[at, r, joint].square().max())
-            total[np.ix_(own, own)] += counts * columns @ filtered(columns, autocovariance(error)).T
+            if residuals.weight is None:
+                total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
+                continue
+            for phase in _phases(residuals.weight[at, r, joint].numpy()):
+                part = columns[:, phase]
+                total[np.ix_(own, own)] += np.square(error[phase]).mean() * part @ part.T
     return total
+
+
+def _phases(weight: np.ndarray) -> list[slice]:
+    """Where a joint is free, phase by phase."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], weight > 0, [False]]).astype(int)))
+    return [slice(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
 
 
 def _from_first_sample(
