@@ -33,7 +33,7 @@ class Course:
     shift: torch.Tensor
     """What is added to them, (num_envs, n, 2): encoder bias, and what nobody knows of where a phase begins."""
     push: torch.Tensor
-    """What is added to the specific force, (num_envs, 3) [m/s²]."""
+    """What is added to the angular acceleration [rad/s²] and the specific force [m/s²], (num_envs, 6)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,8 +70,7 @@ def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, 
 
         v₀ = (ω, ω × (c - P))        a₀ = (α, f + α × (c - P))
 
-    so that ω = α = 0 and f = -g gives ``qfrc_bias``. A step of second order takes joint speeds of its middle,
-    v + h a / 2 with the acceleration a of the step before: forces of the motion grow with the square of the speed.
+    so that ω = α = 0 and f = -g gives ``qfrc_bias``.
 
     Args:
         model: The model, whose base is fixed.

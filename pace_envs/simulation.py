@@ -290,13 +290,7 @@ class Simulation:
             return
         applied, own = self.qfrc_applied.clone(), self._own_bias  # bound before it is computed
         self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self.qfrc_applied += own
-        speed = self.qvel.clone()
-        if self._drift is not None:  # the speed of the step's middle, as far as the step before tells it
-            self.qvel.add_(self.bind("qacc_warmstart"), alpha=0.5 * self.cfg.dt)
-            self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self.qfrc_applied -= self._frame.next_bias(self.model)
-        self.qvel.copy_(speed)
+        self.qfrc_applied += own - self._frame.next_bias(self.model)
         self.batch.step()
         self.qfrc_applied.copy_(applied)
 

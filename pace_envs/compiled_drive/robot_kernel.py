@@ -150,11 +150,11 @@ class RobotKernel:
         }
         if (course := self._course) is not None:
             tensors |= {name: getattr(course, name) for name in ("motion", "point", "held", "shift", "push")}
-            tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody + env.sim.model.nv, dtype=torch.float64)
+            tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
             **dict.fromkeys(ARGUMENTS, 0),
-            **{name: self._batch.address_of(f"mj_{name}") for name in ("step", "step1", "step2", "comVel")},
+            **{name: self._batch.address_of(f"mj_{name}") for name in ("step", "step1", "step2")},
             "drift": self._batch.address_of("mj_integratePos") if env.sim.is_trapezoidal else 0,
             "robots": env.num_envs,
             "recordings": self._dataset.num_recordings,

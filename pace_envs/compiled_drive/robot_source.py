@@ -18,7 +18,6 @@ ARGUMENTS = {
     "step": "void (*step)(const mjModel*, mjData*)",
     "step1": "void (*step1)(const mjModel*, mjData*)",
     "step2": "void (*step2)(const mjModel*, mjData*)",
-    "comVel": "void (*comVel)(const mjModel*, mjData*)",
     "drift": "void (*drift)(const mjModel*, mjtNum*, const mjtNum*, mjtNum)",
     "robots": "long long robots",
     "recordings": "long long recordings",
@@ -133,16 +132,9 @@ static void step(mjModel* m, mjData* d, long long robot, long long k, int part, 
   }}
   double motion[{COLUMNS}];
   memcpy(motion, a->motion + row(robot, k, {parts - 1}, part, a) * {COLUMNS}, sizeof motion);
-  for (int i = 0; i < 3; ++i) motion[{COLUMNS - 3} + i] += a->push[robot * 3 + i];
+  for (int i = 0; i < 6; ++i) motion[{COLUMNS - 6} + i] += a->push[robot * 6 + i];
   a->step1(m, d);
-  double *room = a->room + robot * (12 * m->nbody + m->nv), *speed = room + 12 * m->nbody;
-  if (a->drift) {{
-    memcpy(speed, d->qvel, m->nv * sizeof(double));
-    for (int i = 0; i < m->nv; ++i) d->qvel[i] += 0.5 * m->opt.timestep * d->qacc_warmstart[i];
-    a->comVel(m, d);
-  }}
-  bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, room);
-  if (a->drift) memcpy(d->qvel, speed, m->nv * sizeof(double));
+  bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
   a->step2(m, d);
 }}
 static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{

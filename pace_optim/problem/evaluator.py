@@ -227,7 +227,7 @@ class Evaluator:
         change = (shown[:, 1:] - shown[:, :1]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).permute(1, 0, 2, 3)
         bias = physical[self.space["encoder_bias"]]
         error = shown[:, 0].to("cpu", torch.float64) - bias - self.dataset.measured[: len(shown)]
-        return free_phases(carried, self._trees, change, error)
+        return free_phases(carried, self._trees, change, error, rollout.env.step_dt)
 
     def _residuals(
         self, physical: torch.Tensor, where: torch.Tensor | None, initial_offset: torch.Tensor | None

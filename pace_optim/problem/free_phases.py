@@ -21,7 +21,9 @@ error has, along each axis, the covariance
     s_i s_k ((1 - w) δ_ik + w exp(-|i - k| / m)) + d² Δf_i Δf_k
 
 with s the standard deviation that the log shows, and Δf the change of the force in a step. On robots that trot in
-simulation, the mean force less the mean of its two samples has this correlation.
+simulation, the mean force less the mean of its two samples has this correlation. The angular acceleration is a slope of
+the gyroscope's: it has a delay, too, and differences of white noise. So an IMU that is late by less than d, and some
+more, moves no parameter.
 
 A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground and no contact
 was logged. Its covariance is multiplied by the square of what its mean square is above theirs, so that it hardly counts
@@ -51,12 +53,12 @@ _ALIKE = 0.85
 """w: part of the variance of the force's error that lasts ..."""
 _LASTS = 10.0
 """... m: for so many control steps."""
-_MORE = 1.4
+_MORE = 1.75
 """Times what second differences of the force show: errors have heavier tails than a normal distribution."""
-_DISTURBED = 1.5
+_DISTURBED = 1.25
 """Times the usual mean square of a leg's phases from which one is disturbed."""
-FORCE = 0.1
-"""Change of the specific force for a derivative [m/s²]."""
+PUSH = 0.1
+"""Change of the angular acceleration [rad/s²] and of the specific force [m/s²] for a derivative."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,21 +185,21 @@ class PhaseProbes:
 
     shift: torch.Tensor
     """Changes of where joints are held: those of one joint of each tree at a time, first of positions, then of speeds;
-    then none, (2 depth + 3, n, 2)."""
+    then none, (2 depth + 6, n, 2)."""
     push: torch.Tensor
-    """Changes of the specific force: none, then along each axis, (2 depth + 3, 3)."""
+    """Changes of the base's angular acceleration and specific force: none, then along each axis, (2 depth + 6, 6)."""
 
     @classmethod
     def of(cls, carried: Carried, trees: Sequence[Sequence[int]]) -> PhaseProbes:
         """As wide as what is not known of beginnings."""
         std, depth = carried.start_std.amax(dim=0), max(len(tree) for tree in trees)
-        shift = torch.zeros(2 * depth + 3, *std.shape, dtype=std.dtype)
-        push = torch.zeros(2 * depth + 3, 3, dtype=std.dtype)
+        shift = torch.zeros(2 * depth + 6, *std.shape, dtype=std.dtype)
+        push = torch.zeros(2 * depth + 6, 6, dtype=std.dtype)
         for kind in range(2):
             for i in range(depth):
                 own = [tree[i] for tree in trees if i < len(tree)]
                 shift[kind * depth + i, own, kind] = std[own, kind]
-        push[2 * depth :] = FORCE * torch.eye(3, dtype=std.dtype)
+        push[2 * depth :] = PUSH * torch.eye(6, dtype=std.dtype)
         return cls(shift=shift, push=push)
 
 
@@ -208,26 +210,29 @@ def _correlated(count: int) -> torch.Tensor:
     return torch.linalg.cholesky(correlation).T
 
 
+def _white(series: torch.Tensor) -> torch.Tensor:
+    """Standard deviation of the white noise on series (T, …), by the median size of fourth differences; NaN: left out.
+
+    White noise of standard deviation σ leaves √70 σ. A foot that hits the ground leaves a few large ones.
+    """
+    return 1.4826 / 70**0.5 * series.diff(n=4, dim=0).abs().nanmedian(dim=0).values
+
+
 def encoder_noise(carried: Carried, error: torch.Tensor) -> torch.Tensor:
     """The encoders' noise, by what errors of free joints have that no motion has, (R, n) [rad].
-
-    White noise of standard deviation σ leaves fourth differences of √70 σ. The median of their size is taken: a foot
-    that hits the ground leaves a few large ones.
 
     Args:
         carried: R recordings.
         error: Of a candidate, at all control steps, (T, R, n) [rad].
     """
-    difference = error.diff(n=4, dim=0).abs()
-    free = carried.free[: len(error)].unfold(0, 5, 1).all(dim=-1)
-    size = torch.where(free, difference, torch.nan).nanmedian(dim=0).values
-    usual = carried.start_std[..., 0]
-    known = (free.sum(dim=0) >= _FEWEST) & (size > 0) & (usual > 0)
-    return torch.where(known, 1.4826 / 70**0.5 * size, usual)
+    free, usual = carried.free[: len(error)], carried.start_std[..., 0]
+    noise = _white(torch.where(free, error, torch.nan))
+    known = (free.sum(dim=0) >= _FEWEST) & (noise > 0) & (usual > 0)
+    return torch.where(known, noise, usual)
 
 
 def free_phases(
-    carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor, error: torch.Tensor
+    carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor, error: torch.Tensor, control_dt: float
 ) -> FreePhases:
     """The phases, and the covariances of their errors.
 
@@ -237,11 +242,14 @@ def free_phases(
     Args:
         carried: R recordings.
         trees: Groups of joints, by index.
-        change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 3, T, R, n).
+        change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 6, T, R, n).
         error: Of the candidate without those changes, (T, R, n) [rad].
+        control_dt: [s].
     """
     depth, noise = max(len(tree) for tree in trees), encoder_noise(carried, error)
-    most = carried.start_std.amax(dim=0)
+    most, gyroscope = carried.start_std.amax(dim=0), _white(carried.base[..., :3])
+    turning = carried.base[..., :3].diff(dim=0) / control_dt
+    slope = torch.cat([turning.diff(dim=0, append=turning[-1:]), carried.base[..., 3:].diff(dim=0)], dim=-1)
     blocks, covariances = blocks_of(carried, trees), []
     for block in blocks:
         r, joints, count = block.recording, block.joints, block.end - block.first
@@ -250,17 +258,17 @@ def free_phases(
         scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
         begun = scale[:, None, None] * change[rows][:, block.first : block.end, r][..., joints] / sigma
         columns = [begun.flatten(1)]
-        response = change[2 * depth :, block.begin : block.end, r][..., joints] / (FORCE * sigma)
+        response = change[2 * depth :, block.begin : block.end, r][..., joints] / (PUSH * sigma)
         kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
         steps = torch.arange(block.first - min(block.first - block.begin, 2 * _BLOCK), block.end - 1)
         behind = torch.arange(block.first, block.end)[:, None] - steps - 1
         felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
-        felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (3, count, steps, joints)
-        felt = felt.transpose(1, 2).flatten(2)  # (3, steps, count joints)
-        late = carried.base[:, r, 3:].diff(dim=0)[steps].T[:, :, None]
-        columns.append(_LATE * (felt * late).sum(dim=1))
-        along = _correlated(len(steps)) @ (felt * (_MORE * carried.force_std[steps, r].T)[:, :, None])
-        columns.append(along.flatten(0, 1))
+        felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (6, count, steps, joints)
+        felt = felt.transpose(1, 2).flatten(2)  # (6, steps, count joints)
+        columns.append(_LATE * (felt * slope[steps, r].T[:, :, None]).sum(dim=1))
+        turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
+        pushed = _correlated(len(steps)) @ (felt[3:] * (_MORE * carried.force_std[steps, r].T)[:, :, None])
+        columns += [turned.flatten(0, 1), pushed.flatten(0, 1)]
         every = torch.cat(columns)
         covariances.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
     wide = _disturbed(blocks, covariances, error, noise)

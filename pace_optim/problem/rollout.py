@@ -175,7 +175,8 @@ class Rollout:
             initial_offset: Added to each recording's first position, (num_candidates, n) [rad].
             shift: Added to positions [rad] and speeds [rad/s] at which joints are held until a free phase begins,
                 (num_candidates, n, 2).
-            push: Added to the specific force of a base that moves, (num_candidates, 3) [m/s²].
+            push: Added to the angular acceleration [rad/s²] and the specific force [m/s²] of a base that moves,
+                (num_candidates, 6).
         """
         count = self.dataset.num_recordings
         self.look_at(self.dataset.train if where is None else where)
@@ -337,7 +338,7 @@ class Rollout:
             self.robot.set_joint_effort_target(self._rows(data.command_effort[k]))
         if self._course is not None:
             motion = self._course.motion[k].repeat(1, self.num_candidates, 1)
-            motion[..., 6:] += self._course.push
+            motion[..., 3:] += self._course.push
             self.env.sim.move_base(motion, self._course.point.repeat(self.num_candidates, 1).numpy())
         self.env.simulate(self._rows(data.command[k]))
 
@@ -368,7 +369,7 @@ class Rollout:
             point=carried.point,
             held=carried.held(),
             shift=torch.zeros(self.env.num_envs, self.robot.num_joints, 2, dtype=self.env.dtype),
-            push=torch.zeros(self.env.num_envs, 3, dtype=self.env.dtype),
+            push=torch.zeros(self.env.num_envs, 6, dtype=self.env.dtype),
         )
 
     def _rows(self, per_recording: torch.Tensor) -> torch.Tensor:
@@ -393,7 +394,7 @@ class Rollout:
         Args:
             offset: Added to the first positions, (num_envs, n) [rad].
             shift: Added to where joints are held, (num_envs, n, 2) [rad, rad/s].
-            push: Added to the specific force of the base, (num_envs, 3) [m/s²].
+            push: Added to the base's angular acceleration [rad/s²] and specific force [m/s²], (num_envs, 6).
         """
         if self._course is not None:
             self._course.shift[:], self._course.push[:] = shift, push

@@ -18,8 +18,10 @@ _SLOPE = 0.005
 """Speeds are slopes over so much time to either side [s]."""
 _SHAKEN = 0.02
 """Noise of the accelerometer is taken over so much time to either side [s]."""
+LIFTED = 0.03
+"""Time after lift-off that does not count [s]: a foot that leaves the ground touches it between samples for a while."""
 MARGIN = 0.01
-"""Time after lift-off and before touch-down that does not count [s]."""
+"""Time before touch-down that does not count [s]."""
 SHORTEST = 0.06
 """Of a free phase that counts [s]."""
 _LOADED = 0.05
@@ -131,11 +133,11 @@ def free_phases(standing: np.ndarray, dt: float) -> np.ndarray:
         standing: Whether it touches the ground, (T,) bool.
         dt: Time between samples [s].
     """
-    margin, shortest = round(MARGIN / dt), max(3, round(SHORTEST / dt))
+    lifted, margin, shortest = round(LIFTED / dt), round(MARGIN / dt), max(3, round(SHORTEST / dt))
     edges = np.flatnonzero(np.diff(np.concatenate([[True], standing, [True]]).astype(int)))
     result = np.zeros(len(standing), dtype=bool)
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        first = begin + (margin if begin else 0)
+        first = begin + (lifted if begin else 0)
         last = end - (margin if end < len(standing) else 0)
         if last - first >= shortest:
             result[first:last] = True
