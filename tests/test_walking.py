@@ -11,8 +11,6 @@ from walking import DT, crawler, walking_problem, write_log
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.kernels import host
 from pace_optim.estimate.derivatives import colour, stencil
-from pace_optim.estimate.error_bars.uncertainty import estimate_uncertainty
-from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet
 from pace_optim.recording.data import ImuPose
@@ -112,11 +110,45 @@ def test_a_joint_that_stands_is_where_it_was_measured(walk):
     assert bool((share > 0.1).all()) and bool((share < 0.9).all())
 
 
+def test_an_imu_that_is_late_moves_no_parameter(walk):
+    problem, truth = walk
+    carried = problem.dataset.carried
+    late = torch.cat([carried.base[:1].repeat(2, 1, 1), carried.base[:-2]])  # 5 ms
+    delayed = replace(problem, dataset=replace(problem.dataset, carried=replace(carried, base=late)))
+    found, _ = steps_of(delayed, problem.space.to_normalised(truth))
+    for name, within in (("armature", 0.03), ("viscous_friction", 0.05)):
+        own = problem.space[name]
+        assert float((found[own] / truth[own] - 1).abs().median()) < within, name
+
+
+def test_a_swing_that_something_disturbs_hardly_counts(walk):
+    problem, truth = walk
+    phases = problem.evaluator().free_phases(truth)
+    block = next(i for i, each in enumerate(phases.blocks) if each.first == each.begin + 1)
+    own = phases.blocks[block]
+    measured = problem.dataset.measured.clone()
+    measured[own.first : own.end, 0, own.joints] += 0.02 * torch.linspace(0, 1, own.end - own.first)[:, None].sin()
+    touched = replace(problem, dataset=replace(problem.dataset, measured=measured)).evaluator().free_phases(truth)
+    wider = [
+        float(b.diagonal().sum() / a.diagonal().sum())
+        for a, b in zip(phases.covariances, touched.covariances, strict=True)
+    ]
+    assert wider[block] > 100 and max(w for i, w in enumerate(wider) if i != block) < 3
+
+
+def test_the_noise_of_encoders_is_that_of_free_joints(walk):
+    problem, _ = walk
+    carried = problem.dataset.carried
+    error = 2e-4 * torch.randn(carried.free.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    error[~carried.free] *= 100
+    assert encoder_noise(carried, error) == pytest.approx(torch.full_like(carried.start_std[..., 0], 2e-4), rel=0.2)
+
+
 def test_chatter_is_no_swing_and_a_swing_keeps_a_margin():
     standing = np.ones(400, dtype=bool)
     standing[100:200] = False
     standing[210:214] = standing[216:217] = False
-    free = free_phases(standing, DT)
+    free = free_phases(standing, DT)  # 30 ms after lift-off, 10 ms before touch-down
     assert np.flatnonzero(free).tolist() == list(range(112, 196))
     standing[150] = True  # one sample of contact cuts it
     assert not free_phases(standing, DT)[146:163].any()
