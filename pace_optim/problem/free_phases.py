@@ -25,9 +25,9 @@ simulation, the mean force less the mean of its two samples has this correlation
 the gyroscope's: it has a delay, too, and differences of white noise. So an IMU that is late by less than d, and some
 more, moves no parameter.
 
-A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground and no contact
-was logged. Its covariance is multiplied by the square of what its mean square is above theirs, so that it hardly counts
-(iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
+A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground, and no
+contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it hardly
+counts (iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def free_phases(
     slope = torch.cat([turning.diff(dim=0, append=turning[-1:]), carried.base[..., 3:].diff(dim=0)], dim=-1)
     blocks, covariances = blocks_of(carried, trees), []
     for block in blocks:
-        r, joints, count = block.recording, block.joints, block.end - block.first
+        r, joints = block.recording, block.joints
         sigma = noise[r, joints]
         rows = [kind * depth + i for kind in range(2) for i in range(len(joints))]
         scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
