@@ -62,7 +62,8 @@ def test_without_the_motion_of_the_base_the_error_is_many_times_the_noise(walk):
     scores = []
     for each in (problem, resting):
         evaluator = each.evaluator()
-        evaluator.phases = FreePhases(blocks=(), covariances=(), noise=carried.start_std[..., 0])  # errors as they are
+        std = carried.start_std[..., 0]
+        evaluator.phases = FreePhases(blocks=(), covariances=(), noise=std, floor=std)  # errors as they are
         scores.append(float(evaluator.residuals(truth[None]).score[0]))
     assert scores[1] > 100 * scores[0]
 

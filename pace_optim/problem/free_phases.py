@@ -9,10 +9,11 @@ covariance
 with σ the encoders' noise, A the derivatives of e by the beginning, each times the standard deviation of that part of
 it, and B those by the specific force in each control step, times a root of its covariance. Least squares of
 
-    e' = σ L⁻¹ e / σ,    C = σ² L Lᵀ
+    e' = s L⁻¹ e / σ,    C = σ² L Lᵀ
 
-is the estimate that knows of this (Aitken, Proceedings of the Royal Society of Edinburgh 55, 1936). L is lower
-triangular in time: e' is what a sample says beyond all those before it. The beginnings cost no parameter.
+with s the recording's noise floor, is the estimate that knows of this (Aitken, Proceedings of the Royal Society of
+Edinburgh 55, 1936). L is lower triangular in time: e' is what a sample says beyond all those before it. The beginnings
+cost no parameter.
 
 What an accelerometer misses lasts. A drive holds its torque between two control steps, and the accelerometer shows the
 force at one instant of that time: its error repeats from step to step, and has a part that is a delay. So the force's
@@ -26,8 +27,8 @@ the gyroscope's: it has a delay, too, and differences of white noise. So an IMU 
 more, moves no parameter.
 
 A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground, and no
-contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it hardly
-counts (iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
+contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it
+hardly counts (iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
 """
 
 from __future__ import annotations
@@ -84,6 +85,8 @@ class FreePhases:
     """Of each, C / σ², (steps joints, steps joints)."""
     noise: torch.Tensor
     """σ, (R, n) [rad]."""
+    floor: torch.Tensor
+    """Noise floor of the recordings s, (R, n) [rad]: errors of the right model are brought to it."""
     _known: list[tuple[torch.Tensor, torch.Tensor, list[tuple[int, int, torch.Tensor]]]] = field(default_factory=list)
     """Steps, a mask, and L⁻¹ there, of the last few."""
 
@@ -106,7 +109,9 @@ class FreePhases:
             if block.recording in chosen
         ]
         blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
-        return replace(self, blocks=blocks, covariances=covariances, noise=self.noise[chosen], _known=[])
+        return replace(
+            self, blocks=blocks, covariances=covariances, noise=self.noise[chosen], floor=self.floor[chosen], _known=[]
+        )
 
     def on_joints(self, joints: Sequence[int]) -> FreePhases:
         """Those of some joints, by index, each by itself."""
@@ -117,7 +122,14 @@ class FreePhases:
             if block.joints[0] in chosen
         ]
         blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
-        return replace(self, blocks=blocks, covariances=covariances, noise=self.noise[:, chosen], _known=[])
+        return replace(
+            self,
+            blocks=blocks,
+            covariances=covariances,
+            noise=self.noise[:, chosen],
+            floor=self.floor[:, chosen],
+            _known=[],
+        )
 
     def taken_out(self, error: torch.Tensor, step: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
         """Errors without what beginnings and the specific force explain; changed in place.
@@ -131,7 +143,8 @@ class FreePhases:
             if begin < end:
                 part = error[:, begin:end, block.recording][..., block.joints]
                 sigma = self.noise[block.recording, block.joints]
-                left = ((part / sigma).flatten(1) @ whitening.T).view(part.shape) * sigma
+                left = ((part / sigma).flatten(1) @ whitening.T).view(part.shape)
+                left *= self.floor[block.recording, block.joints]
                 error[:, begin:end, block.recording, block.joints] = left
         return error
 
@@ -273,7 +286,7 @@ def free_phases(
         covariances.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
     wide = _disturbed(blocks, covariances, error, noise)
     covariances = [factor * covariance for factor, covariance in zip(wide, covariances, strict=True)]
-    return FreePhases(blocks=blocks, covariances=tuple(covariances), noise=noise)
+    return FreePhases(blocks=blocks, covariances=tuple(covariances), noise=noise, floor=carried.start_std[..., 0])
 
 
 def _disturbed(
