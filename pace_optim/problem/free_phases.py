@@ -34,7 +34,7 @@ hardly counts (iteratively reweighted least squares, Holland and Welsch, Communi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -87,6 +87,8 @@ class FreePhases:
     """σ, (R, n) [rad]."""
     floor: torch.Tensor
     """Noise floor of the recordings s, (R, n) [rad]: errors of the right model are brought to it."""
+    expected: tuple[torch.Tensor, ...] = ()
+    """Of each block, what error bars take for C / σ²: with all that lasts."""
     _known: list[tuple[torch.Tensor, torch.Tensor, list[tuple[int, int, torch.Tensor]]]] = field(default_factory=list)
     """Steps, a mask, and L⁻¹ there, of the last few."""
 
@@ -98,7 +100,7 @@ class FreePhases:
                 own = slice(i, None, len(block.joints))
                 blocks.append(replace(block, joints=[joint]))
                 covariances.append(covariance[own, own])
-        return replace(self, blocks=tuple(blocks), covariances=tuple(covariances), _known=[])
+        return replace(self, blocks=tuple(blocks), covariances=tuple(covariances), expected=(), _known=[])
 
     def select(self, recordings: Sequence[int]) -> FreePhases:
         """Those of some of the recordings, by index."""
@@ -110,7 +112,13 @@ class FreePhases:
         ]
         blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
         return replace(
-            self, blocks=blocks, covariances=covariances, noise=self.noise[chosen], floor=self.floor[chosen], _known=[]
+            self,
+            blocks=blocks,
+            covariances=covariances,
+            expected=(),
+            noise=self.noise[chosen],
+            floor=self.floor[chosen],
+            _known=[],
         )
 
     def on_joints(self, joints: Sequence[int]) -> FreePhases:
@@ -126,6 +134,7 @@ class FreePhases:
             self,
             blocks=blocks,
             covariances=covariances,
+            expected=(),
             noise=self.noise[:, chosen],
             floor=self.floor[:, chosen],
             _known=[],
@@ -147,6 +156,19 @@ class FreePhases:
                 left *= self.floor[block.recording, block.joints]
                 error[:, begin:end, block.recording, block.joints] = left
         return error
+
+    def expected_of(self, step: torch.Tensor, where: torch.Tensor) -> Iterator[tuple[Block, int, int, torch.Tensor]]:
+        """Of each block, its rows among the steps, and the covariance of L⁻¹ e / σ that error bars take for true.
+
+        Args:
+            step: Control step of each of the K, ascending, (K,).
+            where: Which samples count, (T, R) bool.
+        """
+        known = self._where(step, where)
+        for block, (begin, end, whitening), expected in zip(self.blocks, known, self.expected, strict=True):
+            joints = len(block.joints)
+            own = ((step[begin:end] - block.first)[:, None] * joints + torch.arange(joints)).flatten()
+            yield block, begin, end, whitening @ expected[own][:, own] @ whitening.T
 
     def _where(self, step: torch.Tensor, where: torch.Tensor) -> list[tuple[int, int, torch.Tensor]]:
         """For each block, its rows among the steps, and L⁻¹ of its samples."""
@@ -263,7 +285,7 @@ def free_phases(
     most, gyroscope = carried.start_std.amax(dim=0), _white(carried.base[..., :3])
     turning = carried.base[..., :3].diff(dim=0) / control_dt
     slope = torch.cat([turning.diff(dim=0, append=turning[-1:]), carried.base[..., 3:].diff(dim=0)], dim=-1)
-    blocks, covariances = blocks_of(carried, trees), []
+    blocks, covariances, expected = blocks_of(carried, trees), [], []
     for block in blocks:
         r, joints = block.recording, block.joints
         sigma = noise[r, joints]
@@ -278,15 +300,25 @@ def free_phases(
         felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
         felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (6, count, steps, joints)
         felt = felt.transpose(1, 2).flatten(2)  # (6, steps, count joints)
+        white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
+        own = torch.cat([*columns, white.flatten(0, 1)])
+        covariances.append(torch.eye(own.shape[1], dtype=change.dtype) + own.T @ own)
         columns.append(_LATE * (felt * slope[steps, r].T[:, :, None]).sum(dim=1))
         turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
-        pushed = _correlated(len(steps)) @ (felt[3:] * (_MORE * carried.force_std[steps, r].T)[:, :, None])
+        pushed = _MORE * _correlated(len(steps)) @ white
         columns += [turned.flatten(0, 1), pushed.flatten(0, 1)]
         every = torch.cat(columns)
-        covariances.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
-    wide = _disturbed(blocks, covariances, error, noise)
-    covariances = [factor * covariance for factor, covariance in zip(wide, covariances, strict=True)]
-    return FreePhases(blocks=blocks, covariances=tuple(covariances), noise=noise, floor=carried.start_std[..., 0])
+        expected.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
+    wide = _disturbed(blocks, expected, error, noise)
+    covariances = [factor * each for factor, each in zip(wide, covariances, strict=True)]
+    expected = [factor * each for factor, each in zip(wide, expected, strict=True)]
+    return FreePhases(
+        blocks=blocks,
+        covariances=tuple(covariances),
+        noise=noise,
+        floor=carried.start_std[..., 0],
+        expected=tuple(expected),
+    )
 
 
 def _disturbed(

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
+from pace_optim.estimate.error_bars.swings import middle_of_swings
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
 from pace_optim.estimate.least_squares import Descent
 from pace_optim.problem.evaluator import Evaluator, Residuals
@@ -66,7 +67,10 @@ def assess(
         there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
         hessian, _ = there.normal_equations()
     initial = probes.initial(error)
-    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held)
+    middle = None
+    if evaluator.phases is not None and every.weight is not None:
+        middle = middle_of_swings(there, every, evaluator.phases, data.sampled, recordings)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held, middle)
     residuals = every.rows(0, 1)
     return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise)
 

@@ -76,6 +76,7 @@ def estimate_uncertainty(
     initial: torch.Tensor | None = None,
     initial_joints: Sequence[tuple[int, ...]] = (),
     held: Sequence[str] = (),
+    middle: np.ndarray | None = None,
 ) -> Uncertainty:
     """Error bars at an optimum.
 
@@ -87,7 +88,7 @@ def estimate_uncertainty(
     recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A prior of
     precision P adds σ² P to H and σ⁴ P to the middle, so that what moves nothing keeps its prior's error bar. A
     simulation starts at the first measured position: that sample's noise moves all that follows, and is added to Σ.
-    Residuals of a walking robot's swings are whitened: there Σ is diagonal, with a variance for each swing.
+    Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.swings`).
 
     Args:
         jacobian: At x.
@@ -96,10 +97,11 @@ def estimate_uncertainty(
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
         held: Labels of what is held where it is; it has no error bar, and the others have those beside it.
+        middle: JᵀΣJ where Σ is known, normalised (size, size); ``None``: from the residuals.
     """
     samples = int(jacobian.residuals.where.sum())
     hessian, _ = jacobian.normal_equations()
-    middle = _middle(jacobian)
+    middle = _middle(jacobian) if middle is None else middle
     if (prior := jacobian.residuals.prior) is not None:
         middle += prior.noise * prior.hessian.numpy()
     if initial is not None:
@@ -199,19 +201,8 @@ def _middle(jacobian: Jacobian) -> np.ndarray:
             own = [entry for entry in row if joint in colouring.joints[entry]]
             columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
-            if residuals.weight is None:
-                total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
-                continue
-            for phase in _phases(residuals.weight[at, r, joint].numpy()):
-                part = columns[:, phase]
-                total[np.ix_(own, own)] += np.square(error[phase]).mean() * part @ part.T
+            total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
     return total
-
-
-def _phases(weight: np.ndarray) -> list[slice]:
-    """Where a joint is free, phase by phase."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], weight > 0, [False]]).astype(int)))
-    return [slice(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
 
 
 def _from_first_sample(
