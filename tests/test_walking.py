@@ -118,10 +118,10 @@ def test_an_imu_that_is_late_moves_no_parameter(walk):
     delayed = replace(problem, dataset=replace(problem.dataset, carried=replace(carried, base=late)))
     found, residuals = steps_of(delayed, problem.space.to_normalised(truth))
     _, on_time = steps_of(problem, problem.space.to_normalised(truth))
-    assert float(residuals.score[0]) < 1.3 * float(on_time.score[0])
+    assert float(residuals.score[0]) < 2 * float(on_time.score[0])  # 4 times, if nothing knows of a delay
     own = problem.space["viscous_friction"]
     assert float((found[own] / truth[own] - 1).abs().median()) < 0.005
-    assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 3e-5
+    assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 1e-4
 
 
 def test_a_swing_that_something_disturbs_hardly_counts(walk):

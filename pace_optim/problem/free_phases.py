@@ -22,9 +22,10 @@ error has, along each axis, the covariance
     s_i s_k ((1 - w) δ_ik + w exp(-|i - k| / m)) + d² Δf_i Δf_k
 
 with s the standard deviation that the log shows, and Δf the change of the force in a step. On robots that trot in
-simulation, the mean force less the mean of its two samples has this correlation. The angular acceleration is a slope of
-the gyroscope's: it has a delay, too, and differences of white noise. So an IMU that is late by less than d, and some
-more, moves no parameter.
+simulation, the mean force less the mean of its two samples has this correlation. Error bars know of it. C itself has
+the delay, and white noise: a fit that gives less weight to what is slow cannot tell a spring from an offset.
+
+The angular acceleration is a slope of the gyroscope's. It has a delay, too, and differences of white noise.
 
 A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground, and no
 contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it
@@ -54,8 +55,6 @@ _ALIKE = 0.85
 """w: part of the variance of the force's error that lasts ..."""
 _LASTS = 10.0
 """... m: for so many control steps."""
-_MORE = 1.75
-"""Times what second differences of the force show: errors have heavier tails than a normal distribution."""
 _DISTURBED = 1.25
 """Times the usual mean square of a leg's phases from which one is disturbed."""
 PUSH = 0.1
@@ -300,12 +299,12 @@ def free_phases(
         felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
         felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (6, count, steps, joints)
         felt = felt.transpose(1, 2).flatten(2)  # (6, steps, count joints)
+        columns.append(_LATE * (felt * slope[steps, r].T[:, :, None]).sum(dim=1))
         white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
         own = torch.cat([*columns, white.flatten(0, 1)])
         covariances.append(torch.eye(own.shape[1], dtype=change.dtype) + own.T @ own)
-        columns.append(_LATE * (felt * slope[steps, r].T[:, :, None]).sum(dim=1))
         turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
-        pushed = _MORE * _correlated(len(steps)) @ white
+        pushed = _correlated(len(steps)) @ white
         columns += [turned.flatten(0, 1), pushed.flatten(0, 1)]
         every = torch.cat(columns)
         expected.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
