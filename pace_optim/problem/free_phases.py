@@ -19,17 +19,17 @@ What an accelerometer misses lasts. A drive holds its torque between two control
 force at one instant of that time: its error repeats from step to step, and has a part that is a delay. So the force's
 error has, along each axis, the covariance
 
-    s_i s_k ((1 - w) δ_ik + w exp(-|i - k| / m)) + d² Δf_i Δf_k
+    s_i s_k ((1 - w) δ_ik + w exp(-|i - k| / m)) + d² f'_i f'_k
 
-with s the standard deviation that the log shows, and Δf the change of the force in a step. On robots that trot in
-simulation, the mean force less the mean of its two samples has this correlation. Error bars know of it. C itself has
-the delay, and white noise: a fit that gives less weight to what is slow cannot tell a spring from an offset.
-
-The angular acceleration is a slope of the gyroscope's. It has a delay, too, and differences of white noise.
+with s the standard deviation that the log shows, and f' the slope of the force. On robots that trot in simulation, the
+mean force less the mean of its two samples has this correlation. The angular acceleration is a slope of the
+gyroscope's. It has a delay, too, and differences of white noise. Error bars know of all this. C itself has white noise
+of the force and nothing else: to a fit that gives less weight to what is slow or late, a spring is an offset or a delay.
 
 A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground, and no
 contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it
-hardly counts (iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977).
+hardly counts (iteratively reweighted least squares, Holland and Welsch, Communications in Statistics 6, 1977). Missing
+physics differs from swing to swing, too, by a few times: such phases keep their weight.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ _FEWEST = 64
 """Samples from which the encoders' noise is estimated."""
 _KEPT = 3
 """Masks of samples that are remembered."""
-_LATE = 1.0
-"""d: standard deviation of the force's delay [control steps]."""
+_LATE = 0.001
+"""d: standard deviation of the force's delay [s]: one of twice that is found in the log, and warned of."""
 _ALIKE = 0.85
 """w: part of the variance of the force's error that lasts ..."""
 _LASTS = 10.0
 """... m: for so many control steps."""
-_DISTURBED = 1.25
+_DISTURBED = 8.0
 """Times the usual mean square of a leg's phases from which one is disturbed."""
 PUSH = 0.1
 """Change of the angular acceleration [rad/s²] and of the specific force [m/s²] for a derivative."""
@@ -299,13 +299,13 @@ def free_phases(
         felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
         felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (6, count, steps, joints)
         felt = felt.transpose(1, 2).flatten(2)  # (6, steps, count joints)
-        columns.append(_LATE * (felt * slope[steps, r].T[:, :, None]).sum(dim=1))
         white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
         own = torch.cat([*columns, white.flatten(0, 1)])
         covariances.append(torch.eye(own.shape[1], dtype=change.dtype) + own.T @ own)
         turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
         pushed = _correlated(len(steps)) @ white
-        columns += [turned.flatten(0, 1), pushed.flatten(0, 1)]
+        late = _LATE / control_dt * (felt * slope[steps, r].T[:, :, None]).sum(dim=1)
+        columns += [late, turned.flatten(0, 1), pushed.flatten(0, 1)]
         every = torch.cat(columns)
         expected.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
     wide = _disturbed(blocks, expected, error, noise)
