@@ -24,7 +24,7 @@ error has, along each axis, the covariance
 with s the standard deviation that the log shows, and f' the slope of the force. On robots that trot in simulation, the
 mean force less the mean of its two samples has this correlation. The angular acceleration is a slope of the
 gyroscope's. It has a delay, too, and differences of white noise. Error bars know of all this. C itself has white noise
-of the force and nothing else: to a fit that gives less weight to what is slow or late, a spring is an offset or a delay.
+of the force and no more: to a fit that gives less weight to what is slow or late, a spring is an offset or a delay.
 
 A phase whose errors are far above those of the leg's other phases is disturbed: a foot touched the ground, and no
 contact was logged. Its covariance is multiplied by the square of the ratio of its mean square to theirs, so that it
