@@ -18,7 +18,7 @@ from pace_optim.diagnosis.selection.decisions import Decision, as_lines, read_de
 from pace_optim.diagnosis.selection.rules import decide, decided
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "single_joint_fits")]
+FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "joints/fits")]
 CASES = read_cases(sorted((Path(__file__).parent / "decisions").glob("*.jsonl*")))
 """The decisions of the reference: benchmarks/ablation.md."""
 PLAIN = {0, 1, -1, 2, 0.5, 10, 100, 1e3, -1e3}

@@ -17,7 +17,8 @@ from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_en
 from pace_envs.identified import use_identified
 from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
-from pace_optim.diagnosis.wrong_links import LinkFindings, LinksCfg, find_wrong_links
+from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
+from pace_optim.diagnosis.wrong_links import LinkFindings, find_wrong_links
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined

@@ -73,7 +73,7 @@ def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colou
 
     def search(budget, around):
         budgets.append(budget)
-        return normalised(problem)
+        return [normalised(problem)]
 
     best = staged.run([torch.full_like(centre(problem), 0.9)], search)
     spent = sum(d.simulations for d in staged.descents if d.stage == PIECES and d is staged.descents[0])

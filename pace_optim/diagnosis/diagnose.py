@@ -61,7 +61,7 @@ def diagnose(
     values = {name: result.parameters[name] for name in whole.space.slices}
     wrong = LinkFindings()
     if settings.links:
-        wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say)
+        wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, settings.cfg.links)
     problem = whole.with_effects(()).with_links(wrong.links)
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)

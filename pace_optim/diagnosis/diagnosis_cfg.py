@@ -101,6 +101,39 @@ RULES = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class LinksCfg:
+    """Numbers of the search for wrong links; ratios are of RMSE."""
+
+    above: float = 1.15
+    """Nothing is looked for where the error is less than this many times the noise."""
+    left: float = 1.15
+    """At this many times the noise nothing is left."""
+    clear: float = 5.0
+    """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
+    a link."""
+    pays: float = 1.5
+    """What a link must lower the error by."""
+    alike: float = 1.10
+    """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
+    share: float = 0.25
+    """Share of each recording that candidates are screened and compared on."""
+    step: float = 1e-2
+    """Normalised step of the derivatives."""
+    tried: int = 4
+    """Candidates of a round that are fitted, ..."""
+    of_link: int = 3
+    """and so many of them of one link."""
+    iterations: int = 8
+    """Of each fit, at most."""
+    most: int = 3
+    """Wrong links, at most."""
+    tolerance: float = 1e-3
+    """They end where less than this part of the score is left to gain."""
+    cost: float = 0.25
+    """Power of the number of parameters by which what they explain is divided."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DiagnosisCfg:
     """A diagnosis' numbers, and which of its moves are made."""
 
@@ -109,6 +142,7 @@ class DiagnosisCfg:
     judging: JudgingCfg = field(default_factory=JudgingCfg)
     verdict: VerdictCfg = field(default_factory=VerdictCfg)
     menu: MenuCfg = field(default_factory=MenuCfg)
+    links: LinksCfg = field(default_factory=LinksCfg)
     off: tuple[str, ...] = ()
     """Which of ``RULES`` are not made, for an ablation."""
 

@@ -24,6 +24,7 @@ from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import effect_cfgs, get_effect
 from pace_envs.link_inertia import NAMES, PARTS, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
+from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
 from pace_optim.estimate.derivatives import Colouring, colour, stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
@@ -35,35 +36,6 @@ LOOK_ALIKES = ("torque_gain", "proportional_gain", "parallel_spring", "torque_of
 """Effects on one joint that look like a wrong link."""
 _CHOICES = (("mass",), ("com",), ("mass", "com"), tuple(PARTS))
 """What may be wrong with a link, the fewest parameters first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinksCfg:
-    """Numbers of the search for wrong links; ratios are of RMSE."""
-
-    above: float = 1.15
-    """Nothing is looked for where the error is less than this many times the noise."""
-    left: float = 1.15
-    """At this many times the noise nothing is left."""
-    clear: float = 5.0
-    """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
-    a link."""
-    pays: float = 1.5
-    """What a link must lower the error by."""
-    alike: float = 1.10
-    """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
-    share: float = 0.25
-    """Share of each recording that candidates are screened and compared on."""
-    step: float = 1e-2
-    """Normalised step of the derivatives."""
-    tried: int = 4
-    """Candidates of a round that are fitted, ..."""
-    of_link: int = 3
-    """and so many of them of one link."""
-    iterations: int = 8
-    """Of each fit, at most."""
-    most: int = 3
-    """Wrong links, at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +213,7 @@ def _screened(
             names = tuple(name for part in PARTS if part in parts for name in PARTS[part])
             entries = [*own, *(space.labels.index(f"{name}/{each.link}") for name in names)]
             gain = _score_of(gradient, hessian, entries) - score
-            gains.append((gain / len(names) ** 0.25, replace(each, names=names)))
+            gains.append((gain / len(names) ** cfg.cost, replace(each, names=names)))
     result: list[Reference] = []
     for _, each in sorted(gains, key=lambda each: -each[0]):
         if sum(each.link == other.link for other in result) < cfg.of_link:
@@ -293,7 +265,9 @@ def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
 
 def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg, *, whole: bool = False) -> _Fitted:
     """The problem fitted from near, on pieces, or on all that is trained on."""
-    near = LeastSquaresCfg(max_iteration=cfg.iterations, score_tolerance=1e-3, noise_score=noise_score(problem))
+    near = LeastSquaresCfg(
+        max_iteration=cfg.iterations, score_tolerance=cfg.tolerance, noise_score=noise_score(problem)
+    )
     stage = problem if whole else problem.on_pieces(cfg.share)
     start = _values_in(problem, values)
     x = least_squares(stage.training_evaluator(), _colouring(problem), [start], near)[0].x

@@ -88,7 +88,7 @@ class WayDown:
     def run(
         self,
         starts: Sequence[torch.Tensor],
-        search: Callable[[int, torch.Tensor], torch.Tensor] | None = None,
+        search: Callable[[int, torch.Tensor], Sequence[torch.Tensor]] | None = None,
         scan: Callable[[torch.Tensor], torch.Tensor | None] = lambda _: None,
     ) -> Descent:
         """Go all the way; returns the best descent on the whole recordings.
@@ -96,7 +96,7 @@ class WayDown:
         Args:
             starts: Normalised vectors, (size,).
             scan: Gives another start by the best end so far, or none.
-            search: Searches the pieces with a budget of simulations around a vector; returns its best vector.
+            search: Searches the pieces with a budget of simulations around a vector; returns starts.
         """
         pieces, whole = self.stages
         if not self._of(whole):
@@ -107,7 +107,7 @@ class WayDown:
                 best = self._on_pieces(starts)
             if search is not None and self.is_far(best.score):
                 spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
-                starts.append(search(round(self.cfg.search_budget * spent), best.x))
+                starts.extend(search(round(self.cfg.search_budget * spent), best.x))
                 self._on_pieces(starts)
             self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])

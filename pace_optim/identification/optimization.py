@@ -221,16 +221,16 @@ class Optimization:
             end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
         else:
             searches = self.settings.optimizer != "least_squares"
-            end = self.way.run(self._starts(), self._search_within if searches else None, self._scan)
+            starts = self._without_effects_too(self.problem.space.start)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
 
-    def _starts(self) -> list[torch.Tensor]:
-        """The start of the parameters, and the same without the effects."""
-        space = self.problem.space
-        added = [label for label in space.labels if "." in label]
-        return [space.start, at_prior(self.problem, space.start, added)] if added else [space.start]
+    def _without_effects_too(self, x: torch.Tensor) -> list[torch.Tensor]:
+        """A start, and the same without the effects: a richer model also begins at the one that it contains."""
+        added = [label for label in self.problem.space.labels if "." in label]
+        return [x, at_prior(self.problem, x, added)] if added else [x]
 
     def _scan(self, x: torch.Tensor) -> torch.Tensor | None:
         """The best end of the first descents with frequencies of combs that explain more."""
@@ -244,15 +244,15 @@ class Optimization:
             self.optimizer = make_optimizer(self.problem, self.settings, self.processes, self._around)
         return self.optimizer
 
-    def _search_within(self, budget: int, x: torch.Tensor) -> torch.Tensor:
-        """The best of a search of the pieces around a normalised vector (size,), with a budget of simulations."""
+    def _search_within(self, budget: int, x: torch.Tensor) -> list[torch.Tensor]:
+        """Starts by a search of the pieces around a normalised vector (size,), with a budget of simulations."""
         if not len(self._around):
             self._around = self.problem.space.to_physical(x)
         optimizer = self._make_optimizer()
         generations = max(_FEWEST_GENERATIONS, budget // optimizer.population_size)
         optimizer.cfg = replace(optimizer.cfg, max_iteration=min(optimizer.cfg.max_iteration, generations))
         self.progress.say("far above the noise: searching (Ctrl-C keeps what is found)")
-        return self._search(optimizer)
+        return self._without_effects_too(self._search(optimizer))
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(

@@ -23,8 +23,8 @@ from pace_optim.terminal.processes import Processes
 
 _HYBRID_POPULATION = 48
 """Candidates per generation of the hybrid's search: enough for a tree's dozen parameters, cheap enough to end soon."""
-_AROUND = 0.25
-"""First standard deviation of a hybrid's search, in normalised parameters: half a decade of a magnitude."""
+_AROUND = 0.5
+"""First standard deviation of a hybrid's search, in normalised parameters: a decade of a magnitude."""
 
 
 def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
@@ -97,13 +97,13 @@ def make_optimizer(
         problem: What is fitted.
         settings: How.
         processes: Who shares the search.
-        around: Physical parameters (size,) around which the hybrid searches, by magnitude; ``None``: PACE's search from
-            the start of the parameters.
+        around: Physical parameters (size,) around which a hybrid searches what it searches by magnitude; the rest it
+            searches from the start of the parameters. ``None``: PACE's search, all from there.
     """
     space, start, cfg = problem.space, problem.space.start, search_settings(problem, settings)
     if around is not None:
         space = space.by_magnitude()
-        start = space.to_normalised(around).clamp(-1.0, 1.0)
+        start = torch.where(space.is_logarithmic, space.to_normalised(around).clamp(-1.0, 1.0), space.start)
         cfg = replace(cfg, sigma=_AROUND if settings.sigma is None else settings.sigma)
     return build(
         optimizer_class(settings.optimizer) if settings.has_own_objective else CMAESOptimizer,

@@ -43,8 +43,8 @@ class ParameterSpace:
         self.lower = torch.tensor([v for p in parameters for v in p.lower], dtype=torch.float64)
         self.upper = torch.tensor([v for p in parameters for v in p.upper], dtype=torch.float64)
         self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
-        log = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
-        self._box = Box(self.lower, self.upper, log)
+        self.is_logarithmic = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
+        self._box = Box(self.lower, self.upper, self.is_logarithmic)
         self.prior = torch.tensor(
             [float("inf") if p.prior is None else p.prior for p in parameters for _ in p.keys], dtype=torch.float64
         )

@@ -200,8 +200,9 @@ def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[
     Raises:
         ValueError: If an expression matches nothing, a part is unknown, or a link does not move or has no mass.
     """
-    moving = {model.body(b).name: moved_by(model, model.body(b).name, joints) for b in range(1, model.nbody)}
-    names = [name for name, joint in moving.items() if name and joint is not None and model.body(name).mass[0] > 0]
+    named = [model.body(b).name for b in range(1, model.nbody) if model.body(b).name]
+    moving = {name: moved_by(model, name, joints) for name in named}
+    names = [name for name, joint in moving.items() if joint is not None and model.body(name).mass[0] > 0]
     found: dict[str, tuple[str, ...]] = {}
     for text in wanted:
         pattern, at, parts = text.rpartition("@")
