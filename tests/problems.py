@@ -89,7 +89,7 @@ def record(
         for key, value in (drive or {}).items():
             getattr(actuator, key)[:] = value
     if load is not None:
-        bench = {f.name: getattr(load, f.name) for f in fields(Load) if f.name != "added_mass"}
+        bench = {f.name: getattr(load, f.name) for f in fields(Load) if not f.name.startswith("added_mass")}
         bench = {key: value for key, value in bench.items() if value is not None}
         if bench:
             assert cfg.sim2real.apply_load is not None
