@@ -42,7 +42,9 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     make_result(effects=["stribeck_friction"]).save(with_it / "result.json")
     without = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
     assert "Add it" in without and "This run is the fit with it." not in without
-    assert "This run is the fit with it." in page_of(with_it).text and "Add it" not in page_of(with_it).text
+    text = page_of(with_it).text
+    assert "This run is the fit with it." in text and "What was missing is in this run" in text
+    assert "Add it" not in text and "An effect is missing" not in text
 
 
 def test_commands_in_the_advice_can_be_copied(tmp_path):

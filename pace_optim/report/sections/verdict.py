@@ -55,6 +55,9 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
     links = [link["label"] for link in content.get("links", [])]
+    has_it = bool(effects) and set(effects) <= set(had)
+    if has_it and content["verdict"] == "effect":
+        heading = "What was missing is in this run"
     if content.get("free_form"):
         part_known = "only a part of it is known" if content["added"] else "no known effect explains it"
         css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
@@ -68,7 +71,7 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
         css=css,
         heading=heading,
         summary=content["summary"],
-        has_it=bool(effects) and set(effects) <= set(had),
+        has_it=has_it,
         effects=shlex.join(dict.fromkeys([*had, *effects])),
         links=shlex.join(links),
         why="Add it" if content["added"] or links else "Until it is known, this lowers the error",
