@@ -31,7 +31,7 @@ class Course:
     held: torch.Tensor
     """Positions [rad] and speeds [rad/s] at which joints are held, (T, R, n, 2); NaN where they are free."""
     shift: torch.Tensor
-    """What is added to them, (num_envs, n, 2): encoder bias, and what nobody knows of where a phase begins."""
+    """What is added to them, (num_envs, n, 2): encoder bias, and the unknown part of where a phase begins."""
     push: torch.Tensor
     """What is added to the angular acceleration [rad/s²] and the specific force [m/s²], (num_envs, 6)."""
 

@@ -24,11 +24,12 @@ def main() -> None:
     kept: list = []
     whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))
     first = whole
-    end = whole.run([problem.space.start])
+    starts = [problem.space.start, 0.5 * torch.ones_like(problem.space.start)]
+    end = whole.run(starts)
     for checkpoint in kept[1::3]:
         again = way()
         again.descents = Descent.restore(checkpoint)
-        other = again.run([problem.space.start])
+        other = again.run(starts)
         if not torch.equal(other.x, end.x) or other.scores != end.scores or not torch.equal(other.hessian, end.hessian):
             sys.exit(1)
     print(len(kept), "iterations")

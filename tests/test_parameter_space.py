@@ -167,3 +167,19 @@ def test_one_declaration_adds_a_parameter_that_a_fit_recovers():
     assert best.score < 1e-9 * float(before)
     assert range_error(problem, best.x, truth) < 1e-3
     assert float(problem.space.to_physical(best.x)[-1]) == pytest.approx(50.0, rel=1e-3)
+
+
+def test_what_cannot_be_negative_is_searched_by_magnitude():
+    space = ParameterSpace.of(env_cfg().sim2real)
+    by_magnitude = space.by_magnitude()
+    assert by_magnitude.labels == space.labels
+    logarithmic = {
+        label.split("/")[0] for label, log in zip(space.labels, by_magnitude.is_logarithmic, strict=True) if log
+    }
+    assert "encoder_bias" not in logarithmic and {"viscous_friction", "friction"} <= logarithmic
+    entry = space["friction"].start
+    physical = space.to_physical(space.start)
+    physical[entry] = 1e-2 * space.upper[entry]
+    x = by_magnitude.to_normalised(physical)
+    assert float(x[entry]) == pytest.approx(0.0, abs=1e-9)  # half way from a ten-thousandth of the bound to it
+    torch.testing.assert_close(by_magnitude.to_physical(x), physical)

@@ -301,7 +301,7 @@ class Effect:
         if self.new_rows is None or not self._on_device:
             new, self.new_rows = self.new_rows, None
             return new
-        new = self.new_rows.clone()  # a CUDA graph repeats it, and nobody asks whether there are some
+        new = self.new_rows.clone()  # a CUDA graph repeats it, with new rows or without
         self.new_rows.fill_(False)
         return new
 

@@ -48,7 +48,7 @@ class ParameterSpace:
         self.prior = torch.tensor(
             [float("inf") if p.prior is None else p.prior for p in parameters for _ in p.keys], dtype=torch.float64
         )
-        """Standard deviation of each entry's prior around 0, normalised, (size,); infinite where there is none."""
+        """Standard deviation of each entry's prior around 0, normalised, (size,); infinite without a prior."""
 
     @classmethod
     def of(cls, cfg: PaceCfg) -> ParameterSpace:

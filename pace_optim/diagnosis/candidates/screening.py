@@ -267,7 +267,9 @@ def _explained(
 
 
 def _gram(columns: torch.Tensor) -> torch.Tensor:
-    return (columns @ columns.T).double()
+    """Products of columns (m, N), (m, m); in float32 they would depend on how many columns there are."""
+    columns = columns.double()
+    return columns @ columns.T
 
 
 def _cross_validated(grams: torch.Tensor) -> float:

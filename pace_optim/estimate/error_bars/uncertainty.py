@@ -88,7 +88,7 @@ def estimate_uncertainty(
     recording, its autocovariance estimated from the residuals and tapered where it is lost in the noise. A prior of
     precision P adds σ² P to H and σ⁴ P to the middle, so that what moves nothing keeps its prior's error bar. A
     simulation starts at the first measured position: that sample's noise moves all that follows, and is added to Σ.
-    Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.swings`).
+    Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.assessment`).
 
     Args:
         jacobian: At x.
