@@ -66,6 +66,9 @@ class SimulationCfg:
     contacts: bool = False
     """Whether geoms collide."""
 
+    sensors: bool = True
+    """Whether MuJoCo computes the model's sensors."""
+
     num_threads: int = 0
     """Threads of the physics; 0 means one per processor that the process may use. Results do not depend on it."""
 
@@ -396,6 +399,8 @@ class Simulation:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if not self.cfg.contacts:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        if not self.cfg.sensors:
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         for body in spec.bodies[1:]:
             body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
         timeconst, impedance = self.cfg.friction_timeconst, self.cfg.friction_impedance

@@ -86,6 +86,8 @@ def test_what_may_be_left_to_gain_grows_with_what_is_missing(times, part):
 class Curved:
     """Residuals x - 0.3 and 1 + bend x²/2 in place of a simulation: what no x explains is large, and turns."""
 
+    looks_coarser = False
+
     def __init__(self, bend):
         self.bend, self.space = bend, SimpleNamespace(to_physical=lambda x: x)
 
@@ -207,6 +209,8 @@ def test_a_parameter_without_influence_stays_where_it_is():
 
 class Fake:
     """Residuals from a function of the normalised vector, as an evaluator gives them."""
+
+    looks_coarser = False
 
     def __init__(self, function):
         self.function = function
@@ -336,6 +340,8 @@ class Rattling:
 
     A rotor's inertia, a delay that is nearly the same, and something else: one combination hardly moves anything.
     """
+
+    looks_coarser = False
 
     def __init__(self, seed=0, rattle=RATTLE):
         generator = torch.Generator().manual_seed(seed)

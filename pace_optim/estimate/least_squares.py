@@ -46,6 +46,10 @@ class LeastSquaresCfg:
     creep_tolerance: float = 1e-4
     """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
 
+    near_enough: float = 2e-3
+    """With derivatives of a longer physics step, stop when an iteration lowers the score by less than this part of it:
+    they lead beside the minimum. The error bars' own derivatives take the rest."""
+
     target_score: float = 1e-16
     """Stop below this score [rad²]."""
 
@@ -217,7 +221,9 @@ def _iterate(
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
         step = _Step(descent, hessian, jacobian.gradient_at(descent.x, error))
-    if descent.scores[-1] < descent.scores[-2]:
+    gained = descent.scores[-2] - descent.scores[-1]
+    beside = jacobian is not None and evaluator.looks_coarser and gained <= cfg.near_enough * descent.score
+    if gained > 0:
         descent.gradient, descent.refused = None, 0
     else:
         descent.refused += 1
@@ -225,7 +231,7 @@ def _iterate(
             descent.gradient = None
     if descent.score <= cfg.target_score:
         descent.stop_reason = f"score below {cfg.target_score:g}"
-    elif not blind and (left <= allowed or descent.refused >= _REFUSED or _creeps(descent.scores, cfg)):
+    elif not blind and (left <= allowed or beside or descent.refused >= _REFUSED or _creeps(descent.scores, cfg)):
         descent.stop_reason = "converged"
     elif descent.iteration >= cfg.max_iteration:
         descent.stop_reason = f"max_iteration {cfg.max_iteration}"

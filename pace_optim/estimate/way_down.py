@@ -2,10 +2,12 @@
 
 1. Descend on pieces: windows of two seconds, a share of each recording. Over a short time the error bends less, and
    has fewer valleys.
-2. Where that ends above the noise, search the pieces around the best end by CMA-ES, one strategy for each kinematic
+2. Where that ends above the noise and a fact is assumed, such as the rate of the drives' loops, descend with another.
+   The way goes on there if that explains more.
+3. Where that ends far above the noise, search the pieces around the best end by CMA-ES, one strategy for each kinematic
    tree. Armatures, frictions and the like are searched by magnitude. The search may simulate a stated multiple of what
    the descents took. Descend again from its best.
-3. Descend on the whole recordings from the end that is best there.
+4. Descend on the whole recordings from the end that is best there.
 
 Residuals are those of the fit's own physics step. Derivatives, and the search, take the longest stable one.
 
@@ -90,26 +92,31 @@ class WayDown:
         starts: Sequence[torch.Tensor],
         search: Callable[[int, torch.Tensor], Sequence[torch.Tensor]] | None = None,
         scan: Callable[[torch.Tensor], torch.Tensor | None] = lambda _: None,
+        elsewhere: Callable[[Descent], WayDown | None] = lambda _: None,
     ) -> Descent:
         """Go all the way; returns the best descent on the whole recordings.
 
         Args:
             starts: Normalised vectors, (size,).
-            scan: Gives another start by the best end so far, or none.
             search: Searches the pieces with a budget of simulations around a vector; returns starts.
+            scan: Gives another start by the best end so far, or none.
+            elsewhere: Gives the way of a model with other facts, begun at the best end so far, if it is to be gone on.
         """
         pieces, whole = self.stages
-        if not self._of(whole):
-            starts = list(starts)
-            best = self._on_pieces(starts)
-            if (found := scan(best.x)) is not None:
-                starts.append(found)
-                best = self._on_pieces(starts)
-            if search is not None and self.is_far(best.score):
-                spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
-                starts.extend(search(round(self.cfg.search_budget * spent), best.x))
-                self._on_pieces(starts)
-            self.descents.append(self._best_on_whole(starts))
+        if self._of(whole):
+            return self._descend(whole, [])
+        starts = list(starts)
+        best = self.begin(starts)
+        if (found := scan(best.x)) is not None:
+            starts.append(found)
+            best = self.begin(starts)
+        if (way := elsewhere(best)) is not None:
+            return way.run([best.x], search)
+        if search is not None and self.is_far(best.score):
+            spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
+            starts.extend(search(round(self.cfg.search_budget * spent), best.x))
+            self.begin(starts)
+        self.descents.append(self._best_on_whole(starts))
         return self._descend(whole, [])
 
     def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
@@ -126,7 +133,7 @@ class WayDown:
         """A stage's descents so far."""
         return [d for d in self.descents if d.stage == stage]
 
-    def _on_pieces(self, starts: Sequence[torch.Tensor]) -> Descent:
+    def begin(self, starts: Sequence[torch.Tensor]) -> Descent:
         """Descend on pieces from those starts that are new; returns the best end of all so far."""
         pieces = self.stages[0]
         self._descend(pieces, [Descent(x=x.clamp(-1.0, 1.0).clone(), stage=pieces) for x in starts])

@@ -31,8 +31,6 @@ from pace_optim.run.summary import summary
 
 _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
-_LOOP_IN_DOUBT = 1.5
-"""Times the noise above which a fit with an assumed loop rate tries another."""
 _STEP_IN_DOUBT = 1.3
 """Times the noise above which a fit may go on at half its physics step ..."""
 _OF_THE_STEP = 0.25
@@ -49,16 +47,8 @@ class _End:
 
     problem: Problem
     """What was fitted; where the recordings tell the rate of the drives' loops, with that."""
-    x: torch.Tensor
-    """Normalised, (size,)."""
-    of_noise: Uncertainty
-    """What noise alone leaves open."""
-    residuals: Residuals
-    """On all samples."""
-    jacobian: Jacobian
-    """On the training samples of the recordings that are trained on."""
-    noise: float
-    """The simulation's own noise [rad]."""
+    at: Assessment
+    """The vector, and what noise alone leaves open."""
     train_rmse: float
     """Where the optimizers ended [rad]."""
     times: float | None
@@ -73,6 +63,16 @@ class _End:
     consistency: Consistency = field(default_factory=Consistency)
 
     @property
+    def x(self) -> torch.Tensor:
+        """The vector, normalised (size,)."""
+        return self.at.x
+
+    @property
+    def jacobian(self) -> Jacobian:
+        """On the training samples of the recordings that are trained on."""
+        return self.at.jacobian
+
+    @property
     def is_far(self) -> bool:
         """Whether that is so far above the noise that error bars mean nothing."""
         return self.times is not None and self.times >= FAR_ABOVE_NOISE
@@ -80,12 +80,12 @@ class _End:
     @property
     def known(self) -> np.ndarray:
         """Which parameters have an error bar, (size,) bool."""
-        return ~np.isnan(self.of_noise.std)
+        return ~np.isnan(self.at.uncertainty.std)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Error bars that know what comes from the physics step and from the loops' rate, too."""
-        result, shares = self.of_noise, [] if self.rates is None else list(self.rates.shares)
+        result, shares = self.at.uncertainty, [] if self.rates is None else list(self.rates.shares)
         if self.without_step is not None:
             shares.append(step_share(self.jacobian, self.without_step, self.problem.space, self.x, self.known))
         for share in shares:
@@ -93,18 +93,11 @@ class _End:
         return result
 
     def moved(self, run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
-        """Another vector, with some parameters held."""
-        known = _known_at(run, self.problem, x, held)
-        train = _train_rmse(self.problem, known.residuals)
-        return replace(
-            self,
-            x=x,
-            of_noise=known.uncertainty,
-            residuals=known.residuals,
-            jacobian=known.jacobian,
-            train_rmse=train,
-            times=times_noise(self.problem, train),
-        )
+        """Another vector nearby, with some parameters held."""
+        problem = self.problem
+        at = self.at.moved(problem, *_evaluators(run, problem), x, held)
+        train = _train_rmse(problem, at.residuals)
+        return replace(self, at=at, train_rmse=train, times=times_noise(problem, train))
 
 
 def conclude(
@@ -140,13 +133,13 @@ def conclude(
         end = replace(end, stop_reasons=(*end.stop_reasons, CHECKS_INTERRUPTED))
     space = end.problem.space
     bias = space.to_physical(end.x)[space["encoder_bias"]].numpy()
-    run.folder.write_json("drives.json", drive_loads(end.problem, _assessor(run, end.problem), bias))
+    run.folder.write_json("drives.json", drive_loads(end.problem, _evaluators(run, end.problem)[0], bias))
     return _write(run, record, end, checked=True)
 
 
 def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = False) -> FitResult:
     """Write what is known so far; what takes simulations to tell only where all has been checked."""
-    run.folder.write_tensors("best_trajectory.pt", trajectories(end.problem, end.residuals))
+    run.folder.write_tensors("best_trajectory.pt", trajectories(end.problem, end.at.residuals))
     result = _result(run, record, end, checked)
     result.save(run.folder.path / "result.json")
     return result
@@ -154,7 +147,7 @@ def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: boo
 
 def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = True) -> FitResult:
     """What is known so far, as a run keeps it."""
-    problem, data, settings, every = end.problem, end.problem.dataset, run.settings, end.residuals
+    problem, data, settings, every = end.problem, end.problem.dataset, run.settings, end.at.residuals
     where = {"train": data.train[every.step], "validation": data.validation[every.step]}
     rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
     uncertainty = end.uncertainty
@@ -183,7 +176,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         loop_rate=_loop_rate(end),
         warnings=[
             *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
-            *rough_motion(end.noise, float(end.jacobian.residuals.score[0])),
+            *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
             *([] if rates is None else rates.sentences(problem.space, end.known)),
             *(fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure) if checked else []),
             *end.consistency.sentences,
@@ -201,16 +194,14 @@ def _loop_rate(end: _End) -> dict[str, Any]:
 
 def _reached(run: Optimization, outcome: Outcome) -> _End:
     """Where the optimizers ended, with error bars."""
-    problem, known = run.problem, _known_at(run, run.problem, outcome.x)
-    run.refuse_divergence(float(known.residuals.score[0]))
-    train = _train_rmse(problem, known.residuals)
+    problem = run.problem
+    every, training = _evaluators(run, problem)
+    at = assess(problem, every, run.colouring, outcome.x, run.ended, training)
+    run.refuse_divergence(float(at.jacobian.residuals.score[0]))
+    train = _train_rmse(problem, at.residuals)
     return _End(
         problem=problem,
-        x=outcome.x,
-        of_noise=known.uncertainty,
-        residuals=known.residuals,
-        jacobian=known.jacobian,
-        noise=known.noise,
+        at=at,
         train_rmse=train,
         times=times_noise(problem, train),
         stop_reasons=tuple(outcome.stop_reasons),
@@ -221,13 +212,11 @@ def _train_rmse(problem: Problem, every: Residuals) -> float:
     return rmse_by_joint(every, problem.dataset.train[every.step], problem.joint_names)[ALL]
 
 
-def _known_at(run: Optimization, problem: Problem, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
-    return assess(problem, _assessor(run, problem), run.colouring, x, held, run.ended)
-
-
-def _assessor(run: Optimization, problem: Problem) -> Evaluator:
-    """What simulates all recordings."""
-    return run.assessor if problem is run.problem else problem.evaluator()
+def _evaluators(run: Optimization, problem: Problem) -> tuple[Evaluator, Evaluator]:
+    """What simulates all recordings, and what simulates those that are trained on."""
+    if problem is run.problem:
+        return run.assessor, run.evaluator
+    return problem.evaluator(), problem.training_evaluator()
 
 
 def _with_loop_rate(run: Optimization, end: _End) -> _End:
@@ -235,12 +224,7 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
     if end.problem.assumes_loop_rate:
         run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
     rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
-    least = float(end.jacobian.residuals.score[0]) if rates is None else rates.score
-    doubtful = end.problem.assumes_loop_rate and not end.is_far and least > _LOOP_IN_DOUBT**2 * noise_score(end.problem)
-    if doubtful and (outcome := run.with_other_loop(end.x)) is not None:
-        end = _reached(run, outcome)
-        rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
-    if rates is None or (end.is_far and rates.chosen == rates.fitted):
+    if rates is None:
         return end
     end = replace(end, rates=rates)
     if rates.chosen == rates.fitted:
@@ -307,8 +291,8 @@ def _consistent(run: Optimization, end: _End) -> _End:
     """Fit each recording alone, where there are several and the optimizer can afford it."""
     if not run.settings.check_consistency or run.settings.optimizer == "cmaes":
         return end
-    train = end.problem.dataset.train[end.residuals.step]
-    score = float(end.residuals.error[0].square()[train].sum(dim=1).mean())
+    train = end.problem.dataset.train[end.at.residuals.step]
+    score = float(end.at.residuals.error[0].square()[train].sum(dim=1).mean())
     result = check_consistency(end.problem, end.x, score, run.progress.say, end.jacobian)
     if result.recordings:
         run.folder.write_json("consistency.json", asdict(result))
@@ -317,6 +301,5 @@ def _consistent(run: Optimization, end: _End) -> _End:
 
 _CHECKS = (_with_loop_rate, _with_step, _with_prior, _perhaps_without_delay, _consistent)
 """What is checked of a result, in this order."""
-_WHERE_FAR = (_with_loop_rate, _silent_at_prior, _with_prior)
-"""What is checked far above the noise: another rate may be all that is wrong. Where physics is missing, recordings
-disagree, and that is the diagnosis' work."""
+_WHERE_FAR = (_silent_at_prior, _with_prior)
+"""The same far above the noise: where physics is missing, recordings disagree, and that is the diagnosis' work."""

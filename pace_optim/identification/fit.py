@@ -165,10 +165,11 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     start: Any = processes.agree(None)
     if start is None:
         return
-    settings, around, history, line_generation = start
+    settings, around, history, line_generation, loop = start
     settings = replace(settings, device=device)
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg)
+    problem = problem if loop in (None, problem.loop_dt) else problem.with_loop(loop)
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
     optimizer.restore(history, line_generation)

@@ -13,6 +13,7 @@ from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
+from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
@@ -30,10 +31,13 @@ from pace_optim.terminal.progress import ProgressLine
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 _INTERRUPTED = "interrupted"
-_USUAL_LOOP = 1e-3
-"""Period of the loops that are tried where those of the fit are continuous, the usual one of servo drives [s]."""
-OTHER_LOOP, FINER_STEP = "other loop, ", "step of {:g} s, "
-"""What the stages' names begin with on the way of the other loop, and at a finer step."""
+_LOOPS = (1e-3, 0.0)
+"""Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
+delayed torque needs a loop that holds it."""
+OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
+"""What the stages' names begin with on the way of another loop, and at a finer step."""
+_LOOP_IN_DOUBT = 1.5
+"""Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
@@ -147,25 +151,26 @@ class Optimization:
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
-    def with_other_loop(self, x: torch.Tensor) -> Outcome | None:
-        """Fit loops of another rate, from the end of the fit with the assumed one.
-
-        Args:
-            x: That end, normalised (size,).
-
-        Returns:
-            Their end; they are the run's problem from now on. ``None`` where they are no better.
-        """
-        smooth = self.problem.loop_dt > 0 and self.problem.delay_mode == "command"
-        period = 0.0 if smooth else _USUAL_LOOP
-        rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
-        self.progress.say(f"above the noise: fitting loops that run {rate}, as their rate is not stated")
-        ended, other = self.ended, self._course(self.problem.with_loop(period), OTHER_LOOP)
-        end = other.way.run([x])
-        if ended is not None and not end.score < ended.score:
+    def _with_other_loop(self, best: Descent) -> WayDown | None:
+        """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
+        problem, noise = self.problem, noise_score(self.problem)
+        if not problem.assumes_loop_rate:
             return None
-        self._use(other)
-        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+        least, found = best, None
+        for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
+            if period == problem.loop_dt or least.score <= _LOOP_IN_DOUBT**2 * noise:
+                continue
+            rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
+            self.progress.say(f"above the noise: fitting loops that run {rate}, as their rate is not stated")
+            other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
+            end = other.way.begin([least.x])
+            if end.score < least.score:
+                least, found = end, other
+        if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
+            return None
+        self._use(found)
+        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
+        return found.way
 
     def at_half_the_step(self, problem: Problem, x: torch.Tensor, score: float) -> Outcome | None:
         """Go on from the end of a fit, at half its physics step.
@@ -222,7 +227,7 @@ class Optimization:
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)
-            end = self.way.run(starts, self._search_within if searches else None, self._scan)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._with_other_loop)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
@@ -236,7 +241,7 @@ class Optimization:
         """The best end of the first descents with frequencies of combs that explain more."""
         problem = self.problem
         effects = effect_cfgs(problem.env_cfg.sim2real.effects)
-        return scanned(problem.space, self.way.pieces, x, effects, problem.joint_names)
+        return scanned(problem.space, self._in_use.way.pieces, x, effects, problem.joint_names)
 
     def _make_optimizer(self) -> CMAESOptimizer:
         """The search; a hybrid's is made when it begins."""
@@ -270,7 +275,8 @@ class Optimization:
             agree_to_stop(optimizer, self.processes)
 
         self._searched = True
-        self.processes.agree((self.settings, self._around, optimizer.history, optimizer.line_generation))
+        loop = self.problem.loop_dt if self.problem.assumes_loop_rate else None
+        self.processes.agree((self.settings, self._around, optimizer.history, optimizer.line_generation, loop))
         self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()

@@ -130,6 +130,11 @@ class Evaluator:
         self._again = 0
 
     @property
+    def looks_coarser(self) -> bool:
+        """Whether :meth:`look_around` simulates at a longer physics step."""
+        return self._nearby is not None
+
+    @property
     def simulated_steps(self) -> int:
         """Control steps simulated so far, over all environments."""
         own = sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again

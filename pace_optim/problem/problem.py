@@ -513,6 +513,7 @@ def _configured(
 ) -> PaceSim2realEnvCfg:
     cfg = copy.deepcopy(plain)
     cfg.set_effects(effects)
+    cfg.sim.sensors = False  # an encoder's positions are all that a recording is compared with
     if physics_dt is not None:
         set_physics_dt(cfg, physics_dt)
     return cfg

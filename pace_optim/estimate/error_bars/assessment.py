@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,14 @@ import torch
 
 from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
-from pace_optim.estimate.least_squares import Descent
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
+from pace_optim.estimate.levenberg_marquardt import LinearModel
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 
+_MOST_LOOKS = 3
+"""After the first."""
 _INITIAL_STEP = 1e-5
 """Change of the first position for its derivative [rad]; more where the simulation's own noise is more than that."""
 
@@ -24,6 +27,8 @@ _INITIAL_STEP = 1e-5
 class Assessment:
     """What is known of a vector."""
 
+    x: torch.Tensor
+    """The vector, normalised (size,)."""
     uncertainty: Uncertainty
     """Its error bars."""
     residuals: Residuals
@@ -32,6 +37,24 @@ class Assessment:
     """On the training samples of the recordings that are trained on."""
     noise: float
     """The simulation's own noise [rad]."""
+    initial: Initial
+    """On the same samples as the Jacobian."""
+
+    def moved(
+        self, problem: Problem, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()
+    ) -> Assessment:
+        """The same of a vector nearby, with these derivatives.
+
+        Args:
+            problem: What was fitted, or the same with other facts.
+            evaluator: Simulates all its recordings.
+            training: Simulates what is trained on.
+            x: The vector, normalised (size,).
+            held: Labels of what is held where it is.
+        """
+        residuals = training.residuals(problem.space.to_physical(x)[None])
+        there = replace(self.jacobian, residuals=residuals)
+        return _assessment(problem, evaluator, training, x, there, self.initial, self.noise, held)
 
 
 def assess(
@@ -39,46 +62,74 @@ def assess(
     evaluator: Evaluator,
     colouring: Colouring,
     x: torch.Tensor,
-    held: Sequence[str] = (),
     ended: Descent | None = None,
+    training: Evaluator | None = None,
 ) -> Assessment:
-    """Error bars at x from the training samples, where some labels are held, and x's residuals on all samples.
+    """Error bars at x from the training samples, and x's residuals on all samples.
+
+    Where a descent ended by derivatives of a longer physics step, x goes on to the minimum by these of the fit's own.
 
     Args:
         problem: What was fitted.
         evaluator: Simulates all recordings.
         colouring: Which entries are perturbed together.
         x: Normalised, (size,).
-        held: Labels of what is held where it is.
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
+        training: Simulates what is trained on; ``None``: the problem's own.
     """
-    data, recordings = problem.dataset, problem.dataset.trained()
-    evaluator.look_at_phases(problem.space.to_physical(x), anew=True)
+    training = training or problem.training_evaluator()
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
-    for _ in range(2 if hessian is None else 1):
+    for look in range(1 + _MOST_LOOKS):
+        training.look_at_phases(problem.space.to_physical(x), anew=True)
         around = stencil(x, colouring, hessian, noise, score)
         shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
-        every = evaluator.residuals(problem.space.to_physical(probes.vectors), data.sampled, probes.offset)
-        train = data.train[every.step][:, recordings]
-        steps = train.any(dim=1)
-        error = every.error[:, steps][:, :, recordings] * train[steps][None, :, :, None]
-        weight = None if every.weight is None else every.weight[steps][:, recordings]
-        trained = Residuals(error=error, where=train[steps], step=every.step[steps], weight=weight, prior=every.prior)
-        there, noise, score = around.jacobian(trained), around.noise(trained), float(trained.rows(0, 1).score[0])
+        every = training.residuals(problem.space.to_physical(probes.vectors), initial_offset=probes.offset)
+        there, noise, score = around.jacobian(every), around.noise(every), float(every.rows(0, 1).score[0])
+        blind, gained, initial = hessian is None, 0.0, probes.initial(every.error)
+        if ended is not None and training.looks_coarser and look < _MOST_LOOKS:
+            x, there, gained = _gone_on(training, ended.damping, x, there)
+        if not blind and gained <= LeastSquaresCfg().near_enough * score:
+            break
         hessian, _ = there.normal_equations()
-    initial = probes.initial(error)
+    return _assessment(problem, evaluator, training, x, there, initial, noise)
+
+
+def _assessment(
+    problem: Problem,
+    evaluator: Evaluator,
+    training: Evaluator,
+    x: torch.Tensor,
+    there: Jacobian,
+    initial: Initial,
+    noise: float,
+    held: Sequence[str] = (),
+) -> Assessment:
+    """Error bars from derivatives at x or near it."""
     middle = None
-    if evaluator.phases is not None and every.weight is not None:
-        middle = _middle_of_swings(there, every, evaluator.phases, data.sampled, recordings)
-    uncertainty = estimate_uncertainty(there, problem.space, x, initial, probes.initial_joints, held, middle)
-    residuals = every.rows(0, 1)
-    return Assessment(uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise)
+    if training.phases is not None and there.residuals.weight is not None:
+        middle = _middle_of_swings(there, training.phases, training.dataset.train)
+    uncertainty = estimate_uncertainty(there, problem.space, x, initial.derivatives, initial.joints, held, middle)
+    physical = problem.space.to_physical(x)
+    evaluator.look_at_phases(physical, anew=True)
+    residuals = evaluator.residuals(physical[None], problem.dataset.sampled)
+    return Assessment(x=x, uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise, initial=initial)
 
 
-def _middle_of_swings(
-    jacobian: Jacobian, every: Residuals, phases: FreePhases, sampled: torch.Tensor, recordings: Sequence[int]
-) -> np.ndarray:
+def _gone_on(
+    evaluator: Evaluator, damping: float, x: torch.Tensor, there: Jacobian
+) -> tuple[torch.Tensor, Jacobian, float]:
+    """A step with known derivatives: where it leads, the residuals there with the same derivatives, and its gain."""
+    trials = LinearModel(*there.normal_equations()).trials(x, damping)
+    tried, score = evaluator.residuals(evaluator.space.to_physical(trials)), float(there.residuals.score[0])
+    best = int(tried.score.argmin())
+    gained = score - float(tried.score[best])
+    if not gained > 0:
+        return x, there, 0.0
+    return trials[best], replace(there, residuals=tried.rows(best, best + 1)), gained
+
+
+def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Tensor) -> np.ndarray:
     """JᵀΣJ, (size, size), with Σ the covariance of each swing's errors, and none between swings.
 
     Residuals are whitened by C, which a fit follows. What lasts in them is in Σ = L⁻¹ C' L⁻ᵀ, with C' all that is not
@@ -87,27 +138,21 @@ def _middle_of_swings(
 
     Args:
         jacobian: On the training samples.
-        every: Residuals on all samples, from which those of the Jacobian were taken.
         phases: What is not known of swings.
-        sampled: Where there is a sample, (T, R) bool.
-        recordings: Of all R, those of the Jacobian.
+        trained: Where these samples are, (T, R) bool.
     """
     residuals, colouring = jacobian.residuals, jacobian.colouring
     row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
     total = np.zeros((len(colouring.joints), len(colouring.joints)))
     if residuals.weight is None:
         return total
-    place = torch.full((int(every.step.max()) + 1,), -1)
-    place[residuals.step] = torch.arange(len(residuals.step))
-    for block, begin, end, expected in phases.expected_of(every.step, sampled):
-        if block.recording not in recordings:
-            continue
-        r, joints, at = list(recordings).index(block.recording), block.joints, place[every.step[begin:end]]
-        kept = (at >= 0) & residuals.where[at.clamp(min=0), r]
+    for block, begin, end, expected in phases.expected_of(residuals.step, trained):
+        r, joints = block.recording, block.joints
+        kept = residuals.where[begin:end, r]
         if not bool(kept.any()):
             continue
-        at, rows = at[kept], kept[:, None].expand(-1, len(joints)).flatten()
-        scale = (residuals.weight[at, r][:, joints] * phases.floor[block.recording, joints]).flatten()
+        at, rows = torch.arange(begin, end)[kept], kept[:, None].expand(-1, len(joints)).flatten()
+        scale = (residuals.weight[at, r][:, joints] * phases.floor[r, joints]).flatten()
         entries = [entry for entry in row if set(joints) & set(colouring.joints[entry])]
         own = jacobian.columns[[row[entry] for entry in entries]][:, at, r][..., joints].flatten(1) * scale
         error = residuals.error[0, at, r][:, joints].flatten() / scale.clamp(min=1e-300)
@@ -130,9 +175,20 @@ class Probes:
     shake: float
     """How far it is moved [rad]."""
 
-    def initial(self, error: torch.Tensor) -> torch.Tensor:
-        """Derivatives by the first positions of ``initial_joints``, (sets, …), of residuals (m, …)."""
-        return (error[-len(self.initial_joints) :] - error[:1]) / self.shake
+    def initial(self, error: torch.Tensor) -> Initial:
+        """What residuals (m, …) of these vectors show of the first positions."""
+        derivatives = (error[-len(self.initial_joints) :] - error[:1]) / self.shake
+        return Initial(derivatives=derivatives, joints=self.initial_joints)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Initial:
+    """How the residuals depend on the first positions."""
+
+    derivatives: torch.Tensor
+    """Derivatives of the residuals, (sets, K, R, n)."""
+    joints: tuple[tuple[int, ...], ...]
+    """Joints whose first position is moved together, set by set."""
 
 
 def make_probes(

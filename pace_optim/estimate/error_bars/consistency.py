@@ -117,8 +117,9 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
         start.scores = [float(there.residuals.score[0])]
     cfg = replace(_REFINE, noise_score=noise_score(problem))
     best = least_squares(evaluator, colouring, [start], cfg)[0]
-    uncertainty = assess(problem, evaluator, colouring, best.x, ended=best).uncertainty
-    return _Fit(score=best.score, x=best.x, uncertainty=uncertainty, simulated_steps=evaluator.simulated_steps)
+    known = assess(problem, evaluator, colouring, best.x, ended=best, training=evaluator)
+    score = float(known.jacobian.residuals.score[0])
+    return _Fit(score=score, x=known.x, uncertainty=known.uncertainty, simulated_steps=evaluator.simulated_steps)
 
 
 def _of_recording(there: Jacobian, r: int) -> Jacobian:

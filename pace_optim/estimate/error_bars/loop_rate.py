@@ -36,7 +36,7 @@ _NOTHING_LEFT = 1e-5
 """They end where the next is expected to lower the score by less than this part of it."""
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
-_UNEXPLAINED = 0.5
+UNEXPLAINED = 0.5
 """Part of what no candidate explains. One that is worse than the best by it is two standard deviations away."""
 _NAMED = 2
 """Values that a sentence shows."""
@@ -263,6 +263,6 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor, noi
             variance += float((d * filtered(d, autocovariance(weights[best] @ each))).sum())
         if variance > 0:
             worse = squares[c] - squares[best]
-            at_most = (SURE * worse / (_UNEXPLAINED * unexplained)) ** 2
+            at_most = (SURE * worse / (UNEXPLAINED * unexplained)) ** 2
             result[c] = min(worse * float(apart @ gram @ apart) / variance, at_most)
     return result

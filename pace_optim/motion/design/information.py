@@ -89,7 +89,7 @@ def _simulated(
     result = []
     for r, trajectory in enumerate(trajectories):
         position = encoder[0, :, r].numpy() + bias
-        initial = probes.initial(encoder[:, :, r])
+        initial = probes.initial(encoder[:, :, r]).derivatives
         derivatives = encoder[1 : 1 + len(colouring.colours), :, r] - encoder[0, :, r]
         blocks = [_block(derivatives, initial, tree, steps, colouring) for tree in trees]
         findings = [
