@@ -21,7 +21,7 @@ import torch
 from pace_actuators.files import checked
 from pace_optim.estimate.derivatives import NOISE_ROWS, Colouring, Jacobian, stencil
 from pace_optim.estimate.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
-from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.evaluator import Evaluator, Residuals
 
 _CREEPING = 3
 _REFUSED = 2
@@ -213,14 +213,14 @@ def _iterate(
         return
     descent.iteration += 1
     descent.scores.append(descent.score)
-    step = _Step(descent, hessian, gradient)
+    step = Step(descent, hessian, gradient)
     left, allowed = step.expected, cfg.tolerance(descent.score) * descent.score
     steps = 1 if jacobian is None else 1 + (len(colouring.colours) + 1 + NOISE_ROWS) // len(step.trials)
     for _ in range(steps):
-        gain, error = step.take(evaluator, where)
+        gain, residuals = step.take(evaluator, where)
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
-        step = _Step(descent, hessian, jacobian.gradient_at(descent.x, error))
+        step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]))
     gained = descent.scores[-2] - descent.scores[-1]
     beside = jacobian is not None and evaluator.looks_coarser and gained <= cfg.near_enough * descent.score
     if gained > 0:
@@ -237,7 +237,7 @@ def _iterate(
         descent.stop_reason = f"max_iteration {cfg.max_iteration}"
 
 
-class _Step:
+class Step:
     """Trials of one step of a descent, at several dampings."""
 
     def __init__(self, descent: Descent, hessian: torch.Tensor, gradient: torch.Tensor):
@@ -247,8 +247,8 @@ class _Step:
         self.expected = model.expected_gain(self.trials[0] - descent.x)
         """What the first of them gains where J is right [rad²]."""
 
-    def take(self, evaluator: Evaluator, where: torch.Tensor | None) -> tuple[float, torch.Tensor]:
-        """Simulate them and go to the best; returns what was gained [rad²] and the best's error, (K, R, n)."""
+    def take(self, evaluator: Evaluator, where: torch.Tensor | None = None) -> tuple[float, Residuals]:
+        """Simulate them and go to the best; returns what was gained [rad²] and the best's residuals, m = 1."""
         descent = self.descent
         residuals = evaluator.residuals(evaluator.space.to_physical(self.trials), where)
         descent.simulations += len(self.trials)
@@ -258,7 +258,7 @@ class _Step:
         if gain > 0:
             descent.x, descent.scores[-1] = self.trials[best].clone(), float(scores[best])
         descent.damping = next_damping(descent.damping, best if gain > 0 else None)
-        return gain, residuals.error[best]
+        return gain, residuals.rows(best, best + 1)
 
 
 def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:

@@ -16,7 +16,7 @@ from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.assessment import Assessment, assess, trajectories
 from pace_optim.estimate.error_bars.consistency import Consistency, check_consistency
-from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, noise_score, times_noise
+from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used_loop
 from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
@@ -31,12 +31,6 @@ from pace_optim.run.summary import summary
 
 _LONG = 60.0
 """A fit that took longer tells its result before it is checked [s]."""
-_STEP_IN_DOUBT = 1.3
-"""Times the noise above which a fit may go on at half its physics step ..."""
-_OF_THE_STEP = 0.25
-"""... where the step makes this part of what is above the noise, ..."""
-_HALVINGS = 2
-"""... so many times."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -234,32 +228,10 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
 
 
 def _with_step(run: Optimization, end: _End) -> _End:
-    """Add the physics step's part of each error bar; halve the step if it makes much of the error."""
-    for _ in range(_HALVINGS):
-        end = _with_step_share(run, end)
-        if run.settings.physics_dt is not None or not _shows_its_step(end):
-            return end
-        score = float(end.jacobian.residuals.score[0])
-        outcome = run.at_half_the_step(end.problem, end.x, score)
-        if outcome is None:
-            return end
-        end = replace(_reached(run, outcome), rates=end.rates)
-    return _with_step_share(run, end)
-
-
-def _with_step_share(run: Optimization, end: _End) -> _End:
+    """Add the physics step's part of each error bar."""
     run.progress.say("simulating with a finer step, to measure the part of the step")
     physical = end.problem.space.to_physical(end.x)
     return replace(end, without_step=change_without_step(end.problem, physical, end.jacobian.residuals))
-
-
-def _shows_its_step(end: _End) -> bool:
-    """Whether the physics step is a good part of what is above the noise."""
-    if end.times is None or end.is_far or end.times < _STEP_IN_DOUBT or end.without_step is None:
-        return False
-    there = end.jacobian.residuals
-    of_step = float(end.without_step.square().sum() / there.where.sum())
-    return of_step > _OF_THE_STEP * (float(there.score[0]) - noise_score(end.problem))
 
 
 def _with_prior(run: Optimization, end: _End) -> _End:

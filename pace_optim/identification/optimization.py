@@ -14,6 +14,7 @@ from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
+from pace_optim.estimate.error_bars.step_share import change_without_step
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
@@ -38,6 +39,12 @@ OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
 """What the stages' names begin with on the way of another loop, and at a finer step."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
+_STEP_IN_DOUBT = 1.3
+"""Times the noise above which a fit may go on at half its physics step ..."""
+_OF_THE_STEP = 0.25
+"""... where the step makes this part of what is above the noise, ..."""
+_HALVINGS = 2
+"""... so many times."""
 _FEWEST_GENERATIONS = 5
 """Of a search, whatever its budget."""
 
@@ -61,6 +68,8 @@ class _Course:
     """A problem and the way down with it."""
 
     problem: Problem
+    pieces: Problem
+    """The same on pieces of the recordings."""
     evaluator: Evaluator
     """On the recordings that are trained on."""
     assessor: Evaluator
@@ -120,7 +129,7 @@ class Optimization:
             name=name,
         )
         way.descents = [d for d in self._restored if d.stage in way.stages]
-        course = _Course(problem=problem, evaluator=evaluator, assessor=problem.evaluator(), way=way)
+        course = _Course(problem=problem, pieces=pieces, evaluator=evaluator, assessor=problem.evaluator(), way=way)
         self._courses.append(course)
         return course
 
@@ -151,12 +160,22 @@ class Optimization:
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
-    def _with_other_loop(self, best: Descent) -> WayDown | None:
-        """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
-        problem, noise = self.problem, noise_score(self.problem)
-        if not problem.assumes_loop_rate:
+    def _elsewhere(self, best: Descent) -> WayDown | None:
+        """The way with another loop rate or a finer step, begun at the best end on pieces, where they explain more."""
+        course, best = self._other_loop(self._in_use, best)
+        course = self._finer_step(course, best)
+        if course is self._in_use:
             return None
-        least, found = best, None
+        self._use(course)
+        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
+        return course.way
+
+    def _other_loop(self, course: _Course, best: Descent) -> tuple[_Course, Descent]:
+        """The way of loops at another rate and its end on pieces, where that refutes the assumed rate."""
+        problem, noise = course.problem, noise_score(course.problem)
+        if not problem.assumes_loop_rate:
+            return course, best
+        found, least = course, best
         for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
             if period == problem.loop_dt or least.score <= _LOOP_IN_DOUBT**2 * noise:
                 continue
@@ -165,32 +184,34 @@ class Optimization:
             other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
             end = other.way.begin([least.x])
             if end.score < least.score:
-                least, found = end, other
-        if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
-            return None
-        self._use(found)
-        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
-        return found.way
+                found, least = other, end
+        refuted = best.score - least.score > UNEXPLAINED * (least.score - noise)
+        return (found, least) if refuted else (course, best)
 
-    def at_half_the_step(self, problem: Problem, x: torch.Tensor, score: float) -> Outcome | None:
-        """Go on from the end of a fit, at half its physics step.
+    def _finer_step(self, course: _Course, best: Descent) -> _Course:
+        """The way at a finer physics step, where the step makes much of what the pieces leave above the noise."""
+        for _ in range(_HALVINGS):
+            if self.settings.physics_dt is not None or not self._shows_its_step(course, best):
+                break
+            finer = course.problem.with_physics_dt(course.problem.physics_dt / 2)
+            self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
+            other = self._course(finer, FINER_STEP.format(finer.physics_dt))
+            end = other.way.begin([best.x])
+            if not end.score < best.score:
+                break
+            course, best = other, end
+        return course
 
-        Args:
-            problem: Of that end.
-            x: That end, normalised (size,).
-            score: Its score [rad²].
-
-        Returns:
-            The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
-        """
-        finer = problem.with_physics_dt(problem.physics_dt / 2)
-        self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
-        other = self._course(finer, FINER_STEP.format(finer.physics_dt))
-        end = other.way.near(x, NEAR)
-        if not end.score < score:
-            return None
-        self._use(other)
-        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+    def _shows_its_step(self, course: _Course, best: Descent) -> bool:
+        noise = noise_score(course.problem)
+        if best.score <= _STEP_IN_DOUBT**2 * noise:
+            return False
+        physical = course.problem.space.to_physical(best.x)
+        there = course.way.pieces.residuals(physical[None])
+        change = change_without_step(course.pieces, physical, there)
+        if change is None:
+            return False
+        return float(change.square().sum() / there.where.sum()) > _OF_THE_STEP * (best.score - noise)
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
@@ -227,7 +248,7 @@ class Optimization:
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)
-            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._with_other_loop)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])

@@ -11,14 +11,13 @@ import torch
 
 from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
-from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
-from pace_optim.estimate.levenberg_marquardt import LinearModel
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, Step
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 
-_MOST_LOOKS = 3
-"""After the first."""
+_MOST_LOOKS, _MOST_STEPS = 3, 10
+"""After the first look, and with the derivatives of one."""
 _INITIAL_STEP = 1e-5
 """Change of the first position for its derivative [rad]; more where the simulation's own noise is more than that."""
 
@@ -79,16 +78,18 @@ def assess(
     """
     training = training or problem.training_evaluator()
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
-    for look in range(1 + _MOST_LOOKS):
+    goes_on = ended is not None and ended.stop_reason and training.looks_coarser
+    for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
         around = stencil(x, colouring, hessian, noise, score)
         shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
         every = training.residuals(problem.space.to_physical(probes.vectors), initial_offset=probes.offset)
         there, noise, score = around.jacobian(every), around.noise(every), float(every.rows(0, 1).score[0])
-        blind, gained, initial = hessian is None, 0.0, probes.initial(every.error)
-        if ended is not None and training.looks_coarser and look < _MOST_LOOKS:
-            x, there, gained = _gone_on(training, ended.damping, x, there)
+        blind, initial = hessian is None, probes.initial(every.error)
+        if ended is not None and goes_on:
+            x, there = _gone_on(training, ended, x, there)
+        gained = score - float(there.residuals.score[0])
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break
         hessian, _ = there.normal_equations()
@@ -116,17 +117,18 @@ def _assessment(
     return Assessment(x=x, uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise, initial=initial)
 
 
-def _gone_on(
-    evaluator: Evaluator, damping: float, x: torch.Tensor, there: Jacobian
-) -> tuple[torch.Tensor, Jacobian, float]:
-    """A step with known derivatives: where it leads, the residuals there with the same derivatives, and its gain."""
-    trials = LinearModel(*there.normal_equations()).trials(x, damping)
-    tried, score = evaluator.residuals(evaluator.space.to_physical(trials)), float(there.residuals.score[0])
-    best = int(tried.score.argmin())
-    gained = score - float(tried.score[best])
-    if not gained > 0:
-        return x, there, 0.0
-    return trials[best], replace(there, residuals=tried.rows(best, best + 1)), gained
+def _gone_on(evaluator: Evaluator, ended: Descent, x: torch.Tensor, there: Jacobian) -> tuple[torch.Tensor, Jacobian]:
+    """Steps with known derivatives, as long as they gain: where they lead, and the residuals there with these."""
+    descent = Descent(x=x, damping=ended.damping, scores=[float(there.residuals.score[0])])
+    hessian, gradient = there.normal_equations()
+    for _ in range(_MOST_STEPS):
+        gained, residuals = Step(descent, hessian, gradient).take(evaluator)
+        if gained > 0:
+            there = replace(there, residuals=residuals)
+            gradient = there.gradient_at(descent.x, residuals.error[0])
+        if gained <= LeastSquaresCfg().score_tolerance * descent.score:
+            break
+    return descent.x, there
 
 
 def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Tensor) -> np.ndarray:
