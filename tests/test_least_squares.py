@@ -94,7 +94,7 @@ class Curved:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None):
+    def look_around(self, x, where=None, own_step=False):
         every = self.residuals(x, where)
         return every.rows(0, 1), every
 
@@ -223,7 +223,7 @@ class Fake:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None):
+    def look_around(self, x, where=None, own_step=False):
         every = self.residuals(x, where)
         return every.rows(0, 1), every
 
@@ -357,7 +357,7 @@ class Rattling:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None):
+    def look_around(self, x, where=None, own_step=False):
         every = self.residuals(x, where)
         return every.rows(0, 1), every
 

@@ -23,6 +23,8 @@ from pace_optim.estimate.derivatives import NOISE_ROWS, Colouring, Jacobian, ste
 from pace_optim.estimate.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
+ROUGH = 0.05
+"""Part of the error from which on the simulation's own noise is notable."""
 _CREEPING = 3
 _REFUSED = 2
 _AS_EXPECTED = 0.5
@@ -47,8 +49,9 @@ class LeastSquaresCfg:
     """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
 
     near_enough: float = 2e-3
-    """With derivatives of a longer physics step, stop when an iteration lowers the score by less than this part of it:
-    they lead beside the minimum. The error bars' own derivatives take the rest."""
+    """Derivatives of a longer physics step lead beside the minimum. They have done their part when an iteration lowers
+    the score by less than this part of it. A smooth simulation stops there, as the error bars' own derivatives take the
+    rest. A rough one goes on with those of its own step."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""
@@ -83,6 +86,8 @@ class DescentState:
     iteration: int = 0
     refused: int = 0
     """Iterations in a row in which no trial was better."""
+    own_step: bool = False
+    """Whether derivatives take the fit's own physics step, where there is a longer one."""
     simulations: int = 0
     """Vectors simulated."""
     scores: list[float] = field(default_factory=list)
@@ -138,7 +143,7 @@ class Descent(DescentState):
             return self.hessian, self.gradient, self.jacobian
         around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
-        here, residuals = evaluator.look_around(evaluator.space.to_physical(vectors), where)
+        here, residuals = evaluator.look_around(evaluator.space.to_physical(vectors), where, self.own_step)
         self.simulations += len(vectors)
         score = float(here.score[0])
         if not self.scores and math.isfinite(score):
@@ -222,7 +227,12 @@ def _iterate(
             break
         step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]))
     gained = descent.scores[-2] - descent.scores[-1]
-    beside = jacobian is not None and evaluator.looks_coarser and gained <= cfg.near_enough * descent.score
+    longer = jacobian is not None and evaluator.looks_coarser and not descent.own_step
+    beside = longer and gained <= cfg.near_enough * descent.score
+    if beside and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
+        descent.own_step, descent.damping = True, FIRST_DAMPING
+        descent.gradient, descent.refused = None, 0
+        return
     if gained > 0:
         descent.gradient, descent.refused = None, 0
     else:

@@ -228,10 +228,15 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
 
 
 def _with_step(run: Optimization, end: _End) -> _End:
-    """Add the physics step's part of each error bar."""
-    run.progress.say("simulating with a finer step, to measure the part of the step")
-    physical = end.problem.space.to_physical(end.x)
-    return replace(end, without_step=change_without_step(end.problem, physical, end.jacobian.residuals))
+    """Add the physics step's part of each error bar; halve the step where it makes much of the error."""
+    while True:
+        run.progress.say("simulating with a finer step, to measure the part of the step")
+        there = end.jacobian.residuals
+        change = change_without_step(end.problem, end.problem.space.to_physical(end.x), there)
+        outcome = None if end.is_far else run.at_half_the_step(end.problem, end.x, there, change)
+        if outcome is None:
+            return replace(end, without_step=change)
+        end = replace(_reached(run, outcome), rates=end.rates)
 
 
 def _with_prior(run: Optimization, end: _End) -> _End:

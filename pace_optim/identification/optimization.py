@@ -20,7 +20,7 @@ from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
 from pace_optim.identification.setup import make_optimizer, make_searcher
-from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
@@ -110,6 +110,7 @@ class Optimization:
         self._around = torch.zeros(0, dtype=torch.float64)
         """Physical parameters around which a hybrid searches, (size,); empty before."""
         self._courses: list[_Course] = []
+        self._halvings = 0
         self._use(self._course(problem))
         self._steps_before = 0
         self._search_stop: list[str] = []
@@ -190,28 +191,60 @@ class Optimization:
 
     def _finer_step(self, course: _Course, best: Descent) -> _Course:
         """The way at a finer physics step, where the step makes much of what the pieces leave above the noise."""
-        for _ in range(_HALVINGS):
-            if self.settings.physics_dt is not None or not self._shows_its_step(course, best):
+        while best.score > _STEP_IN_DOUBT**2 * noise_score(course.problem):
+            physical = course.problem.space.to_physical(best.x)
+            with course.way.pieces.again():  # it was simulated before
+                there = course.way.pieces.residuals(physical[None])
+            finer = self._at_half_the_step(course.problem, there, change_without_step(course.pieces, physical, there))
+            if finer is None:
                 break
-            finer = course.problem.with_physics_dt(course.problem.physics_dt / 2)
-            self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
-            other = self._course(finer, FINER_STEP.format(finer.physics_dt))
-            end = other.way.begin([best.x])
+            end = finer.way.begin([best.x])
             if not end.score < best.score:
                 break
-            course, best = other, end
+            course, best = finer, end
         return course
 
-    def _shows_its_step(self, course: _Course, best: Descent) -> bool:
-        noise = noise_score(course.problem)
-        if best.score <= _STEP_IN_DOUBT**2 * noise:
-            return False
-        physical = course.problem.space.to_physical(best.x)
-        there = course.way.pieces.residuals(physical[None])
-        change = change_without_step(course.pieces, physical, there)
-        if change is None:
-            return False
-        return float(change.square().sum() / there.where.sum()) > _OF_THE_STEP * (best.score - noise)
+    def _at_half_the_step(self, problem: Problem, there: Residuals, change: torch.Tensor | None) -> _Course | None:
+        """The course at half the physics step, where the step makes much of what residuals (m = 1) leave.
+
+        Args:
+            problem: Of these residuals.
+            there: The residuals.
+            change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
+        """
+        noise, score = noise_score(problem), float(there.score[0])
+        if change is None or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+            return None
+        of_step = float(change.square().sum() / there.where.sum())
+        if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
+            return None
+        self._halvings += 1
+        finer = problem.with_physics_dt(problem.physics_dt / 2)
+        self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
+        return self._course(finer, FINER_STEP.format(finer.physics_dt))
+
+    def at_half_the_step(
+        self, problem: Problem, x: torch.Tensor, there: Residuals, change: torch.Tensor | None
+    ) -> Outcome | None:
+        """Go on from the end of a fit at half its physics step, where that shows.
+
+        Args:
+            problem: Of that end.
+            x: That end, normalised (size,).
+            there: Its residuals (m = 1).
+            change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
+
+        Returns:
+            The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
+        """
+        finer = self._at_half_the_step(problem, there, change)
+        if finer is None:
+            return None
+        end = finer.way.near(x, NEAR)
+        if not end.score < float(there.score[0]):
+            return None
+        self._use(finer)
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""

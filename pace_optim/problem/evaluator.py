@@ -156,7 +156,9 @@ class Evaluator:
             self._rollouts[num_candidates] = Rollout(env, self.dataset, self.space)
         return self._rollouts[num_candidates]
 
-    def look_around(self, physical: torch.Tensor, where: torch.Tensor | None = None) -> tuple[Residuals, Residuals]:
+    def look_around(
+        self, physical: torch.Tensor, where: torch.Tensor | None = None, own_step: bool = False
+    ) -> tuple[Residuals, Residuals]:
         """The residuals of the first candidate (m = 1), and those of all whose differences count.
 
         The latter are simulated at a longer physics step where there is one, and the first candidate does not diverge.
@@ -164,8 +166,9 @@ class Evaluator:
         Args:
             physical: Physical parameters, (m, size).
             where: As for :meth:`residuals`.
+            own_step: Whether they are not.
         """
-        if self._nearby is not None:
+        if self._nearby is not None and not own_step:
             here = self.residuals(physical[:1], where)
             self._nearby.phases, self._nearby._phases_at = self.phases, self._phases_at
             every = self._nearby.residuals(physical, where)

@@ -14,14 +14,13 @@ from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.least_squares import ROUGH
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 
 _OVERFIT_RATIO = 1.5
 _NAMED = 3
 """Joints that a sentence names, at most."""
-_ROUGH = 0.05
-"""Part of the error from the simulation's own noise above which a warning is given."""
 _NOTHING = 1e-6
 """Errors below this are negligible [rad]."""
 _OF_THE_STEP = (0.3, 5.0)
@@ -176,7 +175,7 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
 
 def rough_motion(noise: float, score: float) -> list[str]:
     """Whether the simulation's own noise [rad] is a notable part of the error (score [rad²])."""
-    if noise < _ROUGH * score**0.5:
+    if noise < ROUGH * score**0.5:
         return []
     return [
         "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
