@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pace_optim.identification.log_checks.balance import _bounded
 from pace_optim.identification.log_checks.checks import _flat_ends
 from pace_optim.identification.setup import load_for_fit
 from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive
 from pace_optim.run.settings import FitSettings
 
 STRANGERS = Path(__file__).parents[2] / "shared" / "cases" / "strangers"
@@ -41,6 +43,20 @@ def test_a_fault_is_named_with_its_joints(kind, tmp_path):
     assert set(made.joints) <= {joint for each in found for joint in each.joints}
 
 
+@pytest.mark.parametrize(("kind", "seed"), [("swapped", 705), ("limit", 701), ("gravity", 705)])
+def test_a_fault_that_one_joint_hides_is_named(kind, seed, tmp_path):
+    made, found = found_in(kind, seed, tmp_path)
+    assert {each.check for each in found} == {made.check}
+
+
+def test_a_robot_that_stands_is_refused_however_it_is_commanded(tmp_path):
+    made = inputs.make("still", 0)
+    torque = np.ones_like(made.recording.dof_pos)
+    log = replace(made.recording, des_dof_pos=None, des_dof_effort=torque, drive=Drive())
+    (found,) = check_log(inputs.problem_of(replace(made, recording=log), tmp_path))
+    assert found.stops and found.joints == made.recording.joint_names and "shows no parameter" in found.text
+
+
 def test_a_frozen_encoder_is_told_with_its_time(tmp_path):
     made, (found,) = found_in("frozen", 1, tmp_path)
     joint = made.recording.joint_names.index(made.joints[0])
@@ -57,7 +73,9 @@ def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path
     settings.trust_log = True
     problem = load_for_fit(settings, load_env_cfg(task))
     assert "are swapped" in " ".join(problem.contradictions)
-    assert capsys.readouterr().err.count("are swapped") == 1
+    told = capsys.readouterr().err
+    assert told.count("are swapped") == 1
+    assert told.count("note: control rate") == 2  # of each load, before the search
 
 
 def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
