@@ -73,9 +73,7 @@ def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path
     settings.trust_log = True
     problem = load_for_fit(settings, load_env_cfg(task))
     assert "are swapped" in " ".join(problem.contradictions)
-    told = capsys.readouterr().err
-    assert told.count("are swapped") == 1
-    assert told.count("note: control rate") == 2  # of each load, before the search
+    assert capsys.readouterr().err.count("are swapped") == 1
 
 
 def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
