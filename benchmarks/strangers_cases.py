@@ -33,6 +33,8 @@ WHEEL = {"viscous_friction": (0.05,), "friction": (0.12,), "delay": 2.0}
 ANKLE = {"armature": (0.01,), "friction": (0.08,)}
 """Every other target is missing in the log, which looks like a shorter delay."""
 SHOULDER = {"viscous_friction": (0.2, None), "friction": (0.05, None)}
+"""The torque is logged at 40 Hz and held, while the drive's changed in between: friction is 8 to 14 % off. With smooth
+torques between them it is 4 % off, and the error falls from 6.4 to 1.0 mrad."""
 _RELATIVE, _BIAS, _DELAY = 0.05, 3e-3, 0.4
 _LONGEST = 600
 
