@@ -93,9 +93,9 @@ ROWS = {
     "sign_pos": _cause("sign_pos", "(?i)elbow.*sign|sign.*elbow"),
     "wrap_tg_only": _cause("wrap_tg_only", "(?i)wrap"),
     "frozen_1s": _cause("frozen_1s", "(?i)frozen|stands? still|constant|does not change"),
-    "dead_encoder": _cause("dead_encoder", "(?i)encoder|does not move|moves less"),
+    "dead_encoder": _cause("dead_encoder", "elbow never changes"),
     "motor_side": _cause("motor_side", r"(?i)motor|gear|scale of|\b9\b"),
-    "torque_saturates_unstated": _cause("torque_saturates_unstated", "(?i)limit"),
+    "torque_saturates_unstated": _cause("torque_saturates_unstated", r"torque of \w+ ends at"),
     "on_side": _cause("on_side", "(?i)gravity"),
     "effort_with_damping": Row(
         task="effort_with_damping/pendulum.xml", data=("effort_with_damping/a.csv",), right=PENDULUM
