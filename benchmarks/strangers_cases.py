@@ -33,6 +33,8 @@ WHEEL = {"viscous_friction": (0.05,), "friction": (0.12,), "delay": 2.0}
 ANKLE = {"armature": (0.01,), "friction": (0.08,)}
 """Every other target is missing in the log, which looks like a shorter delay."""
 SHOULDER = {"viscous_friction": (0.2, None), "friction": (0.05, None)}
+"""The torque is logged at 40 Hz and held, while the drive's changed in between: friction is 8 to 14 % off. With smooth
+torques between them it is 4 % off, and the error falls from 6.4 to 1.0 mrad."""
 _RELATIVE, _BIAS, _DELAY = 0.05, 3e-3, 0.4
 _LONGEST = 600
 
@@ -91,9 +93,9 @@ ROWS = {
     "sign_pos": _cause("sign_pos", "(?i)elbow.*sign|sign.*elbow"),
     "wrap_tg_only": _cause("wrap_tg_only", "(?i)wrap"),
     "frozen_1s": _cause("frozen_1s", "(?i)frozen|stands? still|constant|does not change"),
-    "dead_encoder": _cause("dead_encoder", "(?i)encoder|does not move|moves less"),
+    "dead_encoder": _cause("dead_encoder", "elbow never changes"),
     "motor_side": _cause("motor_side", r"(?i)motor|gear|scale of|\b9\b"),
-    "torque_saturates_unstated": _cause("torque_saturates_unstated", "(?i)limit"),
+    "torque_saturates_unstated": _cause("torque_saturates_unstated", r"torque of \w+ ends at"),
     "on_side": _cause("on_side", "(?i)gravity"),
     "effort_with_damping": Row(
         task="effort_with_damping/pendulum.xml", data=("effort_with_damping/a.csv",), right=PENDULUM

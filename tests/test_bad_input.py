@@ -302,7 +302,7 @@ def test_recordings_that_a_run_names_and_cannot_have_are_told_with_its_settings(
     content = json.loads((run / "settings.json").read_text())
     content["settings"]["validation"] = ["x"]
     (run / "settings.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"x: found the suffix ''.*settings\.json"):
+    with pytest.raises(ValueError, match=r"x: no such file.*settings\.json"):
         Run.open(run).problem()
 
 

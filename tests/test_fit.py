@@ -215,6 +215,13 @@ def test_a_finer_physics_step_and_a_delay_mode_are_kept_in_the_result(recordings
     assert result.delay_s == pytest.approx(0.0025 * result.parameters["delay"]["all"])
 
 
+def test_assumptions_are_told_once_and_before_the_search(recordings, tmp_path, no_report, capsys):
+    result, _ = run(tmp_path, recordings["clean"], optimizer="least_squares")
+    told = capsys.readouterr().err
+    assert result.notes and all(told.count(note) == 1 for note in result.notes)
+    assert not any(note in line for note in result.notes for line in summary(result))
+
+
 def test_the_same_seed_gives_the_same_result(recordings, tmp_path, no_report):
     first, second = (run(tmp_path, recordings["noisy"])[0] for _ in range(2))
     assert first.parameters == second.parameters and first.score == second.score

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pace_optim.identification.log_checks.balance import _bounded
 from pace_optim.identification.log_checks.checks import _flat_ends
 from pace_optim.identification.setup import load_for_fit
 from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive
 from pace_optim.run.settings import FitSettings
 
 STRANGERS = Path(__file__).parents[2] / "shared" / "cases" / "strangers"
@@ -39,6 +41,20 @@ def test_a_fault_is_named_with_its_joints(kind, tmp_path):
     made, found = found_in(kind, 0, tmp_path)
     assert {each.check for each in found} == {made.check}
     assert set(made.joints) <= {joint for each in found for joint in each.joints}
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("swapped", 705), ("limit", 701), ("gravity", 705)])
+def test_a_fault_that_one_joint_hides_is_named(kind, seed, tmp_path):
+    made, found = found_in(kind, seed, tmp_path)
+    assert {each.check for each in found} == {made.check}
+
+
+def test_a_robot_that_stands_is_refused_however_it_is_commanded(tmp_path):
+    made = inputs.make("still", 0)
+    torque = np.ones_like(made.recording.dof_pos)
+    log = replace(made.recording, des_dof_pos=None, des_dof_effort=torque, drive=Drive())
+    (found,) = check_log(inputs.problem_of(replace(made, recording=log), tmp_path))
+    assert found.stops and found.joints == made.recording.joint_names and "shows no parameter" in found.text
 
 
 def test_a_frozen_encoder_is_told_with_its_time(tmp_path):

@@ -207,9 +207,9 @@ def test_a_urdf_s_meshes_are_drawn_though_the_dynamics_leave_them_out(tmp_path):
     mass = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
     joint = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/></joint>'
     (tmp_path / "bot.urdf").write_text(
-        f'<robot name="bot"><link name="base"/><link name="arm">{mass}{mesh.format("ball.obj")}</link>'
+        f'<robot name="bot"><link name="world"/><link name="arm">{mass}{mesh.format("ball.dae")}</link>'
         f'<link name="hand">{mass}{mesh.format("gone.stl")}</link>'
-        f"{joint.format('shoulder', 'base', 'arm')}{joint.format('elbow', 'arm', 'hand')}</robot>"
+        f"{joint.format('shoulder', 'world', 'arm')}{joint.format('elbow', 'arm', 'hand')}</robot>"
     )
     model = read_model_file(tmp_path / "bot.urdf").spec.compile()
     shapes = {model.body(geom["body"]).name: geom for geom in scene_of(model, looks_of(tmp_path / "bot.urdf"))["geoms"]}

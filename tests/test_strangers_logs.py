@@ -146,10 +146,11 @@ def test_units_are_decided_for_each_joint(tmp_path):
     assert found.des_dof_pos == pytest.approx(np.stack([TARGET, TARGET], 1), abs=1e-5)
 
 
-def test_a_joint_that_may_be_in_either_unit_is_refused_by_name(tmp_path):
+def test_a_joint_that_may_be_in_either_unit_is_refused_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     degrees, smooth = 180 / np.pi, 0.4 * np.sin(3 * TIME)
     noise = 1e-3 * np.random.default_rng(1).normal(size=len(TIME))  # neither as in degrees nor as in rad
-    with pytest.raises(ValueError, match=r"elbow goes from .* fits rad and degrees"):
+    with pytest.raises(ValueError, match=r"missing the unit of elbow .*: rad or degrees"):
         read(table(tmp_path / "log.csv", **arm(q_shoulder=degrees * MOTION, q_elbow=smooth + noise)))
 
 
@@ -290,3 +291,92 @@ def test_damaged_files_are_refused_in_one_line(name, words):
     with pytest.raises(ValueError, match=words) as refused:
         load_recording(STRANGERS / "damaged" / name)
     assert "\n" not in str(refused.value)
+
+
+# ------------------------------------------------------------------ tables as loggers write them
+
+
+def written(path: Path, *head: str, columns: tuple[np.ndarray, ...] = (TIME, MOTION, TARGET), sep: str = ",") -> Path:
+    rows = [sep.join(f"{cell:.6f}" for cell in row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([*head, *rows]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "sep"),
+    [
+        ("log.csv", ("# rig 3", "", '"# kp = 20, see notes"', "time,q_j,des_j"), ","),
+        ("log.csv", ("# time,q_j,des_j",), ","),  # numpy.savetxt
+        ("log.txt", ("% rig 3", "time q_j des_j"), " "),
+        ("log.dat", ("time\tq_j\tdes_j",), "\t"),
+    ],
+)
+def test_names_stand_after_comments_in_the_last_comment_and_between_any_marks(tmp_path, name, head, sep):
+    found = read(written(tmp_path / name, *head, sep=sep), Robot())
+    assert found.recording.dof_pos[:, 0] == pytest.approx(MOTION, abs=1e-5)
+
+
+def test_a_file_without_names_says_so_and_is_read_with_a_map(tmp_path):
+    path = written(tmp_path / "log.csv")
+    with pytest.raises(ValueError, match="no line of names: its columns are called 'column 1' to 'column 3'"):
+        read(path, Robot())
+    (tmp_path / "map.toml").write_text(
+        '[time]\ncolumn = "column 1"\nunit = "s"\n[joints.j]\ndof_pos = {from = "column 2", unit = "rad"}\n'
+        'des_dof_pos = {from = "column 3", unit = "rad"}\n'
+    )
+    found = read(path, Robot(), read_map(tmp_path / "map.toml"))
+    assert found.recording.des_dof_pos[:, 0] == pytest.approx(TARGET, abs=1e-5)
+
+
+def test_columns_of_one_name_are_left_out_and_rows_that_are_series_are_noticed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    twice = written(tmp_path / "log.csv", "time,q_j,des_j,tau,tau", columns=(TIME, MOTION, TARGET, TIME, TIME))
+    assert any("come more than once: tau" in line for line in read(twice, Robot()).lines)
+    np.savetxt(tmp_path / "rows.csv", np.stack([TIME, MOTION]), delimiter=",")
+    with pytest.raises(ValueError, match="800 columns and 2 rows: transpose it"):
+        read(tmp_path / "rows.csv", Robot())
+
+
+def test_a_plus_in_a_folder_joins_nothing_and_files_are_called_after_their_series(tmp_path):
+    folder = tmp_path / "a+b"
+    folder.mkdir()
+    states = written(folder / "q.csv", "time,hip,knee", columns=(TIME, MOTION, 0.5 * MOTION))
+    commands = written(folder / "q_cmd.csv", "time,hip,knee", columns=(TIME, TARGET, 0.5 * TARGET))
+    found = read(Path(f"{states}+{commands}"), Robot(joint_names=("hip", "knee")))
+    assert found.recording.dof_pos[:, 1] == pytest.approx(0.5 * MOTION, abs=1e-5)
+    assert found.recording.des_dof_pos[:, 0] == pytest.approx(TARGET, abs=1e-5)
+
+
+def test_a_series_in_two_units_is_taken_once_and_forces_are_no_positions(tmp_path):
+    force = {"force_feedback": 9 * MOTION, "force_desired": 9 * TARGET, "force_last_desired": 9 * TARGET}
+    both = {"position_degrees": np.degrees(MOTION), "position_radians": MOTION, "position_last": MOTION}
+    found = read(table(tmp_path / "log.csv", "%.9f", time=TIME, **force, **both), Robot()).recording
+    assert found.joint_names == ("joint",) and found.dof_pos[:, 0] == pytest.approx(MOTION, abs=1e-6)
+    assert found.des_dof_effort[:, 0] == pytest.approx(9 * TARGET, abs=1e-6)
+
+
+def test_an_index_finger_is_a_joint_and_an_index_is_none(tmp_path):
+    columns = {"left_index_pos": MOTION, "left_index_cmd": TARGET, "index": TIME, "motor_index": TIME}
+    found = read(table(tmp_path / "log.csv", time=TIME, **columns), Robot())
+    assert found.recording.joint_names == ("left_index",) and "Not used: index, motor_index." in found.lines[-1]
+
+
+def test_two_clocks_that_disagree_are_said(tmp_path):
+    found = read(table(tmp_path / "log.csv", timestamp=TIME, real_time=2 * TIME, q_j=MOTION, des_j=TARGET), Robot())
+    assert any("two clocks: 'real_time' spans 2 times as long as 'timestamp'" in line for line in found.lines)
+
+
+def test_a_joint_without_limits_is_read_in_the_unit_of_the_others(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = {"q_elbow": np.degrees(0.1 * MOTION), "des_elbow": np.degrees(0.1 * TARGET)}
+    small["q_elbow"] += np.degrees(1e-4) * np.random.default_rng(3).normal(size=len(TIME))
+    columns = arm(q_shoulder=np.degrees(MOTION), des_shoulder=np.degrees(TARGET), **small)
+    found = read(table(tmp_path / "log.csv", **columns), Robot()).recording
+    assert found.dof_pos[:, 1] == pytest.approx(0.1 * MOTION, abs=1e-3)
+
+
+def test_torques_of_some_joints_are_commands_and_the_rest_is_not_missing(tmp_path):
+    three = Robot(joint_names=("shoulder", "elbow", "wrist"), limits=np.full((3, 2), [-3.0, 3.0]))
+    columns = {"q_shoulder": MOTION, "q_elbow": MOTION, "tau_shoulder": TARGET, "tau_elbow": TARGET}
+    found = read(table(tmp_path / "log.csv", time=TIME, **columns), three).recording
+    assert found.joint_names == ("shoulder", "elbow") and found.des_dof_effort.shape[1] == 2

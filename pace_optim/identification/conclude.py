@@ -149,6 +149,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
     unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
     rates = end.rates
+    told = replace(uncertainty, indistinguishable=()) if end.is_far else uncertainty  # where correlations mean nothing
     stalled = f"stalled: residual is {end.times or 0.0:,.0f}x the measurement noise"
     return make_result(
         problem,
@@ -172,7 +173,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
             *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
             *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
             *([] if rates is None else rates.sentences(problem.space, end.known)),
-            *(fit_warnings(problem, physical, uncertainty, rmse, end.left_open, unsure) if checked else []),
+            *(fit_warnings(problem, physical, told, rmse, end.left_open, unsure) if checked else []),
             *end.consistency.sentences,
         ],
     )

@@ -15,6 +15,7 @@ from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.identification.own_objective import conclude_own
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
+from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.inputs import (
@@ -25,7 +26,7 @@ from pace_optim.run.inputs import (
     with_absolute_paths,
 )
 from pace_optim.run.open import Run
-from pace_optim.run.result import FitResult
+from pace_optim.run.result import FitResult, assumptions
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds
 from pace_optim.terminal.processes import Processes
@@ -44,6 +45,7 @@ def fit(
     on_start: Callable[[Path], None] = lambda _: None,
     assess_interrupted: bool = True,
     processes: Processes | None = None,
+    told: bool = False,
 ) -> tuple[FitResult, Path]:
     """Identify a robot.
 
@@ -55,6 +57,7 @@ def fit(
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
             interruption is passed on at once, and the folder has what ``resume`` needs.
         processes: Who shares the search's candidates; this one writes, the others call :func:`help_fit`.
+        told: Whether it has been told what is assumed, and how the recordings are understood.
 
     Returns:
         The result and the run's folder.
@@ -62,12 +65,18 @@ def fit(
     Raises:
         ValueError: If anything does not fit; nothing has been written then.
     """
+    said: list[str] = []
+
+    def tell(text: str) -> None:
+        said.append(text.strip())
+        tell_on_stderr(text)
+
     if before is None:
-        problem, place = load_for_fit(settings), None
+        problem, place = load_for_fit(settings, tell=tell_nobody if told else tell), None
         if problem.logged_rate:
             settings = replace(settings, control_dt=problem.control_dt)
     else:
-        problem, place = load_for_fit(settings, before.load_cfg(), told=True), before.record.folder
+        problem, place = load_for_fit(settings, before.load_cfg(), tell_nobody), before.record.folder
     settings = with_absolute_paths(settings, problem.plain_cfg)
     own_code = [*effect_modules(problem.effects), *optimizer_modules(settings.optimizer)]
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, own_code, place)
@@ -75,6 +84,10 @@ def fit(
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
     folder.write_start(settings.to_dict(), digests, problem, inputs=inputs, environment=record.to_dict())
     on_start(folder.path)
+    if before is None and not told:
+        for note in assumptions(problem):
+            if not {note, f"note: {note}", note.partition(": ")[2]} & set(said):
+                tell_on_stderr(f"note: {note}")
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     return _finished(run, record, assess_interrupted)
 
@@ -100,7 +113,7 @@ def fit_with_torques(
     told = progress or ProgressLine()
     told.tell(f"The torques in the recordings contradict what is stated ({facts}): fitting with what they say too.")
     unknown = [*settings.unknown, *(fact for fact in result.contested if fact not in settings.unknown)]
-    other, other_folder = fit(replace(settings, unknown=unknown), progress)
+    other, other_folder = fit(replace(settings, unknown=unknown), progress, told=True)
     before, after = (1e3 * each.rmse["train"]["all"] for each in (result, other))
     if after < _BETTER * before:
         told.tell(
@@ -143,7 +156,7 @@ def resume(
     settings = before.settings if max_iteration is None else replace(before.settings, max_iteration=max_iteration)
     if device is not None:
         settings = replace(settings, device=device)
-    problem = load_for_fit(settings, before.load_cfg(), told=True)
+    problem = load_for_fit(settings, before.load_cfg(), tell_nobody)
     check_same_configuration(before, problem)
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     run.restore(checkpoint)
@@ -168,7 +181,7 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     settings, around, history, line_generation, loop = start
     settings = replace(settings, device=device)
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
-    problem = load_for_fit(settings, env_cfg)
+    problem = load_for_fit(settings, env_cfg, tell_nobody)
     problem = problem if loop in (None, problem.loop_dt) else problem.with_loop(loop)
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from pace_optim.estimate.way_down import WayDownCfg
 from pace_optim.identification.log_checks import checked
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
+from pace_optim.problem.recordings import tell_on_stderr
 from pace_optim.problem.try_out import check_size, try_out
 from pace_optim.run.open import problem_of
 from pace_optim.run.settings import FitSettings
@@ -27,13 +28,13 @@ _AROUND = 0.5
 """First standard deviation of a hybrid's search, in normalised parameters: a decade of a magnitude."""
 
 
-def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
+def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str], None] = tell_on_stderr) -> Problem:
     """Read everything, refuse what cannot be fitted, and try the simulation out.
 
     Args:
         settings: What to fit, and how.
         env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
-        told: Whether an earlier run has told how the recordings are understood.
+        tell: Is told how the recordings are understood, and warnings of them.
 
     Raises:
         ValueError: If anything does not fit.
@@ -41,7 +42,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, told: bool = False)
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
-    problem = checked(problem_of(settings, env_cfg, told), settings.trust_log, tell_nobody if told else tell_on_stderr)
+    problem = checked(problem_of(settings, env_cfg, tell), settings.trust_log, tell)
     if problem.dataset.num_recordings * 4 > settings.num_envs and settings.only_searches:
         raise ValueError(
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "

@@ -52,7 +52,7 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
         notes.append(
             f"{listed(names[alone], 3)}: the torque that is commanded is taken to be all that the drive gives"
             f"{'' if drive.damping is None else ', less its damping'}, since nothing states the gains of a position "
-            "loop beside it."
+            "loop beside it. No loop corrects the simulation, so errors of this torque add up along the recording."
         )
         drive = replace(drive, stiffness=stiffness, damping=damping)
     _, on_speed = acting_loops(recording, stiffness)

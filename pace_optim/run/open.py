@@ -5,7 +5,7 @@ problem = open_problem("logs/pace/my_arm/26_01_01_12-00-00")
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,7 @@ class Run:
         try:
             drive_dt = self.told_drive_dt if settings.drive_dt is None else settings.drive_dt
             settings = replace(settings, physics_dt=physics_dt or self.used_physics_dt, drive_dt=drive_dt)
-            problem = problem_of(settings, self.load_cfg(), told=not data)
+            problem = problem_of(settings, self.load_cfg(), tell=tell_on_stderr if data else tell_nobody)
         except ValueError as error:
             if data or str(self.folder) in str(error):
                 raise
@@ -145,13 +145,13 @@ def open_problem(
     )
 
 
-def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -> Problem:
+def problem_of(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str], None] = tell_on_stderr) -> Problem:
     """The problem that settings pose: the one place where they become one.
 
     Args:
         settings: Of a fit; its task and effects are known.
         env_cfg: The task's configuration, if it has been loaded.
-        told: Whether it has been told how their recordings are understood.
+        tell: Is told how the recordings are understood.
     """
     return load_problem(
         settings.task,
@@ -170,7 +170,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, told: bool = False) -
         rate=settings.rate,
         strict=settings.strict,
         max_duration=settings.max_duration,
-        tell=tell_nobody if told else tell_on_stderr,
+        tell=tell,
     )
 
 

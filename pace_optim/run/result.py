@@ -63,7 +63,10 @@ class FitResult(DriveResult):
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+    """What was found beside the parameters, in sentences."""
     notes: list[str] = field(default_factory=list)
+    """What was assumed, and how the recordings were read: known before the search."""
 
     def check(self, source: object) -> None:
         """Check what the types of the fields do not say.
@@ -255,14 +258,18 @@ def make_result(
         recordings={"train": data.names("train"), "validation": data.names("validation")},
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
-        notes=list(problem.env_cfg.sim2real.notes)
-        + list(problem.measured.notes)
-        + whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL])
-        + notes_by_kind(data.recordings),
+        findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),
+        notes=assumptions(problem),
         links=_found_links(problem, values),
         file_values=_file_values(problem),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         **facts,
     )
     gains = identified_gains(problem.env_cfg, data.recordings, problem.unknown, values, open_, result.unit_of)
-    return replace(result, notes=[*gains, *result.notes])
+    return replace(result, findings=[*gains, *result.findings])
+
+
+def assumptions(problem: Problem) -> list[str]:
+    """What a fit assumes of the robot, and how its recordings were read, in sentences."""
+    of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes]
+    return [*of_robot, *notes_by_kind(problem.dataset.recordings)]

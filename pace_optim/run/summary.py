@@ -35,7 +35,7 @@ def summary(result: FitResult) -> list[str]:
         f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s; "
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
-    lines += [f"note: {note}" for note in result.notes]
+    lines += [f"note: {finding}" for finding in result.findings]
     return lines + [f"warning: {warning}" for warning in result.warnings]
 
 

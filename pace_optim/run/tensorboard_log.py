@@ -153,7 +153,11 @@ class TensorBoardLog:
 def _as_markdown(result: FitResult) -> str:
     """Warnings, notes and the way to the result."""
     lines = [f"**{result.robot_name}**, {result.task}", ""]
-    for title, entries in (("Warnings", result.warnings), ("Notes", result.notes), ("Stopped", result.stop_reasons)):
+    for title, entries in (
+        ("Warnings", result.warnings),
+        ("Notes", [*result.findings, *result.notes]),
+        ("Stopped", result.stop_reasons),
+    ):
         if entries:
             lines += ["", f"| {title} |", "|---|", *(f"| {_in_cell(entry)} |" for entry in entries)]
     lines += ["", f"{result.simulated_steps / 1e6:.2f} M simulated steps in {result.wall_time_s:.1f} s"]

@@ -43,6 +43,8 @@ _COMMANDED = 0.05
 """Travel of a command that moves a joint whose drive is on [rad, m]."""
 _FOLLOWED = 0.02
 """Part of that travel which is no motion."""
+_STANDS = 2e-3
+"""Travel within which a joint stands [rad, m]."""
 _FROZEN = 0.1
 """Shortest standstill that is looked at [s]."""
 _ABRUPT = 3.0
@@ -191,7 +193,8 @@ def reversed_sign(evidence: Evidence) -> Iterator[Change]:
 def swapped(evidence: Evidence) -> Iterator[Change]:
     """The columns of two joints are exchanged, in all series, the positions or the targets."""
     view, doubted = evidence.view, evidence.doubted
-    for i, j in itertools.combinations(sorted(doubted), 2):
+    every = itertools.combinations(sorted(evidence.balance), 2)
+    for i, j in (pair for pair in every if not set(pair).isdisjoint(doubted)):  # friction may hide the fault of one
         pair, other = [i, j], [j, i]
         measured: dict[str, Any] = {"position": _column(view.position, pair, view.position[:, other])}
         commanded: dict[str, Any] = {
@@ -337,7 +340,7 @@ def _flat_ends(target: np.ndarray) -> np.ndarray:
 def lifted_limits(evidence: Evidence) -> Iterator[Change]:
     """The drive gives more than its stated limits."""
     view = evidence.view
-    for j in evidence.doubted:
+    for j in _of_known_gains(evidence):
         given, asked = view.given(j), view.asked(j)
         if np.mean(np.abs(given - asked) > 1e-6 * np.abs(asked)) > _SHARE:
             limits = {name: getattr(view, name).copy() for name in ("effort_limit", "saturation_effort")}
@@ -351,13 +354,19 @@ def lifted_limits(evidence: Evidence) -> Iterator[Change]:
             )
 
 
+def _of_known_gains(evidence: Evidence) -> list[int]:
+    """Doubted joints whose torque is known: with assumed gains it may be any multiple of what it is."""
+    return [j for j in evidence.doubted if not evidence.view.assumed[j]]
+
+
 def torque_limit(evidence: Evidence) -> Iterator[Change]:
     """The drive gives no more than a torque that nobody states."""
     view = evidence.view
-    for j in evidence.doubted:
-        if evidence.balance[j].misfit < 0.5 * _LARGE:
-            continue
+    for j in _of_known_gains(evidence):
         most = np.quantile(np.abs(view.asked(j)), np.linspace(0.3, 0.995, 15))
+        most = most[most > 0.0]  # of a drive that mostly gives none
+        if len(most) < 2:
+            continue
 
         def changed(limit: float, j: int = j) -> View:
             limits = view.effort_limit.copy()
@@ -391,7 +400,7 @@ def turned_gravity(evidence: Evidence) -> Iterator[Change]:
         [Links.of(replace(view, gravity=view.gravity + axis)).torque - links.torque for axis in np.eye(3)], axis=-1
     )
     judged = [j for j in few.balance if np.ptp(pull[:, j], axis=0).max() > 0]
-    free = balances(view, links, few.doubted, pull)
+    free = balances(view, links, [j for j in evidence.doubted if j in few.balance], pull)
     if not any(each.misfit < _WORTH * few.balance[j].misfit for j, each in free.items()):
         return
 
@@ -653,7 +662,14 @@ def _gain(before: Evidence, after: Evidence, change: Change) -> float:
 def check_log(problem: Problem) -> list[Finding]:
     """What is wrong with the recordings of a problem; the same of several is said once."""
     merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
-    for view in views_of(problem):
+    views = views_of(problem)
+    if all(np.ptp(view.position, axis=0).max() < _STANDS for view in views):
+        text = (
+            f"no joint moves by {1e3 * _STANDS:g} mrad or mm: a robot that stands shows no parameter. Record a motion."
+        )
+        still = Change(joints=tuple(range(len(views[0].joints))), view=views[0], text=text)
+        return [replace(_finding(SIGHTS[0], still), recordings=tuple(view.name for view in views))]
+    for view in views:
         for finding in explained(view):
             merged.setdefault((finding.check, finding.joints), []).append(finding)
     return [replace(each[0], recordings=tuple(f.recordings[0] for f in each)) for each in merged.values()]

@@ -15,6 +15,9 @@ from .base import base_fields
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 
+_FINE = 0.0025
+"""Between two torques that stand for a measured one [s]."""
+
 
 def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """The fields of a recording, and notes on how they came about.
@@ -47,6 +50,14 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         interpolate = interpolate_linear if series == "dof_effort" else interpolate_smooth
         if parts[series]:
             fields[series] = _columns(parts[series], joint_names, lambda p, how=interpolate: _at(p, time, how))  # type: ignore[misc]
+    if _is_measured(columns, joint_names):  # a measurement changes between its samples, as no held command does
+        step = float(np.median(np.diff(time)))
+        fine = np.linspace(time[0], time[-1], (len(time) - 1) * max(1, round(step / _FINE)) + 1)
+        parts["des_dof_effort"] = {
+            name: (fine, np.interp(fine, clock, values))
+            for name, (clock, values) in parts["des_dof_effort"].items()
+        }
+        del fields["dof_effort"]
     commands = {series: parts[series] for series in COMMAND_SERIES if parts[series]}
     own = [clock for part in commands.values() for clock, _ in part.values()]
     if own and not all(clock is time or np.array_equal(clock, time) for clock in own):
@@ -76,6 +87,12 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
     if log.time_origin or first:
         fields["time_origin"] = log.time_origin + first
     return {**fields, **columns.facts}, notes
+
+
+def _is_measured(columns: ColumnMap, joint_names: Sequence[str]) -> bool:
+    """Whether the torques that are taken to be commanded are those that were measured."""
+    each = [columns.joints[name] for name in joint_names]
+    return all("des_dof_effort" in by and by["des_dof_effort"] == by.get("dof_effort") for by in each)
 
 
 def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> str:

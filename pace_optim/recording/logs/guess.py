@@ -19,8 +19,8 @@ from .base import guess_base
 from .column_map import ColumnMap, Source
 from .joints import match, only_numbers
 from .log import Channel, Log
-from .units import Known, guessed_units
-from .words import CURRENTS, GAINS, NEED_FACTOR, meaning
+from .units import Known, UnitUnknown, guessed_units
+from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, meaning
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives are told."""
@@ -91,16 +91,14 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     Args:
         log: The log.
         robot: The robot, as far as it is known.
-
-    Raises:
-        ValueError: If a joint's numbers fit two units.
     """
+    notes: list[str] = []
     candidates = [found for channel in log.channels.values() if (found := _candidate(channel)) is not None]
+    candidates = _once(candidates, notes)
     names = robot.joint_names or _own_names(candidates)
     groups: dict[tuple[str, str], list[_Candidate]] = defaultdict(list)
     for each in candidates:
         groups[each.channel.table, each.series].append(each)
-    notes: list[str] = []
     chosen: dict[str, dict[str, tuple[tuple[float, int, int], _Candidate]]] = {name: {} for name in names}
     named = {
         c.channel.table for c in candidates if not only_numbers([c.label]) and _meant(c.label, names, robot.wanted)
@@ -123,7 +121,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     facts_from = {by[fact].channel.key for by in picked.values() for fact in facts if fact in by}
     notes += more
     picked = _without_plans(picked, notes)
-    sources, more = _with_units(picked, robot, names)
+    sources, more, open_units = _with_units(picked, robot, names)
     notes += more
     if not any(s in COMMAND_SERIES for by in sources.values() for s in by):
         _effort_as_command(sources, notes)
@@ -131,11 +129,12 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     enable, more = _enable(switches)
     facts_from |= {channel.key for channel in switches} if enable else set()
     base, of_base = guess_base(log)
-    more = [*more, *of_base]
+    missing = [*_missing(sources, robot.wanted or _found(sources, robot, candidates) or names), *open_units]
+    more = [*more, *of_base, *(_foreign(candidates, robot) if missing else [])]
     return Guess(
         columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable, base=base),
         notes=(*notes, *more),
-        missing=tuple(_missing(sources, robot.wanted or _found(sources, robot, candidates) or names)),
+        missing=tuple(missing),
         unit_stated=tuple(name for name, by in picked.items() if "dof_pos" in by and by["dof_pos"].unit),
         facts_from=tuple(facts_from),
     )
@@ -197,6 +196,34 @@ def _candidate(channel: Channel) -> _Candidate | None:
     return _Candidate(
         channel=channel, series=("des_" if commanded else "") + said.quantity, label=label, unit=said.unit
     )
+
+
+def _once(candidates: Sequence[_Candidate], notes: list[str]) -> list[_Candidate]:
+    """Without series that the log has in a second unit: the SI one is kept. Those that differ are all left out."""
+    same: dict[tuple[str, str, str], list[_Candidate]] = defaultdict(list)
+    for each in candidates:
+        same[each.channel.table, each.series, each.label].append(each)
+    kept: list[_Candidate] = []
+    for those in same.values():
+        units = {each.unit for each in those} - set(NEED_FACTOR) - {""}
+        if len(those) == 1 or len(units) < len(those):
+            kept += those
+            continue
+        first, *others = sorted(those, key=lambda each: UNITS[each.series.removeprefix("des_")][each.unit] != 1.0)
+        if all(_agree(first, other) for other in others):
+            kept.append(first)
+        else:
+            keys = listed(each.channel.key for each in those)
+            notes.append(f"{keys}: one series in several units, and their values differ: not used. Map one of them.")
+    return [each for each in candidates if any(each is one for one in kept)]
+
+
+def _agree(one: _Candidate, other: _Candidate) -> bool:
+    """Whether two channels are one series in two units."""
+    if len(one.channel.values) != len(other.channel.values):
+        return False
+    first, second = (_scaled(each.channel, each.series, each.unit).values for each in (one, other))
+    return bool(np.allclose(first, second, rtol=0.0, atol=1e-3 * float(np.ptp(first)) + 1e-9))
 
 
 def _own_names(candidates: Sequence[_Candidate]) -> tuple[str, ...]:
@@ -298,7 +325,8 @@ def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -
 
 def _with_units(
     picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str]
-) -> tuple[dict[str, dict[str, Source]], list[str]]:
+) -> tuple[dict[str, dict[str, Source]], list[str], list[str]]:
+    """Where each series comes from, notes, and units that nothing tells."""
     groups: dict[tuple[str, str, JointType], dict[str, _Candidate]] = defaultdict(dict)
     stated: dict[str, dict[str, Channel]] = {name: {} for name in names}
     for name, by in picked.items():
@@ -313,6 +341,7 @@ def _with_units(
     scaled: dict[str, Channel] = {}
     of_positions: dict[str, str] = {}
     notes: list[str] = []
+    unknown: list[str] = []
     for (series, _, _), group in sorted(groups.items(), key=_order_of_group):
         unit = next(iter(group.values())).unit
         if unit in NEED_FACTOR:
@@ -323,8 +352,12 @@ def _with_units(
         units = dict.fromkeys(group, unit)
         if not unit:
             known = {name: robot.known(name, stated[name], given[name]) for name in group}
-            units, more = guessed_units(series, known, scaled, of_positions)
-            notes += more
+            try:
+                units, more = guessed_units(series, known, scaled, of_positions)
+                notes += more
+            except UnitUnknown as error:
+                units = error.units
+                unknown.append(str(error))
         for name, each in group.items():
             if not units[name]:
                 continue
@@ -332,7 +365,7 @@ def _with_units(
             if series == "dof_pos":
                 scaled[name] = _scaled(each.channel, series, units[name])
                 of_positions[name] = units[name]
-    return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes
+    return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes, unknown
 
 
 def _scaled(channel: Channel, series: str, unit: str) -> Channel:
@@ -346,28 +379,42 @@ def _order_of_group(entry: tuple[tuple[str, str, str], object]) -> tuple[int, st
 
 def _effort_as_command(sources: dict[str, dict[str, Source]], notes: list[str]) -> None:
     """A log of torques and motions without any command: the torque is what was commanded."""
-    if sources and all("dof_effort" in by for by in sources.values()):
-        for by in sources.values():
+    measured = [by for by in sources.values() if "dof_pos" in by]
+    if measured and all("dof_effort" in by for by in measured):
+        for by in measured:
             by["des_dof_effort"] = by["dof_effort"]
         notes.append(
             "The log has no commands: its torques (dof_effort) were taken to be what was commanded (des_dof_effort), "
-            "without any gains."
+            "without any gains, with straight lines between them."
         )
 
 
 def _found(
     sources: Mapping[str, Mapping[str, Source]], robot: Robot, candidates: Sequence[_Candidate]
 ) -> tuple[str, ...]:
-    """The robot's joints that the log has, with commands, if it has no others: one without may have another name."""
+    """The robot's joints that the log has, with commands if any has, if it has no others: those may be misspelt."""
     labels = {each.label for each in candidates if each.series == "dof_pos"}
     if not all(match(label, robot.joint_names) for label in labels):
         return ()
-    return tuple(name for name, by in sources.items() if "dof_pos" in by and any(s in COMMAND_SERIES for s in by))
+    measured = {name: by for name, by in sources.items() if "dof_pos" in by}
+    return tuple(n for n, by in measured.items() if not by.keys().isdisjoint(COMMAND_SERIES)) or tuple(measured)
+
+
+def _foreign(candidates: Sequence[_Candidate], robot: Robot) -> list[str]:
+    """Which positions of the log are of no joint of the robot, and what to do if their names are right."""
+    labels = [each.label for each in candidates if each.series == "dof_pos"]
+    foreign = [label for label in labels if label and robot.joint_names and not match(label, robot.joint_names)]
+    if not foreign or len(foreign) == len(labels) or robot.wanted:
+        return []
+    return [
+        f"No joint of the robot is called as {listed(foreign, 12)}. If the names are right, choose the joints that log "
+        "and robot have: --joints REGEX."
+    ]
 
 
 def _missing(sources: dict[str, dict[str, Source]], names: Sequence[str]) -> list[str]:
     if not names:
-        return ["positions of joints (dof_pos)"]
+        return ["positions of joints (dof_pos)", "their commands (des_dof_pos, des_dof_vel or des_dof_effort)"]
     missing = []
     if without := [name for name in names if "dof_pos" not in sources[name]]:
         missing.append(f"positions (dof_pos) of {listed(without)}")

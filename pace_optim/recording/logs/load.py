@@ -20,10 +20,11 @@ from .guess import Robot, guess_map
 from .log import Log
 from .rosbag import read_rosbag
 from .tables import is_joint_table, read_csv_log, read_parquet_log
+from .text_table import SUFFIXES as TABLES
+from .text_table import Head, head_of
 
 BAGS = (".mcap", ".db3", ".bag")
-TABLES = (".csv", ".parquet")
-LOG_SUFFIXES = (*BAGS, ".parquet")
+LOG_SUFFIXES = (*BAGS, ".parquet", *(each for each in TABLES if each not in SUFFIXES))
 _JOIN = "+"
 """Between the files of one log: states.csv+commands.csv."""
 
@@ -72,9 +73,22 @@ def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
     """Whether a path is a log of another program, and not a recording in this project's own form."""
     if columns is not None and (columns.joints or columns.time) and path.suffix.lower() not in (".npz", ".pt"):
         return True
-    if path.is_dir() or path.suffix.lower() in LOG_SUFFIXES or (_JOIN in str(path) and not path.exists()):
+    if path.is_dir() or path.suffix.lower() not in SUFFIXES or len(_parts(path)) > 1:
         return True
     return path.suffix.lower() == ".csv" and path.is_file() and not _is_own_csv(path)
+
+
+def _parts(path: Path) -> list[Path]:
+    """The files that a path joins by `+`; one in the name of a file or folder joins nothing."""
+    found, begun = [], ""
+    for piece in str(path).split(_JOIN):
+        begun += piece
+        if Path(begun).is_file():
+            found.append(Path(begun))
+            begun = ""
+        else:
+            begun += _JOIN
+    return found if found and not begun and not path.exists() else [path]
 
 
 def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> list[Understood]:
@@ -99,7 +113,7 @@ def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Und
         used, notes = columns, list(log.notes)
         facts_from: tuple[str, ...] = ()
         unit_stated = tuple(columns.joints) if columns is not None else ()
-        beside = Path(str(path).split(_JOIN)[0]) if _JOIN in str(path) else path
+        beside = _parts(path)[0]
         if used is None or not used.joints:
             guess = guess_map(log, robot)
             own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
@@ -149,32 +163,30 @@ def paired_files(paths: Sequence[str]) -> list[str]:
 
 def _half(path: Path) -> str:
     """`states` or `commands` where a table has one of them alone, else ""."""
-    if path.suffix.lower() != ".csv" or not path.is_file():
+    if path.suffix.lower() not in TABLES or not path.is_file():
         return ""
-    positions, commands = is_joint_table(_header(path))
+    positions, commands = is_joint_table(_head(path).names)
     return "" if positions == commands else "states" if positions else "commands"
 
 
-def _header(path: Path) -> list[str]:
+def _head(path: Path) -> Head:
+    """How a table begins; as an empty one where it cannot be read."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            line = file.readline(1 << 20)
-        cells = next(csv.reader([line], delimiter=max(",;\t", key=line.count)), [])
+        return head_of(path)
     except (UnicodeDecodeError, OSError, csv.Error):
-        return []
-    return [cell.strip() for cell in cells]
+        return Head(names=(), delimiter=",", first_row=1, notes=())
 
 
 def _is_own_csv(path: Path) -> bool:
     """Whether a CSV is meant to be a recording: it has the time and joints of one of the series by their names."""
-    header = _header(path)
-    own = [column.partition("/")[0] for column in header if "/" in column]
-    return not header or any(series in ("dof_pos", "des_dof_pos") for series in own) or len(header) < 2
+    head = _head(path)
+    own = [column.partition("/")[0] for column in head.names if "/" in column]
+    return head.first_row == 1 and (len(head.names) < 2 or not {"dof_pos", "des_dof_pos"}.isdisjoint(own))
 
 
 def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
-    if _JOIN in str(path) and not path.exists():
-        yield _joined([Path(part) for part in str(path).split(_JOIN)], columns)
+    if len(parts := _parts(path)) > 1:
+        yield _joined(parts, columns)
         return
     if not path.exists():
         folder = path.parent
@@ -201,12 +213,12 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
         yield read_rosbag(path)
     elif suffix == ".parquet":
         yield from read_parquet_log(path, columns)
-    elif suffix == ".csv":
+    elif suffix in TABLES:
         yield from read_csv_log(path, columns)
     else:
         raise ValueError(
             f"{path}: found the suffix '{path.suffix}'; expected one of {listed((*SUFFIXES, *LOG_SUFFIXES))}, or a "
-            "folder of a rosbag2 or a LeRobot dataset. Convert the log."
+            "folder of a rosbag2 or a LeRobot dataset. Write it as .csv: a line of names, then one row per sample."
         )
 
 
@@ -232,7 +244,7 @@ def _joined(paths: Sequence[Path], columns: ColumnMap | None) -> Log:
         name=paths[0].stem,
         channels=channels,
         time_origin=first,
-        notes=tuple(note for log in logs for note in log.notes),
+        notes=tuple(dict.fromkeys(note for log in logs for note in log.notes)),
     )
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +18,16 @@ from pace_optim.recording.stamps import seconds_of, set_back, unix_unit, unround
 from .column_map import ColumnMap
 from .log import Log, cleaned
 from .optional import reader
+from .text_table import read_table
 from .words import TIME_UNITS, is_time, meaning, time_unit
 
 _FASTEST, _SLOWEST = 5e-5, 0.12
 """Steps that a log of joints may have [s]."""
+_ONE_CLOCK = 0.01
+"""Relative difference within which two columns of time are of one clock."""
 _MOST_ROWS = 10**8
 _BYTES_PER_VALUE = 64
 """Memory of a value of a parquet file while lists of it are read."""
-_BYTES_PER_BYTE = 12
-"""Memory of a CSV's cells as text, for each of its bytes."""
 _WHOLE = ("s", "sec", "secs", "second", "seconds")
 _FRACTIONS = {
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds"), 1),
@@ -41,10 +40,18 @@ _FRACTIONS = {
 def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     """Read a CSV of any names; cells may be empty where a column has no value at an instant.
 
+    If the columns are called as joints are, and nothing more, the file's name says which series they are.
+
     Raises:
         ValueError: If it cannot be read as a table over time.
     """
-    return _logs(path.stem, path, _csv_columns(path), columns)
+    content, notes = read_table(path)
+    names = [name for name in content if not is_time(name)]
+    by_file = any(meaning(name, path.stem).quantity for name in names)
+    table = path.stem if by_file and not any(meaning(name).quantity for name in names) else ""
+    if table:
+        content = {f"{table}:{name}" if name in names else name: values for name, values in content.items()}
+    return _logs(path.stem, path, content, columns, table, notes)
 
 
 def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
@@ -98,50 +105,6 @@ def _check_size(path: Path, metadata: Any) -> None:
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     values = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
     check_memory(_BYTES_PER_VALUE * values, f"{path}: reading its {values:.3g} values", "Cut it.")
-
-
-def _csv_columns(path: Path) -> dict[str, np.ndarray]:
-    check_memory(_BYTES_PER_BYTE * path.stat().st_size, f"{path}: reading it", "Cut it.")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            head = file.read(65536)
-            file.seek(0)
-            first = head.splitlines()[0] if head.splitlines() else ""
-            marks = max(",;\t", key=first.count)
-            rows = [row for row in csv.reader(file, delimiter=marks) if any(cell.strip() for cell in row)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8.") from error
-    if len(rows) < 2:
-        raise ValueError(f"{path}: holds no samples; expected a line of column names, then one line per sample.")
-    header = [cell.strip() for cell in rows[0]]
-    if not all(header):
-        raise ValueError(
-            f"{path}: column {header.index('') + 1} has no name in the header ({listed(h or '?' for h in header)}). "
-            "Name every column."
-        )
-    if repeated := sorted({name for name in header if header.count(name) > 1}):
-        raise ValueError(f"{path}: the column(s) {listed(repeated)} appear twice. Keep one of each.")
-    body = rows[1:]
-    if len(body[-1]) != len(header):
-        body = body[:-1]  # cut short where the logger was stopped
-    for line, row in enumerate(body, start=2):
-        if len(row) != len(header):
-            raise ValueError(f"{path}: row {line} has {len(row)} cells but the header has {len(header)}. Complete it.")
-    comma = marks == ";" and not any("." in cell for row in body[:20] for cell in row)
-    return {name: _cells([row[i].strip() for row in body], comma) for i, name in enumerate(header)}
-
-
-def _cells(cells: Sequence[str], comma: bool) -> np.ndarray:
-    """A column's cells as numbers (NaN where empty), whole numbers exactly, or as text."""
-    if comma:
-        cells = [cell.replace(",", ".") for cell in cells]
-    if all(re.fullmatch(r"-?\d{13,19}", cell) for cell in cells[:50]):
-        with suppress(ValueError, OverflowError):
-            return np.array([int(cell) for cell in cells])
-    words = {"": "nan", "true": "1", "false": "0", "none": "nan", "null": "nan", "na": "nan"}
-    with suppress(ValueError):
-        return np.array([float(words.get(cell.lower(), cell)) for cell in cells])
-    return np.array(cells)
 
 
 def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray]]:
@@ -219,9 +182,16 @@ def _with_exact_time(columns: dict[str, np.ndarray], info: Mapping[str, Any]) ->
     return columns
 
 
-def _logs(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> list[Log]:
+def _logs(
+    name: str,
+    path: Path,
+    columns: dict[str, np.ndarray],
+    chosen: ColumnMap | None,
+    table: str = "",
+    notes: Sequence[str] = (),
+) -> list[Log]:
     """The log of a table; several where its clock was set back in between."""
-    column, time, origin, note = _time(path, columns, chosen)
+    column, time, origin, note = _time(path, columns, chosen, notes)
     numbers, text = {}, []
     for key, values in columns.items():
         if key == column or is_time(key):
@@ -230,7 +200,7 @@ def _logs(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnM
             numbers[key] = values
         else:
             text.append(key)
-    notes = [note] + ([f"Not used, because they are text: {listed(text)}."] if text else [])
+    notes = [*notes, note, *([f"Not used, because they are text: {listed(text)}."] if text else [])]
     back = _set_back(time, numbers)
     parts = [slice(a, b) for a, b in zip([0, *back], [*back, len(time)], strict=True)]
     if len(back):
@@ -241,7 +211,7 @@ def _logs(name: str, path: Path, columns: dict[str, np.ndarray], chosen: ColumnM
         stamps, rounding = time[rows], ""
         if all(np.isfinite(values[rows]).all() or not np.isfinite(values[rows]).any() for values in numbers.values()):
             stamps, rounding = unrounded(stamps)
-        channels, more = cleaned("", stamps, {key: values[rows] for key, values in numbers.items()})
+        channels, more = cleaned(table, stamps, {key: values[rows] for key, values in numbers.items()})
         logs.append(
             Log(
                 name=name if len(parts) == 1 else f"{name} part {number}",
@@ -259,7 +229,9 @@ def _set_back(time: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[int]:
     return [k for k in set_back(time).tolist() if np.any(filled[:, :k].any(axis=1) & filled[:, k:].any(axis=1))]
 
 
-def _time(path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) -> tuple[str, np.ndarray, float, str]:
+def _time(
+    path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None, notes: Sequence[str]
+) -> tuple[str, np.ndarray, float, str]:
     """The column of time, stamps [s], Unix time at zero, and a note on what they were taken for."""
     if chosen and chosen.time and chosen.time not in columns:
         raise ValueError(f"{path}: has no column '{chosen.time}' for the time. Columns: {listed(columns)}.")
@@ -269,13 +241,29 @@ def _time(path: Path, columns: dict[str, np.ndarray], chosen: ColumnMap | None) 
     if usable:
         best = max(usable, key=lambda name: _share_rising(columns[name]))
         unit = (chosen.time_unit if chosen else "") or ("ns" if best in joined else time_unit(best))
-        return best, *_seconds(path, best, columns[best], unit)
+        time, origin, note = _seconds(path, best, columns[best], unit)
+        others = [name for name in usable if name != best]
+        return best, time, origin, " ".join([note, *(_beside(best, time, name, columns[name]) for name in others)])
     if chosen and chosen.rate:
         count = len(next(iter(columns.values())))
         return "", np.arange(count) / chosen.rate, 0.0, f"Time is the row's number at the stated {chosen.rate:g} Hz."
     raise ValueError(
-        f"{path}: no column of time found. Columns: {listed(columns)}. Name it time, or write a column map: [time] "
-        'column = "NAME", unit = "s". If the log has none, state its rate: --rate HZ.'
+        f"{' '.join([f'{path}: no column of time found.', *notes])} Columns: {listed(columns, 12)}. Name it time, or "
+        'write a column map: [time] column = "NAME", unit = "s". If the log has none, state its rate: --rate HZ.'
+    )
+
+
+def _beside(name: str, time: np.ndarray, other: str, values: np.ndarray) -> str:
+    """What is to be said of a second column of time: that it runs at another rate than the one that is used."""
+    if values.dtype.kind in "UM":
+        return ""
+    spans = float(np.ptp(time)), float(np.ptp(seconds_of(values)[0] if unix_unit(values) else values))
+    ratio = min((spans[1] * unit / spans[0] for unit in TIME_UNITS.values()), key=lambda ratio: abs(np.log(ratio)))
+    if abs(ratio - 1.0) < _ONE_CLOCK:
+        return ""
+    return (
+        f"The log has two clocks: '{other}' spans {ratio:.3g} times as long as '{name}'. If '{other}' is right, write "
+        f'it into a column map: [time] column = "{other}".'
     )
 
 

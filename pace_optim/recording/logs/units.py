@@ -49,6 +49,15 @@ class Known:
     """All its series, as logged."""
 
 
+class UnitUnknown(ValueError):
+    """Joints may be in either of two units; the message names them."""
+
+    def __init__(self, message: str, units: dict[str, str]) -> None:
+        super().__init__(message)
+        self.units = units
+        """A guess of all, by joint."""
+
+
 def guessed_units(
     series: str, known: Mapping[str, Known], positions: Mapping[str, Channel], of_positions: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str]]:
@@ -61,7 +70,7 @@ def guessed_units(
         of_positions: Their units.
 
     Raises:
-        ValueError: If a joint may be in either of two units.
+        UnitUnknown: If a joint may be in either of two units.
     """
     joint_type = next(iter(known.values())).joint_type
     channels = {name: joint.given[series] for name, joint in known.items()}
@@ -88,15 +97,21 @@ def _of_positions(
             units[name], why[name] = small, f"{beyond:.3g} beyond its limits in {whole}"
         elif by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small):
             units[name], why[name] = by, "by its speeds or torques"
-        elif not limited:
-            far = _TURNS < np.abs(channel.values).max() <= (360.0 if small == "deg" else np.inf)
+        elif not limited and (furthest := np.abs(channel.values).max()) > _TURNS:
+            far = furthest <= (360.0 if small == "deg" else np.inf)
             units[name] = small if far and "des_dof_pos" in joint.given else whole
             why[name] = "and it follows a position" if units[name] == small else ""
     if small not in units.values():
         return {name: units.get(name, whole) for name in channels}, []
     open_ones = [name for name in channels if name not in units]
-    for name in open_ones:
-        units[name] = _like_others(name, channels, units, small)
+    units |= {name: _like_others(name, channels, units, small) for name in open_ones}
+    if unknown := [name for name in open_ones if not units[name]]:
+        ranges = listed(f"{n} ({channels[n].values.min():.3g} to {channels[n].values.max():.3g})" for n in unknown)
+        there = listed(name for name in units if units[name] == small)
+        raise UnitUnknown(
+            f"the unit of {ranges}: {whole} or {_WORDS[small]}, as {there} {'is' if ',' not in there else 'are'} in",
+            {name: unit or small for name, unit in units.items()},
+        )
     notes = [
         f"Positions of {name} reach {np.abs(channels[name].values).max():.4g}"
         f"{', ' + why[name] if why.get(name) else ''}: read as {_WORDS[small]}."
@@ -146,8 +161,7 @@ def _nearer(ratio: float, whole: str, small: str) -> str:
 def _like_others(name: str, channels: Mapping[str, Channel], units: Mapping[str, str], small: str) -> str:
     """The unit of a joint whose numbers fit both, beside joints in the smaller one: their encoders are alike.
 
-    Raises:
-        ValueError: If its noise does not tell.
+    "" where its noise does not tell.
     """
     own = channels[name]
     if np.ptp(own.values) < _STILL:
@@ -157,14 +171,8 @@ def _like_others(name: str, channels: Mapping[str, Channel], units: Mapping[str,
     noise, usual = _noise(own), float(np.median(others))
     away = {u: abs(np.log(max(noise * UNITS["dof_pos"][u], 1e-12) / max(usual, 1e-12))) for u in (whole, small)}
     near, far = sorted(away, key=lambda unit: away[unit])
-    if away[far] - away[near] < np.log(_CLEAR) or away[near] > np.log(10.0):
-        there = listed(other for other in units if units[other] == small)
-        raise ValueError(
-            f"{there}: positions are in {_WORDS[small]}, by the joints' limits. {name} goes from "
-            f"{own.values.min():.3g} to {own.values.max():.3g}, which fits {whole} and {_WORDS[small]}. State its unit "
-            "in a column map (pace import --write_map)."
-        )
-    return near
+    clear = away[far] - away[near] >= np.log(_CLEAR) and away[near] <= np.log(10.0)
+    return near if clear else ""
 
 
 def _noise(channel: Channel) -> float:

@@ -27,8 +27,8 @@ _TIME_WORDS = {
     unit: named
     for named, spelt in (
         ("s", "s sec secs second seconds"),
-        ("ms", "ms msec msecs millis milliseconds"),
-        ("us", "us usec usecs micros microseconds"),
+        ("ms", "ms msec msecs millis millisec millisecs milliseconds"),
+        ("us", "us usec usecs micros microsec microsecs microseconds"),
         ("ns", "ns nsec nsecs nanosec nanosecs nanos nanoseconds"),
     )
     for unit in spelt.split()
@@ -42,11 +42,13 @@ GAINS = {"kp": "stiffness", "stiffness": "stiffness", "kd": "damping", "damping"
 _TIMES = {
     "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "clock", "datetime", "date", "sec",
     "secs", "second", "seconds", "msec", "msecs", "millis", "milliseconds", "usec", "usecs", "micros", "microseconds",
-    "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds", "elapsed",
+    "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds", "elapsed", "millisec", "millisecs", "microsec",
+    "microsecs",
 }  # fmt: skip
 _OF_TIMES = {
     "header", "ros", "log", "unix", "epoch", "since", "start", "utc", "from", "relative", "rel", "sim", "wall",
     "system", "sys", "boot", "monotonic", "host", "received", "recv", "rx", "local", "sample", "abs",
+    "real",
 }  # fmt: skip
 """Words beside those."""
 _COMMAND = {
@@ -65,13 +67,17 @@ _NO_QUANTITY = {
 """Words that are said of positions where no quantity is."""
 _POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular"}
 _VELOCITY = {"vel", "velocity", "velocities", "dq", "qd", "qvel", "speed", "speeds", "omega", "qdot", "rate"}
-_EFFORT = {"effort", "efforts", "torque", "torques", "tau", "trq", "tq", "moment", "ff", "feedforward", "load"}
-_AMPERES = {"amp", "amps", "ampere", "amperes", "iq", "currents"}
+_EFFORT = {
+    "effort", "efforts", "torque", "torques", "tau", "trq", "tq", "moment", "ff", "feedforward", "load", "force",
+    "forces",
+}  # fmt: skip
+_AMPERES = {"amp", "amps", "ampere", "amperes", "iq", "currents", "curr"}
 _OTHER = {
     "error", "err", "errors", "temp", "temperature", "voltage", "volt", "volts", "ki", "gain", "gains", "duty",
     "accel", "acc", "acceleration", "accelerations", "ddq", "qdd", "imu", "quat", "quaternion", "gyro", "index",
     "frame", "episode", "task", "limit", "min", "max", "status", "fault", "mode", "std", "pwm", "power", "id",
-    "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum",
+    "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum", "last", "prev", "previous",
+    "column", "tcp", "pose", "orientation",
 }  # fmt: skip
 _GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
 _SIDES = {"l": "left", "r": "right"}
@@ -142,8 +148,13 @@ def meaning(name: str, table: str = "") -> Meaning:
         bool(said & _AMPERES)
         or unit in CURRENTS
         or ("current" in said and not said & _POSITION and not said & _VELOCITY)
+        or bool(set(around) & _AMPERES and not said & (_POSITION | _VELOCITY | _EFFORT))
     )
-    if said & _OTHER:
+    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(around)
+    others = said & _OTHER
+    if others == {"index"} and any(word.isalpha() for word in said - others - spoken - _GENERIC):
+        others = set()  # a finger's
+    if others:
         quantity = ""
     elif said & {"enabled", "enable"} or ("on" in said and said & {"torque", "servo", "motor", "drive", "power"}):
         quantity = "torque_enable"
@@ -162,7 +173,6 @@ def meaning(name: str, table: str = "") -> Meaning:
         commanded = True
     if of_unit == EFFORT and unit in ("%", "permille") and quantity != EFFORT:
         quantity = ""  # part of a range that nothing states
-    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(around)
     if quantity == "torque_enable":
         spoken |= {"enable", "enabled", "on"}
     joint = tuple(word for word in words(without_unit) if word not in spoken)

@@ -40,7 +40,8 @@ def looks_of(path: Path) -> mujoco.MjModel | None:
 def _of_urdf(text: str, path: Path) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     for link in ElementTree.fromstring(text.strip().strip("\0")).findall("link"):
-        body = spec.worldbody.add_body(name=link.get("name", ""))
+        name = link.get("name", "")
+        body = spec.worldbody if name == spec.worldbody.name else spec.worldbody.add_body(name=name)
         shown = [_mesh(spec, body, part, path) for part in link.findall("visual")]
         if not any(shown):
             for part in link.findall("collision"):
@@ -69,13 +70,14 @@ def _mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: ElementTree.Element, 
 
 
 def _found(name: str, path: Path) -> Path | None:
-    """The file that a URDF names, beside it or above it."""
+    """The file that a URDF names, beside it or above it; or the same mesh in a format that MuJoCo reads."""
     kind, _, rest = name.rpartition("://")
     places = [path.parent, *path.resolve().parents[1:5]]
     shorter = rest.partition("/")[2] if kind == "package" else rest
     for place in places:
         for each in (rest, shorter):
-            if each and (file := place / each).is_file() and file.suffix.lower() in _READ:
+            found = [place / each, *(place / Path(each).with_suffix(suffix) for suffix in _READ)] if each else []
+            if file := next((file for file in found if file.suffix.lower() in _READ and file.is_file()), None):
                 return file.resolve()
     return None
 

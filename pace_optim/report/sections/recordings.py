@@ -20,7 +20,7 @@ _DRIVES = 40
 
 def recordings(run: RunData) -> Section:
     """A row per recording, its notes underneath; then the drives in each."""
-    rows, notes = [], list(run.result.notes)
+    rows, notes = [], [*run.result.findings, *run.result.notes]
     ordered = by_error(run.recordings)
     factor, unit = position_unit([error_of(recording) for recording in ordered], run.result.joint_types)
     for recording in ordered:
