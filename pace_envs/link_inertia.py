@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from pace_actuators.drive_result import LinkInertia
+from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.quaternions import multiply
 from pace_envs.simulation import Simulation
 
@@ -165,7 +166,7 @@ class LinkInertias:
 
         Args:
             sim: The simulation.
-            joint_names: The joints, in the order of the articulation.
+            joint_names: The joints, in the order of the articulation; for a motor that moves several, one of these.
         """
         self.sim = sim
         self._loads: dict[int, torch.Tensor] = {}
@@ -403,11 +404,11 @@ def moved_by(model: mujoco.MjModel, link: str, joints: Sequence[str]) -> str | N
         link: A body's name.
         joints: The driven joints.
     """
-    b = model.body(link).id
+    b, driven = model.body(link).id, DrivenJoints.of_model(model, joints)
     while b > 0:
         own = range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])
         for j in reversed(own):
-            if model.joint(j).name in joints:
-                return model.joint(j).name
+            if (joint := model.joint(j).name) in driven.joints:
+                return driven.names[driven.joints.index(joint)]
         b = int(model.body_parentid[b])
     return None

@@ -13,6 +13,7 @@ from pace_actuators import match_names
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.link_inertia import write_links
 from pace_envs.model_file import compile_model, read_model_file
+from pace_envs.motor_coordinates import add_motors
 
 
 def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.MjSpec:
@@ -33,6 +34,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
             warnings.warn(f"{cfg.mjcf_path}: {note}", stacklevel=2)
         _name_geoms(spec)
     write_links(spec, cfg.links, cfg.mjcf_path)
+    add_motors(spec, cfg.couplings, cfg.mjcf_path)
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if cfg.fix_base:
         for joint in free:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import Effect
+from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
 from pace_optim.joints.simulation.path import ReferencePath
 
@@ -103,6 +104,9 @@ class TwinSimulation(Simulation):
         result[:, self._columns] = load.neg_().view(len(result), -1)
         return result
 
+    def couple(self, coordinates: MotorCoordinates) -> None:
+        """Nothing: what motors feel is on the path."""
+
     def move_base(self, motion: torch.Tensor | None, point: np.ndarray | None = None) -> None:
         """Nothing: what joints feel of it is on the path."""
 
@@ -187,11 +191,14 @@ class TwinSimulation(Simulation):
         columns, self.model = self.path.columns, super()._compile(spec)
         names = [self.model.joint(self.model.dof_jntid[column]).name for column in columns.tolist()]
         alone = self._stands_alone[columns]
-        if others := [joint for joint in spec.joints if joint.name not in names]:
+        coupled = tuple(names) != self.path.names
+        if (others := [joint for joint in spec.joints if joint.name not in names]) or coupled:
             for element in [*spec.sensors, *spec.equalities, *spec.tendons, *others]:
                 spec.delete(element)
+            for joint, name in zip([spec.joint(name) for name in names], self.path.names, strict=True):
+                joint.name = name  # a motor stands in the place of a joint that it moves
             self.model = super()._compile(spec)
-        self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in names])
+        self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in self.path.names])
         self._stands_alone = torch.zeros(self.model.nv, dtype=torch.bool).index_put((self._columns,), alone)
         return self.model
 
