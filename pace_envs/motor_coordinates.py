@@ -232,15 +232,17 @@ class MotorCoordinates:
     damping and friction, which the motors' tendons carry.
     """
 
-    def __init__(self, sim: Simulation, driven: DrivenJoints, shared: Rows):
+    def __init__(self, sim: Simulation, driven: DrivenJoints, shared: Rows, *, continuous: bool):
         """Look up the columns.
 
         Args:
             sim: The simulation.
             driven: What the drives move.
             shared: Drives of a joint whose torque acts on joints that follow it too, such as a gripper's other finger,
-                {joint: {joint: ratio}}; Σ ratio q is the joint's own position where they follow. What such a drive
-                carries stays on its joint.
+                {joint: {joint: ratio}}; Σ ratio q is the joint's own position where they follow. Armature and friction
+                of such a drive stay on its joint, as model files have them.
+            continuous: Whether loops run continuously: the damping of such drives is that of their loops, which acts
+                on all their joints.
 
         Raises:
             ValueError: If a motor's joints lie on different branches of the model.
@@ -261,16 +263,17 @@ class MotorCoordinates:
         self.matrix, self.inverse = sim.tensor(matrix), sim.tensor(np.linalg.inv(matrix))
         at = [driven.joints.index(joint) for joint in dict.fromkeys(moved)]
         self._driven = sim.tensor(driven.inverse[np.ix_(at, at)])
-        self.tendons = torch.tensor([model.tendon(name).id for name in coupled], dtype=torch.long, device=device)
-        on_tendons = [int(model.joint(joint).dofadr[0]) for joint in coupled.values()]
-        self.carriers = torch.tensor(on_tendons, dtype=torch.long, device=device)
-        """Column of each motor whose tendon carries something."""
-        self.own = {field: sim.tensor(getattr(model, f"dof_{field}"))[self.carriers] for field in CARRIED_FIELDS}
-        """What the joints in these columns have beside their motors, by field."""
-
-    def own_inertia_and_damping(self) -> tuple[np.ndarray, np.ndarray]:
-        """Armature [kg m²] and damping [N m s/rad] that joints have beside their motors, in ``carriers``' columns."""
-        return self.own["armature"].numpy(), self.own["damping"].numpy()
+        own = {field: sim.tensor(getattr(model, f"dof_{field}")) for field in CARRIED_FIELDS}
+        self.carried = {field: _Carried.of(model, coupled, own[field]) for field in CARRIED_FIELDS}
+        """What motors' tendons carry in place of the joints in whose columns they stand, by field."""
+        share = np.eye(len(joints))
+        for joint, row in shared.items():
+            if continuous and min(row.values()) >= 0:
+                share[:, joints.index(joint)] = [row.get(each, 0.0) for each in joints]
+        self._share, self._gather = sim.tensor(share), sim.tensor(np.linalg.inv(share))
+        if shared:  # what the file gives the first joint is its drive's
+            damping = sim.expand("dof_damping")
+            damping[:, self.columns] = damping[:, self.columns] @ self._share.T
 
     def to_joints(self) -> None:
         """Turn motors' coordinates, torques and what they carry into those of joints: before MuJoCo computes."""
@@ -278,10 +281,12 @@ class MotorCoordinates:
         sim.qpos[:, self.places] = sim.qpos[:, self.places] @ self.inverse.T
         sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ self.inverse.T
         sim.qfrc_applied[:, self.columns] = sim.qfrc_applied[:, self.columns] @ self.matrix
-        for field, own in self.own.items():
+        for field, carried in self.carried.items():
             of_joints = sim.expand(f"dof_{field}")
-            sim.expand(f"tendon_{field}")[:, self.tendons] = of_joints[:, self.carriers]
-            of_joints[:, self.carriers] = own
+            sim.expand(f"tendon_{field}")[:, carried.tendons] = of_joints[:, carried.columns]
+            of_joints[:, carried.columns] = carried.own
+        damping = sim.expand("dof_damping")
+        damping[:, self.columns] = damping[:, self.columns] @ self._share.T
 
     def to_motors(self) -> None:
         """Turn them back."""
@@ -289,10 +294,12 @@ class MotorCoordinates:
         sim.qpos[:, self.places] = sim.qpos[:, self.places] @ self.matrix.T
         sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ self.matrix.T
         sim.qfrc_applied[:, self.columns] = sim.qfrc_applied[:, self.columns] @ self.inverse
-        for field in self.own:
-            of_tendons = sim.expand(f"tendon_{field}")
-            sim.expand(f"dof_{field}")[:, self.carriers] = of_tendons[:, self.tendons]
-            of_tendons[:, self.tendons] = 0.0
+        damping = sim.expand("dof_damping")
+        damping[:, self.columns] = damping[:, self.columns] @ self._gather.T
+        for field, carried in self.carried.items():
+            of_tendons, of_joints = sim.expand(f"tendon_{field}"), sim.expand(f"dof_{field}")
+            of_joints[:, carried.columns] = of_tendons[:, carried.tendons]
+            of_tendons[:, carried.tendons] = 0.0
 
     def of_driven(self, values: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
         """Positions (..., nq) or speeds (..., nv) of driven joints, whatever the joints that follow them do.
@@ -327,21 +334,45 @@ class MotorCoordinates:
 
     def c_source(self) -> str:
         """C functions ``to_joints`` and ``to_motors``, which do the same to a model and its data."""
-        n, t = len(self.places), len(self.tendons)
-        tables = {"P": self.places.tolist(), "W": self.columns.tolist(), "T": self.tendons.tolist() or [0]}
-        tables |= {"K": self.carriers.tolist() or [0]}
-        lines = [f"static const int {name}[] = {{{', '.join(map(str, each))}}};" for name, each in tables.items()]
-        numbers = {"R": self.matrix, "I": self.inverse} | {f"own_{field}": each for field, each in self.own.items()}
-        for name, each in numbers.items():
-            text = ", ".join(repr(float(value)) for value in each.flatten().tolist() or [0.0])
-            lines.append(f"static const double {name}[] = {{{text}}};")
-        there = "\n    ".join(
-            f"m->tendon_{f}[T[k]] = m->dof_{f}[K[k]]; m->dof_{f}[K[k]] = own_{f}[k];" for f in self.own
+        n, there, back = len(self.places), [], []
+        tables: dict[str, torch.Tensor] = {"P": self.places, "W": self.columns, "R": self.matrix, "I": self.inverse}
+        tables |= {"S": self._share, "G": self._gather}
+        for field, carried in self.carried.items():
+            if count := len(carried.own):
+                tables |= {f"T_{field}": carried.tendons, f"K_{field}": carried.columns, f"own_{field}": carried.own}
+                of_tendon, of_joint = f"m->tendon_{field}[T_{field}[k]]", f"m->dof_{field}[K_{field}[k]]"
+                loop = f"for (int k = 0; k < {count}; ++k)"
+                there.append(f"{loop} {{ {of_tendon} = {of_joint}; {of_joint} = own_{field}[k]; }}")
+                back.append(f"{loop} {{ {of_joint} = {of_tendon}; {of_tendon} = 0.0; }}")
+        written = {name: ", ".join(map(repr, table.flatten().tolist())) for name, table in tables.items()}
+        kinds = {name: "double" if table.is_floating_point() else "int" for name, table in tables.items()}
+        lines = [f"static const {kinds[name]} {name}[] = {{{text}}};" for name, text in written.items()]
+        return "\n".join([*lines, _TURN.format(n=n, there="\n  ".join(there), back="\n  ".join(back))])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Carried:
+    """Where a field of motors is while MuJoCo computes, and otherwise."""
+
+    tendons: torch.Tensor
+    """The motors' tendons."""
+    columns: torch.Tensor
+    """The columns of the joints in whose place the motors stand."""
+    own: torch.Tensor
+    """What these joints have beside their motors."""
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joints: Mapping[str, str], own: torch.Tensor) -> _Carried:
+        """Of tendons and the joints in whose columns their motors stand."""
+        tendons = [model.tendon(name).id for name in joints]
+        columns = torch.tensor([int(model.joint(joint).dofadr[0]) for joint in joints.values()], dtype=torch.long)
+        columns = columns.to(own.device)
+        return cls(
+            tendons=torch.tensor(tendons, dtype=torch.long, device=own.device), columns=columns, own=own[columns]
         )
-        back = "\n    ".join(f"m->dof_{f}[K[k]] = m->tendon_{f}[T[k]]; m->tendon_{f}[T[k]] = 0.0;" for f in self.own)
-        return (
-            "\n".join(lines)
-            + f"""
+
+
+_TURN = """
 static void turn(double* values, const int* place, const double* by, int transposed) {{
   double before[{n}];
   for (int i = 0; i < {n}; ++i) before[i] = values[place[i]];
@@ -353,18 +384,15 @@ static void turn(double* values, const int* place, const double* by, int transpo
 }}
 static void to_joints(mjModel* m, mjData* d) {{
   turn(d->qpos, P, I, 0); turn(d->qvel, W, I, 0); turn(d->qfrc_applied, W, R, 1);
-  for (int k = 0; k < {t}; ++k) {{
-    {there}
-  }}
+  {there}
+  turn(m->dof_damping, W, S, 0);
 }}
 static void to_motors(mjModel* m, mjData* d) {{
   turn(d->qpos, P, R, 0); turn(d->qvel, W, R, 0); turn(d->qfrc_applied, W, I, 1); turn(d->qfrc_bias, W, I, 1);
-  for (int k = 0; k < {t}; ++k) {{
-    {back}
-  }}
+  turn(m->dof_damping, W, G, 0);
+  {back}
 }}
 """
-        )
 
 
 def _turned(values: torch.Tensor, columns: torch.Tensor, by: torch.Tensor) -> torch.Tensor:

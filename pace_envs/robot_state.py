@@ -165,7 +165,8 @@ class RobotState:
         self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
         if layout.driven.are_coupled or cfg.couplings:
             shared = {name: row for name, row in cfg.couplings.items() if name in layout.driven.joints}
-            sim.couple(MotorCoordinates(sim, layout.driven, shared))
+            continuous = any(drive.implicit for drive in cfg.actuators.values())
+            sim.couple(MotorCoordinates(sim, layout.driven, shared, continuous=continuous))
         self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
 
     @property

@@ -114,8 +114,8 @@ class Links:
         turn = env.sim.coordinates
         for model in models:
             model.dof_armature[columns] = model.dof_damping[columns] = 0.0
-            if turn is not None:
-                model.dof_armature[turn.carriers], model.dof_damping[turn.carriers] = turn.own_inertia_and_damping()
+            for field, carried in ({} if turn is None else turn.carried).items():
+                getattr(model, f"dof_{field}")[carried.columns] = carried.own
         return cls(models=models, columns=columns, loops=robot.closed_loops, coordinates=env.sim.coordinates)
 
     def feel(self, motion: Motion) -> JointLoad:
