@@ -253,7 +253,7 @@ class MotorCoordinates:
             _refuse_branches(model, name, driven.joints_of(name))
         rows = {joint: driven.row_of(name) for name, joint in coupled.items()} | {n: shared[n] for n in shared}
         moved = [joint for name in coupled for joint in driven.joints_of(name)]
-        joints = list(dict.fromkeys([*moved, *(joint for row in rows.values() for joint in row)]))
+        joints = list(dict.fromkeys([*moved, *(joint for row in shared.values() for joint in row)]))
         matrix = np.array([[rows.get(j, {j: 1.0}).get(k, 0.0) for k in joints] for j in joints])
         self._sim, device = sim, sim.device
         self.places, self.columns = (
@@ -270,8 +270,9 @@ class MotorCoordinates:
         for joint, row in shared.items():
             if continuous and min(row.values()) >= 0:
                 share[:, joints.index(joint)] = [row.get(each, 0.0) for each in joints]
+        self._shares = bool((share != np.eye(len(joints))).any())
         self._share, self._gather = sim.tensor(share), sim.tensor(np.linalg.inv(share))
-        if shared:  # what the file gives the first joint is its drive's
+        if self._shares:  # what the file gives the first joint is its drive's
             damping = sim.expand("dof_damping")
             damping[:, self.columns] = damping[:, self.columns] @ self._share.T
 
@@ -285,17 +286,19 @@ class MotorCoordinates:
             of_joints = sim.expand(f"dof_{field}")
             sim.expand(f"tendon_{field}")[:, carried.tendons] = of_joints[:, carried.columns]
             of_joints[:, carried.columns] = carried.own
-        damping = sim.expand("dof_damping")
-        damping[:, self.columns] = damping[:, self.columns] @ self._share.T
+        if self._shares:
+            damping = sim.expand("dof_damping")
+            damping[:, self.columns] = damping[:, self.columns] @ self._share.T
 
     def to_motors(self) -> None:
         """Turn them back."""
         sim = self._sim
         sim.qpos[:, self.places] = sim.qpos[:, self.places] @ self.matrix.T
         sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ self.matrix.T
+        if self._shares:
+            damping = sim.expand("dof_damping")
+            damping[:, self.columns] = damping[:, self.columns] @ self._gather.T
         sim.qfrc_applied[:, self.columns] = sim.qfrc_applied[:, self.columns] @ self.inverse
-        damping = sim.expand("dof_damping")
-        damping[:, self.columns] = damping[:, self.columns] @ self._gather.T
         for field, carried in self.carried.items():
             of_tendons, of_joints = sim.expand(f"tendon_{field}"), sim.expand(f"dof_{field}")
             of_joints[:, carried.columns] = of_tendons[:, carried.tendons]
@@ -336,7 +339,10 @@ class MotorCoordinates:
         """C functions ``to_joints`` and ``to_motors``, which do the same to a model and its data."""
         n, there, back = len(self.places), [], []
         tables: dict[str, torch.Tensor] = {"P": self.places, "W": self.columns, "R": self.matrix, "I": self.inverse}
-        tables |= {"S": self._share, "G": self._gather}
+        if self._shares:
+            tables |= {"S": self._share, "G": self._gather}
+            there.append("turn(m->dof_damping, W, S, 0);")
+            back.append("turn(m->dof_damping, W, G, 0);")
         for field, carried in self.carried.items():
             if count := len(carried.own):
                 tables |= {f"T_{field}": carried.tendons, f"K_{field}": carried.columns, f"own_{field}": carried.own}
@@ -385,12 +391,10 @@ static void turn(double* values, const int* place, const double* by, int transpo
 static void to_joints(mjModel* m, mjData* d) {{
   turn(d->qpos, P, I, 0); turn(d->qvel, W, I, 0); turn(d->qfrc_applied, W, R, 1);
   {there}
-  turn(m->dof_damping, W, S, 0);
 }}
 static void to_motors(mjModel* m, mjData* d) {{
-  turn(d->qpos, P, R, 0); turn(d->qvel, W, R, 0); turn(d->qfrc_applied, W, I, 1); turn(d->qfrc_bias, W, I, 1);
-  turn(m->dof_damping, W, G, 0);
   {back}
+  turn(d->qpos, P, R, 0); turn(d->qvel, W, R, 0); turn(d->qfrc_applied, W, I, 1); turn(d->qfrc_bias, W, I, 1);
 }}
 """
 

@@ -163,8 +163,8 @@ class RobotState:
                 sim.qvel[:, v + 3 : v + 6],
             )
         self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
-        if layout.driven.are_coupled or cfg.couplings:
-            shared = {name: row for name, row in cfg.couplings.items() if name in layout.driven.joints}
+        if sim.turns_motors and (layout.driven.are_coupled or cfg.couplings):
+            shared = {name: row for name, row in cfg.couplings.items() if name in row and name in self.joint_names}
             continuous = any(drive.implicit for drive in cfg.actuators.values())
             sim.couple(MotorCoordinates(sim, layout.driven, shared, continuous=continuous))
         self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])

@@ -120,6 +120,8 @@ class Simulation:
 
     dtype = torch.float64
     version = 0
+    turns_motors = True
+    """Whether motors that move several joints are to be told from these: MuJoCo moves the joints."""
     batch: Any
 
     @property

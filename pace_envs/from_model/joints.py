@@ -88,8 +88,9 @@ def joint_facts(
     result = []
     for i, (name, place) in enumerate(zip(names, places, strict=True)):
         drive = drives.get(name)
-        effort = drive.effort_limit if drive else _joint_effort_limit(model, place.id)
-        carrier, at = ("dof", dofs[i]) if name == place.name else ("tendon", model.tendon(name).id)
+        is_joint = name == place.name
+        effort = drive.effort_limit if drive else _joint_effort_limit(model, place.id) if is_joint else np.inf
+        carrier, at = ("dof", dofs[i]) if is_joint else ("tendon", model.tendon(name).id)
         armature, viscous, friction = (
             float(getattr(model, f"{carrier}_{field}")[at]) for field in ("armature", "damping", "frictionloss")
         )

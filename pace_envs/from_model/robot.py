@@ -230,7 +230,16 @@ def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous
 
 
 def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
-    """Joints to drive where the file has no actuators: those that it names, else all that follow no other."""
+    """What to drive where the file has no actuators: joints that it names, else all that follow no other; motors."""
+    motors = {} if file.urdf is None else file.urdf.motors
+    result = _joints_to_drive(model, file)
+    for motor, row in motors.items():
+        if motor not in result and (place := next((joint for joint in row if joint in result), "")):
+            result[result.index(place)] = motor
+    return result
+
+
+def _joints_to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
     if file.urdf is not None and file.urdf.driven:
         return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

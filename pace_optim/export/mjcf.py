@@ -18,8 +18,9 @@ from pace_actuators.effects.fading_friction import SoftFriction
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
-from pace_envs.model_file import missing_files, read_model_file
-from pace_envs.motor_coordinates import add_motors
+from pace_envs.model_file import compile_model, missing_files, read_model_file
+from pace_envs.motor_coordinates import DrivenJoints, add_motors
+from pace_envs.robot_spec import load_robot_spec
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
 
@@ -76,6 +77,16 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def motors_of(drives: IdentifiedDrives) -> dict[str, dict[str, float]]:
+    """The drives that move several joints together, {motor: {joint: ratio}}; none where the robot is not known."""
+    try:
+        robot = load_identified_cfg(drives).scene.robot
+        driven = DrivenJoints.of_model(compile_model(load_robot_spec(robot), robot.mjcf_path), drives.joint_names)
+    except ValueError:
+        return {}
+    return {name: driven.row_of(name) for name in driven.names if name not in driven.joints}
 
 
 def _in_plain_steps(

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import Effect
-from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
 from pace_optim.joints.simulation.path import ReferencePath
 
@@ -25,6 +24,7 @@ class TwinSimulation(Simulation):
     """
 
     is_trapezoidal = True
+    turns_motors = False
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int, path: ReferencePath):
         """Set up the state.
@@ -103,9 +103,6 @@ class TwinSimulation(Simulation):
         result = torch.zeros_like(self.qvel)
         result[:, self._columns] = load.neg_().view(len(result), -1)
         return result
-
-    def couple(self, coordinates: MotorCoordinates) -> None:
-        """Nothing: what motors feel is on the path."""
 
     def move_base(self, motion: torch.Tensor | None, point: np.ndarray | None = None) -> None:
         """Nothing: what joints feel of it is on the path."""
