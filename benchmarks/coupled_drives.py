@@ -70,9 +70,13 @@ CASES = (
         kd=0.2,
         limit=6.0,
         amplitude=0.35,
-        truth={"armature": (2e-3, 3e-3), "viscous_friction": (0.06, 0.05), "friction": (0.05, 0.04),
-               "encoder_bias": (0.01, -0.015)},
-    ),  # fmt: skip
+        truth={
+            "armature": (2e-3, 3e-3),
+            "viscous_friction": (0.06, 0.05),
+            "friction": (0.05, 0.04),
+            "encoder_bias": (0.01, -0.015),
+        },
+    ),
     Case(
         name="two_motor_ankle",
         bodies="""
@@ -86,9 +90,13 @@ CASES = (
         kd=0.5,
         limit=25.0,
         amplitude=0.2,
-        truth={"armature": (4e-3, 5e-3), "viscous_friction": (0.12, 0.15), "friction": (0.15, 0.1),
-               "encoder_bias": (-0.01, 0.012)},
-    ),  # fmt: skip
+        truth={
+            "armature": (4e-3, 5e-3),
+            "viscous_friction": (0.12, 0.15),
+            "friction": (0.15, 0.1),
+            "encoder_bias": (-0.01, 0.012),
+        },
+    ),
     Case(
         name="belt",
         bodies="""
@@ -102,9 +110,13 @@ CASES = (
         kd=0.8,
         limit=20.0,
         amplitude=0.3,
-        truth={"armature": (8e-3, 6e-3), "viscous_friction": (0.2, 0.15), "friction": (0.2, 0.1),
-               "encoder_bias": (0.01, -0.02)},
-    ),  # fmt: skip
+        truth={
+            "armature": (8e-3, 6e-3),
+            "viscous_friction": (0.2, 0.15),
+            "friction": (0.2, 0.1),
+            "encoder_bias": (0.01, -0.02),
+        },
+    ),
 )
 
 
@@ -213,7 +225,9 @@ def _fitted(run: Path) -> np.ndarray:
 
 def main() -> None:
     """Print the table."""
-    print("| robot | armature | viscous friction | friction | delay | error [mrad], fitted / held out | exported MJCF |")
+    print(
+        "| robot | armature | viscous friction | friction | delay | error [mrad], fitted / held out | exported MJCF |"
+    )
     print("|---|---|---|---|---|---|---|")
     for case in CASES:
         with tempfile.TemporaryDirectory() as folder:

@@ -416,5 +416,5 @@ def _refuse_branches(model: mujoco.MjModel, motor: str, joints: Sequence[str]) -
         raise ValueError(
             f"The motor {motor} moves {listed(joints)}, which lie on different branches of the model: MuJoCo has no "
             "inertia between them, so nothing carries the motor's armature. Tie them with <equality><joint/>"
-            "</equality>, or model each branch with a drive of its own."
+            "</equality>, or model each branch with a separate drive."
         )

@@ -12,6 +12,7 @@ import torch
 
 from pace_actuators import resolve_joint_values
 from pace_actuators.joint_units import JointType
+from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
@@ -167,6 +168,12 @@ class RobotState:
             shared = {name: row for name, row in cfg.couplings.items() if name in row and name in self.joint_names}
             continuous = any(drive.implicit for drive in cfg.actuators.values())
             sim.couple(MotorCoordinates(sim, layout.driven, shared, continuous=continuous))
+        elif layout.driven.are_coupled:
+            motors = [name for name in layout.driven.names if name not in layout.driven.joints]
+            raise ValueError(
+                f"The motors {listed(motors)} move several joints together, which is simulated on the processor alone. "
+                'Use sim.device = "cpu" (--device cpu).'
+            )
         self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
 
     @property

@@ -121,7 +121,7 @@ class Simulation:
     dtype = torch.float64
     version = 0
     turns_motors = True
-    """Whether motors that move several joints are to be told from these: MuJoCo moves the joints."""
+    """Whether it can hold the coordinates of motors that move several joints."""
     batch: Any
 
     @property

@@ -37,6 +37,7 @@ class WarpSimulation(Simulation):
     """
 
     dtype = torch.float32
+    turns_motors = False
     data: Any
     warp_model: Any
 
@@ -68,8 +69,7 @@ class WarpSimulation(Simulation):
         """
         self.update_constants()
         if env_ids is None or not self._bound <= _AFTER_RESETS.union(_STATE):
-            with self._in_joints():
-                self._run("forward")
+            self._run("forward")
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put the state of all or some simulations back to the model's."""
@@ -147,8 +147,7 @@ class WarpSimulation(Simulation):
             return
         for field in _DERIVED:
             self.expand(field)
-        with self._in_joints():
-            self._run("set_const")
+        self._run("set_const")
 
     def _run(self, name: str) -> None:
         """Queue a step, a forward pass or the constants on torch's current stream."""
