@@ -56,7 +56,7 @@ def main() -> None:
         nargs="+",
         default=[],
         metavar="REGEX",
-        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia with some of these",
+        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia,load with some of these",
     )
     parser.add_argument(
         "--unknown",
