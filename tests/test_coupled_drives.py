@@ -208,6 +208,25 @@ def test_a_gripper_s_tendon_pulls_both_fingers(tmp_path):
     assert both < 3e-4 and both < 0.2 * first
 
 
+def test_an_exported_gripper_s_servo_pulls_both_fingers(tmp_path):
+    (tmp_path / "hand.xml").write_text(FINGERS)
+    values = {"armature": 0.004, "viscous_friction": 0.01, "friction": 0.02, "encoder_bias": 0.01}
+    content = {
+        "version": 1, "task": str(tmp_path / "hand.xml"), "joint_names": ["left"], "effects": [], "std": {},
+        "delay_mode": "command", "physics_dt": 5e-4, "control_dt": 1e-3, "delay_s": 0.0,
+        "parameters": {name: {"left": value} for name, value in values.items()} | {"delay": {"all": 0.0}},
+        "drive": {"stiffness": {"left": 4.0}, "damping": {"left": 0.1}},
+    }  # fmt: skip
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    model = mujoco.MjModel.from_xml_string(export(tmp_path / "result.json", "mjcf").text)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5
+    mujoco.mj_forward(model, data)
+    assert model.nu == 1 and data.actuator_length[0] == pytest.approx(-0.01)  # what the encoder shows at 0
+    assert data.qfrc_actuator == pytest.approx([1.02, 1.02])
+    assert "the drive of left pulls right too" in " ".join(export(tmp_path / "result.json", "newton").notes)
+
+
 def test_motors_that_do_not_determine_their_joints_are_refused(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(WRIST.xml().replace('coef="-1.0"', 'coef="1.0"'))

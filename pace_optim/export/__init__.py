@@ -12,7 +12,7 @@ from pace_actuators.files import write_atomically
 from pace_actuators.text import listed
 from pace_envs.link_inertia import NAMES
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
-from pace_optim.export.mjcf import mjcf, motors_of
+from pace_optim.export.mjcf import mjcf, motors_of, pulled_notes
 from pace_optim.export.mjlab_native import mjlab_native_python
 from pace_optim.export.newton import newton_python
 
@@ -94,4 +94,6 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
             "the format mjcf, whose tendons carry them, or json."
         )
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
+    if fmt in _OF_JOINTS:
+        notes = [*notes, *pulled_notes(drives)]
     return Export(text=text, notes=notes)

@@ -79,6 +79,20 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     return _with_comment(spec, notes, drives, joints_only), notes
 
 
+def pulled_notes(drives: IdentifiedDrives) -> list[str]:
+    """Which drives pull joints that follow theirs, which a drive of a joint does not, in words."""
+    try:
+        couplings = load_identified_cfg(drives).scene.robot.couplings
+    except ValueError:
+        return []
+    return [
+        f"the drive of {name} pulls {listed([joint for joint in row if joint != name])} too: not held; here the drive "
+        "moves its joint, and the others follow."
+        for name, row in couplings.items()
+        if name in row and name in drives.joint_names
+    ]
+
+
 def motors_of(drives: IdentifiedDrives) -> dict[str, dict[str, float]]:
     """The drives that move several joints together, {motor: {joint: ratio}}; none where the robot is not known."""
     try:

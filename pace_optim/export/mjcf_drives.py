@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from pace_envs.from_model.couplings import followed_ratio
 from pace_envs.motor_coordinates import DrivenJoints, Rows
 from pace_optim.export.plain_drive import PlainDrive
 
@@ -45,7 +46,7 @@ def write_drives(
     spec.option.integrator = _integrator(drives)
     notes += _rate_notes(drives, dt)
     keys = [key for key in spec.keys if len(key.ctrl)]
-    _shift_encoders(spec, drives, notes)
+    _shift_encoders(spec, drives, notes, couplings or {})
     for name, drive in drives.items():
         joints = {joint.name for joint in spec.joints}
         row = (couplings or {}).get(name, {}) if name in joints else {}
@@ -117,14 +118,18 @@ def _write(actuator: mujoco.MjsActuator, drive: PlainDrive, dt: float) -> None:
         actuator.delay, actuator.nsample = 0.0, 0
 
 
-def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str]) -> None:
-    """Let joint positions be what the encoders show: q - bias."""
+def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str], couplings: Rows) -> None:
+    """Let joint positions be what the encoders show: q - bias; joints that follow a drive's move with it."""
     if not any(drive.encoder_bias for drive in drives.values()):
         return
     model = spec.compile()
     driven = DrivenJoints.of_model(model, list(drives))
     of_joints = driven.to_joints(np.array([drive.encoder_bias for drive in drives.values()]))
     shifted = {name: bias for name, bias in zip(driven.joints, of_joints.tolist(), strict=True) if bias}
+    for name, row in couplings.items():
+        if bias := shifted.get(name):
+            follow = {j: followed_ratio(model, model.joint(j).id, model.joint(name).id) for j in row}
+            shifted |= {joint: ratio[0] * bias for joint, ratio in follow.items() if ratio is not None}
     addresses = {name: int(model.joint(name).qposadr[0]) for name in shifted} if spec.keys else {}
     for name, bias in shifted.items():
         joint = spec.joint(name)
