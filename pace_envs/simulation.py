@@ -276,7 +276,7 @@ class Simulation:
         turns = torch.as_tensor(self.model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
         pull = -(axis * turned).sum(dim=-1) * turns
         if self.coordinates is not None:
-            pull = pull @ self._joints_per_motor[columns][:, columns].square()
+            pull = pull @ self._joints_per_motor[columns][:, columns].square()  # each joint alone
         return inertia, pull, inertia * self._stands_alone[columns]
 
     @cached_property

@@ -100,6 +100,37 @@ def test_motors_move_as_tendons_of_plain_mujoco(case, tmp_path):
     assert apart < 1e-8
 
 
+def test_what_a_motor_carries_is_that_of_its_joints_at_the_motor(tmp_path):
+    """Inertia R⁻ᵀ M R⁻¹ without armature, R⁻ᵀ times the torque of the load, and its slope over the motor's angle."""
+    case, place = coupled_drives.CASES[1], np.array([0.1, -0.1])
+    path = tmp_path / "robot.xml"
+    path.write_text(case.xml())
+    cfg = cfg_from_model(path, 1e-3)
+    cfg.scene.num_envs = 1
+    env = ManagerBasedRLEnv(cfg)
+    robot, inverse = env.scene["robot"], np.linalg.inv(rows_of(case))
+    robot.write_base_parameter_to_sim("armature", torch.tensor([case.truth["armature"]]).double())
+    robot.write_joint_state_to_sim(torch.tensor(place)[None], torch.zeros(1, 2))
+    robot.load_effort  # noqa: B018 (MuJoCo computes what is bound)
+    env.sim.forward()
+    inertia, stiffness, _ = (each[0].numpy() for each in env.sim.felt_link(robot.dof_columns))
+    load = robot.load_effort[0].numpy()
+    env.close()
+    model = mujoco.MjModel.from_xml_string(case.xml())
+    data, mass = mujoco.MjData(model), np.zeros((2, 2))
+
+    def weight(at):
+        data.qpos[:] = inverse @ at
+        mujoco.mj_forward(model, data)
+        return inverse.T @ data.qfrc_bias
+
+    slopes = [(weight(place + step) - weight(place - step)) / 2e-5 for step in 1e-5 * np.eye(2)]
+    assert load == pytest.approx(-weight(place), abs=1e-9)
+    mujoco.mj_fullM(model, data, mass)
+    assert inertia == pytest.approx(np.diag(inverse.T @ mass @ inverse), abs=1e-9)
+    assert stiffness == pytest.approx(np.diag(slopes), rel=1e-3)  # of each joint alone
+
+
 def test_the_plant_moves_as_the_true_parameters_say(wrist):
     shown, measured = shown_by(wrist.problem, wrist.truth), wrist.problem.dataset.measured
     error = shown - torch.tensor(WRIST.truth["encoder_bias"]) - measured[:, 0]
