@@ -248,7 +248,7 @@ def main() -> None:
         for label in args.labels:
             if label == "links" and not case.link:
                 continue
-            parts = {"mass": "mass", "com": "com", "tool": "mass,com,inertia"}.get(case.kind)
+            parts = {"mass": "mass", "com": "com", "tool": "load"}.get(case.kind)
             options = ["--links", f"{case.link}@{parts}"] if label == "links" else []
             row = run_case(case, options, label, label == "file", args.cache)
             rows = [r for r in rows if (r["robot"], r["case"], r["label"]) != (case.robot, case.name, label)] + [row]

@@ -35,7 +35,7 @@ class Articulation(RobotState):
             ValueError: If names in the configuration do not fit the model.
         """
         super().__init__(cfg, sim)
-        self._links = LinkInertias(sim, self.joint_names)
+        self._links = LinkInertias(sim, self._layout.driven.joints)
         self._columns: dict[PaceDCMotor, torch.Tensor] = {}
         self._build_actuators()
         self.reset()
@@ -286,9 +286,7 @@ class Articulation(RobotState):
 
     def _build_actuators(self) -> None:
         n = self.num_joints
-        model_values = {
-            name: self._sim.tensor(getattr(self._sim.model, _field(name)))[self._layout.dof_columns] for name in CARRIED
-        }
+        model_values = {name: self._sim.expand(_field(name))[0, self._layout.dof_columns] for name in CARRIED}
         self.actuators: dict[str, PaceDCMotor] = {}
         owner: dict[str, str] = {}
         for group, cfg in self.cfg.actuators.items():

@@ -60,6 +60,12 @@ class ArticulationCfg(Config):
     joint_order: tuple[str, ...] | None = None
     """Order of the joints in every tensor, and which of them are used; ``None`` means the model's order."""
 
+    couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Motors that move several joints, ``{motor: {joint: ratio}}``: a motor's position is Σ ratio q_joint, and its
+    torque acts on each of these joints by its ratio. ``joint_order`` and the drives name motors in place of their
+    joints. Motors that are fixed tendons of the model file need no entry. A joint in place of a motor: its drive pulls
+    joints that follow it too."""
+
     fix_base: bool | None = None
     """Whether the base is held in place or floats; ``None``: as in the file."""
 

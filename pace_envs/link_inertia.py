@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from pace_actuators.drive_result import LinkInertia
+from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.quaternions import multiply
 from pace_envs.simulation import Simulation
 
@@ -39,17 +40,24 @@ PARTS: dict[str, tuple[str, ...]] = {
         "link_shear_13",
         "link_shear_23",
     ),
+    "load": ("link_load_mass", "link_load_x", "link_load_y", "link_load_z"),
 }
 """What can be wrong with a link, and the parameters of each, in the order of every vector."""
+OF_BODY = ("mass", "com", "inertia")
+"""Those of the link itself: its ten inertial parameters. The load is a point mass beside it, such as a tool."""
 NAMES = tuple(name for names in PARTS.values() for name in names)
-"""All ten."""
-UNITS = dict(zip(NAMES, ("kg", *["m"] * 6, *["1"] * 3), strict=True))
+"""All fourteen."""
+TEN = tuple(name for part in OF_BODY for name in PARTS[part])
+"""Those of the link itself."""
+UNITS = dict(zip(NAMES, ("kg", *["m"] * 6, *["1"] * 3, "kg", *["m"] * 3), strict=True))
 """Unit by name."""
 POSITIVE = (PARTS["mass"][0], *PARTS["inertia"][:3])
 """Those above 0: their prior is one of their logarithm."""
 MASS_FACTOR, RADIUS_FACTOR, SHEAR, LEAST_REACH = 2.0, 1.5, 0.3, 0.03
 """The prior's standard deviation: mass and radii by these factors, shears by this. That of the centre of mass is the
 link's largest radius of gyration in the file, at least this [m]: a tool on a small flange moves it far."""
+LOAD_START, LOAD_REACH = 0.25, 4.0
+"""Where a load is sought first, in parts of the link's mass at its centre, and how far, in bounds of that centre."""
 PRIOR = 0.25
 """The same as part of half a bound range: bounds are four standard deviations from the file's value."""
 _THINNEST = 0.01
@@ -69,11 +77,11 @@ class Reference:
     """Of :data:`NAMES`."""
     axes: tuple[tuple[float, ...], ...]
     """Principal axes as columns, in the body's frame."""
-    names: tuple[str, ...] = NAMES
+    names: tuple[str, ...] = TEN
     """Those of its parameters that are free."""
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, link: str, joint: str = "", names: Sequence[str] = NAMES) -> Reference:
+    def of(cls, model: mujoco.MjModel, link: str, joint: str = "", names: Sequence[str] = TEN) -> Reference:
         """A body of a compiled model.
 
         Raises:
@@ -90,21 +98,31 @@ class Reference:
         radii = np.maximum(radii, _THINNEST * radii.max())
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[b])
-        values = (mass, *model.body_ipos[b].tolist(), *radii.tolist(), 0.0, 0.0, 0.0)
+        com = model.body_ipos[b].tolist()
+        values = (mass, *com, *radii.tolist(), 0.0, 0.0, 0.0, 0.0, *com)
         return cls(link=link, joint=joint, values=values, axes=_rows(turn.reshape(3, 3)), names=tuple(names))
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """Between which values one of its parameters is sought: four standard deviations of the prior."""
+        """Between which values one of its parameters is sought: four standard deviations of a prior."""
         value, far = self.values[NAMES.index(name)], 1 / PRIOR
+        if name == PARTS["load"][0]:
+            return 0.0, self.values[0] * MASS_FACTOR**far
+        if name in PARTS["load"]:
+            reach = LOAD_REACH * far * max(LEAST_REACH, *self.values[4:7])
+            return value - reach, value + reach
         if name in POSITIVE:
             factor = (MASS_FACTOR if name == POSITIVE[0] else RADIUS_FACTOR) ** far
             return value / factor, value * factor
         reach = far * (max(LEAST_REACH, *self.values[4:7]) if name in PARTS["com"] else SHEAR)
         return value - reach, value + reach
 
+    def start(self, name: str) -> float:
+        """Where the search of one of its parameters begins: in the file's value, and with some load."""
+        return LOAD_START * self.values[0] if name == PARTS["load"][0] else self.values[NAMES.index(name)]
+
     def pseudo_inertia(self, values: torch.Tensor) -> torch.Tensor:
-        """J of parameters (…, 10), (…, 4, 4)."""
-        mass, com, radii, shear = values.split((1, 3, 3, 3), dim=-1)
+        """J of parameters (…, 14), (…, 4, 4)."""
+        mass, com, radii, shear, load, place = values.split((1, 3, 3, 3, 1, 3), dim=-1)
         first, second = (torch.as_tensor(self.values[4 + i], dtype=values.dtype, device=values.device) for i in (0, 1))
         root = torch.diag_embed(radii)
         root[..., 0, 1], root[..., 0, 2], root[..., 1, 2] = (
@@ -116,7 +134,7 @@ class Reference:
         upper = torch.cat([root, com[..., None]], dim=-1)
         lower = torch.cat([torch.zeros_like(com), torch.ones_like(mass)], dim=-1)
         root = torch.cat([upper, lower[..., None, :]], dim=-2)
-        return mass[..., None] * (root @ root.transpose(-1, -2))
+        return mass[..., None] * (root @ root.transpose(-1, -2)) + _point(load[..., 0], place)
 
     def inertia(self, parameters: Mapping[str, float]) -> LinkInertia:
         """The link with some of its parameters, by name; the others are the file's."""
@@ -165,7 +183,7 @@ class LinkInertias:
 
         Args:
             sim: The simulation.
-            joint_names: The joints, in the order of the articulation.
+            joint_names: The joints, in the order of the articulation; for a motor that moves several, one of these.
         """
         self.sim = sim
         self._loads: dict[int, torch.Tensor] = {}
@@ -212,8 +230,8 @@ class LinkInertias:
         self._remember()
         body = self.sim.model.body(reference.link).id
         if body not in self._parameters:
-            ten = self._zeros(len(NAMES))
-            self._parameters[body] = reference, ten + ten.new_tensor(reference.values)
+            every = self._zeros(len(NAMES))
+            self._parameters[body] = reference, every + every.new_tensor(reference.values)
         self._parameters[body][1][:, NAMES.index(name)] = values.double()
         self._write(slice(None), body)
 
@@ -324,9 +342,9 @@ class Link:
 
 
 def _point(mass: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """J of point masses (n,) at places (n, 3), (n, 4, 4)."""
-    at = torch.cat([place, torch.ones_like(place[:, :1])], dim=1)
-    return mass[:, None, None] * at[:, :, None] * at[:, None, :]
+    """J of point masses (…,) at places (…, 3), (…, 4, 4)."""
+    at = torch.cat([place, torch.ones_like(place[..., :1])], dim=-1)
+    return mass[..., None, None] * at[..., :, None] * at[..., None, :]
 
 
 def _pseudo_inertia(fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -403,11 +421,11 @@ def moved_by(model: mujoco.MjModel, link: str, joints: Sequence[str]) -> str | N
         link: A body's name.
         joints: The driven joints.
     """
-    b = model.body(link).id
+    b, driven = model.body(link).id, DrivenJoints.of_model(model, joints)
     while b > 0:
         own = range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])
         for j in reversed(own):
-            if model.joint(j).name in joints:
-                return model.joint(j).name
+            if (joint := model.joint(j).name) in driven.joints:
+                return driven.names[driven.joints.index(joint)]
         b = int(model.body_parentid[b])
     return None

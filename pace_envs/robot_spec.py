@@ -13,6 +13,7 @@ from pace_actuators import match_names
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.link_inertia import write_links
 from pace_envs.model_file import compile_model, read_model_file
+from pace_envs.motor_coordinates import DrivenJoints, add_motors, fixed_tendon
 
 
 def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.MjSpec:
@@ -27,6 +28,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
     """
     file = read_model_file(cfg.mjcf_path, touches=touches)
     spec = file.spec
+    add_motors(spec, cfg.couplings, cfg.mjcf_path)
     model = compile_model(spec, cfg.mjcf_path)  # a fault of the file is told with its name
     if touches:
         for note in file.notes:
@@ -42,8 +44,27 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
     elif cfg.fix_base is False and not free:
         _let_float(spec, cfg)
     if cfg.held_joints:
-        hold_joints(spec, model, cfg.held_joints)
+        hold_joints(spec, model, _of_joints(model, cfg.held_joints))
     return spec
+
+
+def _of_joints(model: mujoco.MjModel, positions: Mapping[str, float]) -> dict[str, float]:
+    """Where joints are held, with those of motors in place of the motors' own positions.
+
+    Raises:
+        ValueError: If some motors of a group are held, and others are not.
+    """
+    motors = [name for name in positions if fixed_tendon(model, name) is not None]
+    if not motors:
+        return dict(positions)
+    try:
+        driven = DrivenJoints.of_model(model, list(positions))
+    except ValueError as error:
+        raise ValueError(
+            f"Motors that move joints together are held together, or none of them (--joints): {error}"
+        ) from None
+    places = driven.to_joints(np.array(list(positions.values())))
+    return dict(zip(driven.joints, places.tolist(), strict=True))
 
 
 def find_geoms(spec: mujoco.MjSpec, expressions: str | tuple[str, ...]) -> list[mujoco.MjsGeom]:

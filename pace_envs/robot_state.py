@@ -12,10 +12,12 @@ import torch
 
 from pace_actuators import resolve_joint_values
 from pace_actuators.joint_units import JointType
+from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
+from pace_envs.motor_coordinates import DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
 from pace_envs.quaternions import multiply, rotate_inverse
 from pace_envs.simulation import Simulation
 
@@ -32,6 +34,8 @@ class JointLayout:
     """Column of each joint in ``qvel`` and all that belongs to degrees of freedom, (num_joints,)."""
     root: tuple[int, int] | None
     """First columns of a floating base in ``qpos`` and ``qvel``; ``None`` for a fixed one."""
+    driven: DrivenJoints
+    """The joints that they are, or that motors among them move."""
     passive_names: tuple[str, ...] = ()
     """Hinge and slide joints of the model that are not among them: they move as their loads and loops do."""
     passive_columns: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
@@ -49,7 +53,7 @@ class JointLayout:
 
         Args:
             model: The model.
-            joint_order: Their order; ``None`` means the model's.
+            joint_order: Their order, and motors that move several joints; ``None`` means the model's joints.
             path: The model's file, for messages.
             device: Device of the columns.
 
@@ -68,17 +72,19 @@ class JointLayout:
         if not single:
             raise ValueError(f"The model {path} has no joints to drive.")
         order = joint_order or tuple(single)
-        unknown = [name for name in order if name not in single]
+        unknown = [name for name in order if name not in single and fixed_tendon(model, name) is None]
         if unknown or len(set(order)) != len(order):
             wrong = f"names unknown joints: {', '.join(unknown)}" if unknown else "names a joint twice"
             raise ValueError(f"joint_order {wrong}. Joints of the model {path}: {', '.join(single)}.")
-        ids = [single[name] for name in order]
-        passive = {name: j for name, j in single.items() if name not in order}
+        driven = DrivenJoints.of_model(model, order)
+        ids = [single[name] for name in driven.joints]
+        passive = {name: j for name, j in single.items() if name not in driven.joints}
         return cls(
             joint_names=tuple(order),
             qpos_columns=torch.tensor([int(model.jnt_qposadr[j]) for j in ids], device=device),
             dof_columns=torch.tensor([int(model.jnt_dofadr[j]) for j in ids], device=device),
             root=root,
+            driven=driven,
             passive_names=tuple(passive),
             passive_columns=torch.tensor(
                 [int(model.jnt_qposadr[j]) for j in passive.values()], dtype=torch.long, device=device
@@ -132,11 +138,7 @@ class RobotState:
         self.body_names = [sim.model.body(i).name for i in self._body_ids]
         n, device, dtype = self.num_joints, sim.device, sim.dtype
         init = cfg.init_state
-        limits = torch.full((n, 2), torch.inf, dtype=dtype, device=device)
-        limits[:, 0] = -torch.inf
-        for i, name in enumerate(self.joint_names):
-            if sim.model.joint(name).limited[0]:
-                limits[i] = sim.tensor(sim.model.joint(name).range)
+        limits = sim.tensor(layout.driven.range_of_motors(joint_ranges(sim.model, layout.driven.joints)))
         middle = limits.mean(dim=1, keepdim=True).nan_to_num(0.0)
         zeros = torch.zeros(sim.num_envs, n, dtype=dtype, device=device)
         default_pos, self._passive_pos = self._initial_positions()
@@ -162,6 +164,16 @@ class RobotState:
                 sim.qvel[:, v + 3 : v + 6],
             )
         self._loops = ClosedLoops.of_model(sim.model, layout.dof_columns.tolist())
+        if sim.turns_motors and (layout.driven.are_coupled or cfg.couplings):
+            shared = {name: row for name, row in cfg.couplings.items() if name in row and name in self.joint_names}
+            continuous = any(drive.implicit for drive in cfg.actuators.values())
+            sim.couple(MotorCoordinates(sim, layout.driven, shared, continuous=continuous))
+        elif layout.driven.are_coupled:
+            motors = [name for name in layout.driven.names if name not in layout.driven.joints]
+            raise ValueError(
+                f"The motors {listed(motors)} move several joints together, which is simulated on the processor alone. "
+                'Use sim.device = "cpu" (--device cpu).'
+            )
         self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
 
     @property
@@ -185,11 +197,20 @@ class RobotState:
         return self._layout.root is None
 
     @property
+    def driven(self) -> DrivenJoints:
+        """What the drives move: joints, or joints through a constant matrix."""
+        return self._layout.driven
+
+    @property
     def slide_joints(self) -> tuple[str, ...]:
         """Those of the joints that slide."""
-        model = self._sim.model
+        model, driven = self._sim.model, self._layout.driven
         slide = mujoco.mjtJoint.mjJNT_SLIDE
-        return tuple(name for name in self.joint_names if int(model.joint(name).type[0]) == slide)
+        return tuple(
+            name
+            for name in self.joint_names
+            if all(int(model.joint(joint).type[0]) == slide for joint in driven.joints_of(name))
+        )
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
@@ -297,8 +318,15 @@ class RobotState:
         self._write(self._sim.qvel, self._layout.dof_columns, velocity, joint_ids, env_ids, "the velocity")
         if self._loops is not None:
             rows = slice(None) if env_ids is None else self._sim.resolve_env_ids(env_ids)
-            self._sim.qpos[rows], self._sim.qvel[rows] = self._loops.closed(self._sim.qpos[rows], self._sim.qvel[rows])
+            self._sim.qpos[rows], self._sim.qvel[rows] = self._closed(self._sim.qpos[rows], self._sim.qvel[rows])
         self._refresh()
+
+    def _closed(self, qpos: torch.Tensor, qvel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Postures and speeds whose passive joints close the loops; those of drives stay."""
+        if self._loops is None or (turn := self._sim.coordinates) is None:
+            return (qpos, qvel) if self._loops is None else self._loops.closed(qpos, qvel)
+        qpos, qvel = self._loops.closed(turn.of_driven(qpos, turn.places), turn.of_driven(qvel, turn.columns))
+        return turn.positions_of_motors(qpos), turn.speeds_of_motors(qvel)
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write a floating base's state, (len(env_ids), 13) or broadcastable.

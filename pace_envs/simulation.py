@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
+from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
 from pace_envs.quaternions import from_rotation_vector, multiply
@@ -118,6 +120,8 @@ class Simulation:
 
     dtype = torch.float64
     version = 0
+    turns_motors = True
+    """Whether it can hold the coordinates of motors that move several joints."""
     batch: Any
 
     @property
@@ -157,11 +161,28 @@ class Simulation:
         self._link_fields: dict[str, torch.Tensor] = {}
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
         self._frame: _Frame | None = None
+        self.coordinates: MotorCoordinates | None = None
+
+    def couple(self, coordinates: MotorCoordinates) -> None:
+        """Let state, torques and what drives leave to the model be those of motors in the columns of their joints."""
+        self.coordinates = coordinates
+        coordinates.to_motors()
+
+    @contextmanager
+    def _in_joints(self) -> Iterator[None]:
+        """MuJoCo's own coordinates for a while."""
+        if self.coordinates is None:
+            yield
+            return
+        self.coordinates.to_joints()
+        yield
+        self.coordinates.to_motors()
 
     @property
     def qfrc_bias(self) -> torch.Tensor:
         """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m]."""
-        return self._own_bias if self._frame is None or self._frame.bias is None else self._frame.bias
+        bias = self._own_bias if self._frame is None or self._frame.bias is None else self._frame.bias
+        return bias if self.coordinates is None else self.coordinates.efforts_of_motors(bias)
 
     @cached_property
     def _own_bias(self) -> torch.Tensor:
@@ -244,13 +265,33 @@ class Simulation:
             self.forward()
         fields = self._link_fields
         _, entries, joints, bodies, gravity = self._link_place(columns)
-        diagonal = fields["M"][:, entries]
+        if self.coordinates is None:
+            diagonal = fields["M"][:, entries]
+        else:
+            diagonal = fields["M"] @ self._motor_inertias[:, columns]
         inertia = (diagonal - self.expand("dof_armature")[:, columns]).clamp(min=0.0)
         axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
         weight = self.expand("body_subtreemass")[:, bodies, None] * gravity
         turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
         turns = torch.as_tensor(self.model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
-        return inertia, -(axis * turned).sum(dim=-1) * turns, inertia * self._stands_alone[columns]
+        pull = -(axis * turned).sum(dim=-1) * turns
+        if self.coordinates is not None:
+            pull = pull @ self._joints_per_motor[columns][:, columns].square()  # each joint alone
+        return inertia, pull, inertia * self._stands_alone[columns]
+
+    @cached_property
+    def _joints_per_motor(self) -> torch.Tensor:
+        """R⁻¹ of all degrees of freedom, (nv, nv)."""
+        every = torch.eye(self.model.nv, dtype=self.dtype, device=self.device)
+        return every if self.coordinates is None else self.coordinates.speeds_of_joints(every).T
+
+    @cached_property
+    def _motor_inertias(self) -> torch.Tensor:
+        """Of each entry of M, what it counts in the inertia at each coordinate, diag(R⁻ᵀ M R⁻¹), (nM, nv)."""
+        turn = self._joints_per_motor
+        rows = torch.as_tensor(np.repeat(np.arange(self.model.nv), self.model.M_rownnz)).long()
+        columns = torch.as_tensor(self.model.M_colind).long()
+        return turn[rows] * turn[columns] * torch.where(rows == columns, 1.0, 2.0)[:, None]
 
     def _link_place(self, columns: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Where the fields of degrees of freedom are: entries of M, joints, bodies, and gravity; looked up once."""
@@ -282,7 +323,8 @@ class Simulation:
         """Advance every simulation by one physics step."""
         self.update_constants()
         if self._drift is None:
-            self._step()
+            with self._in_joints():
+                self._step()
         else:
             self._leap(self._drift)
 
@@ -307,7 +349,8 @@ class Simulation:
         damping *= 0.5
         self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
         drift(self.qpos, self.qvel, 0.5 * h)
-        self._step()
+        with self._in_joints():
+            self._step()
         drift(self.qpos, self.qvel, -0.5 * h)
         damping.copy_(whole)
         self.qfrc_applied.copy_(applied)
@@ -315,7 +358,8 @@ class Simulation:
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
         self.update_constants()
-        self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
+        with self._in_joints():
+            self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put the state of all or some simulations back to the model's (positions, speeds, forces, time)."""
@@ -369,7 +413,8 @@ class Simulation:
         self.batch = None
 
     def _update_constants(self) -> None:
-        self.batch.set_const()
+        with self._in_joints():
+            self.batch.set_const()
         self._constants_changed = False
 
     def _find_device(self) -> torch.device:
@@ -404,9 +449,9 @@ class Simulation:
         for body in spec.bodies[1:]:
             body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
         timeconst, impedance = self.cfg.friction_timeconst, self.cfg.friction_impedance
-        for joint in spec.joints:
-            joint.solref_friction = [2 * self.cfg.dt if timeconst is None else timeconst, 1.0]
-            joint.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
+        for element in [*spec.joints, *spec.tendons]:
+            element.solref_friction = [2 * self.cfg.dt if timeconst is None else timeconst, 1.0]
+            element.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
         try:
             return spec.compile()
         except ValueError as error:

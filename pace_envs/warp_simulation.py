@@ -37,6 +37,7 @@ class WarpSimulation(Simulation):
     """
 
     dtype = torch.float32
+    turns_motors = False
     data: Any
     warp_model: Any
 

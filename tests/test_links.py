@@ -212,6 +212,22 @@ def test_a_wrong_mass_and_centre_are_found(tmp_path):
     assert std["link_com_y"]["fore"] == pytest.approx(0.25 * (link.bounds("link_com_y")[1] - 0.01), rel=0.02)
 
 
+def test_a_tool_s_mass_and_place_are_found(tmp_path):
+    """Five times as heavy as the link that it is on, and off its centre."""
+    tool = Load(added_mass={"tool": 0.5}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
+    recording = dataclasses.replace(recorded(tmp_path, {}, tool), load=Load())
+    problem = make_problem(recording, cfg=arm_cfg(tmp_path, ["tool@load"]))
+    x, uncertainty = fit(problem, held=("armature", "viscous_friction", "friction", "delay"))
+    found = {name: each["tool"] for name, each in problem.space.to_dict(problem.space.to_physical(x)).items()
+             if name.startswith("link")}  # fmt: skip
+    assert found["link_load_mass"] == pytest.approx(0.5, rel=0.01)
+    assert found["link_load_x"] == pytest.approx(0.03, abs=1e-3)
+    assert found["link_load_z"] == pytest.approx(-0.08, abs=1e-3)
+    assert "link_load_y/tool" in undetermined(problem, x, uncertainty)  # along the axes of both joints
+    whole = problem.env_cfg.sim2real.links[0].inertia(found)
+    assert whole.mass == pytest.approx(0.6, rel=0.01) and whole.com[2] == pytest.approx(-0.08 * 0.5 / 0.6, rel=0.02)
+
+
 def test_links_that_a_problem_holds_act_on_joints_alone_too(tmp_path):
     link = reference("fore").inertia({"link_mass": 1.6})
     problem = make_problem(recorded(tmp_path, {"fore": link}), cfg=arm_cfg(tmp_path))

@@ -110,7 +110,7 @@ def test_what_ties_joints_together_does_not_keep_them_from_being_taken_out(legs)
           <sensor><jointpos joint="LF_HFE"/><tendonpos tendon="t"/></sensor>
           <actuator><motor joint="LF_HFE"/><motor tendon="t"/></actuator>
         </mujoco>""")
-    path = replace(legs.twins.path.on_joints([0]), columns=torch.tensor([1]))
+    path = replace(legs.twins.path.on_joints([0]), columns=torch.tensor([1]), names=("LF_KFE",))
     sim = TwinSimulation(SimulationCfg(), spec, legs.twins.dataset.num_recordings, path)
     assert [sim.model.joint(j).name for j in range(sim.model.njnt)] == ["LF_KFE"]
     assert not bool(sim._stands_alone.any())  # in the robot it follows another

@@ -117,6 +117,7 @@ class RobotKernel:
             robot._layout.dof_columns,
             robot.num_joints,
             mujoco.mj_versionString(),
+            self._env.sim.coordinates,
         )
         series = [commands(self._env, self._dataset, name).double() for name in self._source.series]
         self._series = torch.stack(series).contiguous() if series else torch.zeros(1, dtype=torch.float64)

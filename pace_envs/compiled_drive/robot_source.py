@@ -12,6 +12,7 @@ from pace_envs.compiled_drive.robot import STATE, WRITTEN, DriveProgram
 from pace_envs.compiled_drive.source import Names, changing_nodes, needed_nodes
 from pace_envs.compiled_drive.tape import Node, NotTraceableError
 from pace_envs.kernels.expressions import PRELUDE
+from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import COLUMNS, SOURCE
 
 ARGUMENTS = {
@@ -70,7 +71,12 @@ class RobotSource:
 
 
 def robot_source(
-    programs: Sequence[DriveProgram], qpos: torch.Tensor, dof: torch.Tensor, num_joints: int, version: str
+    programs: Sequence[DriveProgram],
+    qpos: torch.Tensor,
+    dof: torch.Tensor,
+    num_joints: int,
+    version: str,
+    coordinates: MotorCoordinates | None = None,
 ) -> RobotSource:
     """C of all drives of a robot.
 
@@ -80,7 +86,10 @@ def robot_source(
         dof: Where its speed is, (n,).
         num_joints: Of a recording.
         version: MuJoCo's, whose structures are used.
+        coordinates: Of motors that move several joints; ``None``: there are none.
     """
+    turns = "" if coordinates is None else coordinates.c_source()
+    there, back = ("to_joints(m, d);", "to_motors(m, d);") if turns else ("", "")
     series = tuple(dict.fromkeys(name for program in programs for name in program.tape.series))
     drives, memory = [], 0
     for i, program in enumerate(programs):
@@ -125,9 +134,12 @@ static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
   }}
 }}
 {SOURCE}
+{turns}
 static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
+  {there}
   if (!a->motion) {{
     a->step(m, d);
+    {back}
     return;
   }}
   double motion[{COLUMNS}];
@@ -136,6 +148,7 @@ static void step(mjModel* m, mjData* d, long long robot, long long k, int part, 
   a->step1(m, d);
   bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
   a->step2(m, d);
+  {back}
 }}
 static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
   if (!a->drift) {{

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import mujoco
 import numpy as np
 
-from pace_envs.from_model.couplings import followed_ratio
+from pace_actuators.text import listed
+from pace_envs.from_model.couplings import followed_ratio, followers
 
 Kind = Literal["position", "velocity", "effort"]
 
@@ -21,7 +22,7 @@ class FileDrive:
     """The drive of a joint as a model file states it: τ = stiffness (q* - q) - damping q̇, within its limits."""
 
     joint: str
-    """The joint."""
+    """The joint; of a motor that moves several, its tendon."""
     kind: Kind
     """What it is commanded by."""
     stiffness: float
@@ -32,6 +33,9 @@ class FileDrive:
     """Largest torque [N m] or force [N]; infinite where the file has none."""
     target_range: tuple[float, float]
     """Range of position targets [rad or m]; infinite where the file has none."""
+    row: Mapping[str, float] = field(default_factory=dict)
+    """The joints that a tendon pulls, {joint: ratio}: of joints that follow the first one such that Σ ratio q is its
+    position. Empty where the drive moves one joint."""
 
 
 def read_drives(model: mujoco.MjModel) -> tuple[list[FileDrive], list[str]]:
@@ -57,7 +61,14 @@ def read_drives(model: mujoco.MjModel) -> tuple[list[FileDrive], list[str]]:
             gears[drive.joint] = float(model.actuator_gear[i, 0])
     order = [model.joint(j).name for j in range(model.njnt)]
     notes += _gear_notes(gears)
-    return [_within_joint_limit(model, found[name]) for name in order if name in found], list(dict.fromkeys(notes))
+    drives = sorted(found.values(), key=lambda drive: min(order.index(joint) for joint in drive.row or [drive.joint]))
+    if motors := [drive.joint for drive in drives if drive.row and drive.joint not in drive.row]:
+        moved = sorted({joint for drive in drives if drive.joint in motors for joint in drive.row}, key=order.index)
+        notes.append(
+            f"motors that move {listed(moved)} together: {listed(motors)}: armature, friction, bias, gains and limits "
+            "are the motors', and their positions are the tendons' lengths"
+        )
+    return [_within_joint_limit(model, drive) for drive in drives], list(dict.fromkeys(notes))
 
 
 def _gear_notes(gears: Mapping[str, float]) -> list[str]:
@@ -75,7 +86,7 @@ def _read(model: mujoco.MjModel, i: int) -> tuple[FileDrive | None, str]:
     place = _transmission(model, i, name)
     if place is None:
         return None, f"The actuator {name} moves no joint (a site, body or slider-crank) and is left out."
-    joint, gear, rest = place
+    joint, gear, rest, row = place
     gain, bias, damping = _law(model, i, name)
     note = _activation_note(model, i)
     limit = _limit(model.actuator_forcerange[i]) if model.actuator_forcelimited[i] else np.inf
@@ -100,30 +111,34 @@ def _read(model: mujoco.MjModel, i: int) -> tuple[FileDrive | None, str]:
         damping=float(damping) * gear**2,
         effort_limit=float(limit) * abs(gear),
         target_range=target,
+        row=row,
     )
     return drive, note
 
 
-def _transmission(model: mujoco.MjModel, i: int, name: str) -> tuple[str, float, float] | None:
-    """Joint, gear G and rest length L0 of an actuator, L = G q + L0; ``None`` where no joint is moved directly."""
-    kind, gear = int(model.actuator_trntype[i]), float(model.actuator_gear[i, 0])
+def _transmission(model: mujoco.MjModel, i: int, name: str) -> tuple[str, float, float, dict[str, float]] | None:
+    """Joint or motor, gear G and rest length L0 of an actuator, L = G q + L0, and the joints that a tendon pulls.
+
+    ``None`` where no joint is moved directly.
+    """
+    kind, gear, row = int(model.actuator_trntype[i]), float(model.actuator_gear[i, 0]), dict[str, float]()
     target = int(model.actuator_trnid[i, 0])
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
         if int(model.jnt_type[target]) not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             return None
         joint, ratio, rest = model.joint(target).name, gear, 0.0
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-        joint, ratio, rest = _through_tendon(model, target, name)
+        joint, ratio, rest, row = _through_tendon(model, target, name)
         ratio, rest = ratio * gear, rest * gear
     else:
         return None
     if ratio == 0:
         return None
-    return joint, ratio, rest
+    return joint, ratio, rest, row
 
 
-def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str, float, float]:
-    """A tendon as a gear on the first of its joints, where the others follow that one."""
+def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str, float, float, dict[str, float]]:
+    """A tendon as a gear on the first of its joints, where the others follow that one, else as a motor of its own."""
     label = model.tendon(tendon).name or f"number {tendon}"
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
     wraps = range(first, first + count)
@@ -132,20 +147,26 @@ def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str,
             f"The actuator {name} pulls the spatial tendon {label}, whose lever arm changes with the posture: no drive "
             f"here follows that. Give each joint an actuator, or remove this one: see {_REFERENCE}."
         )
-    joints = [int(model.wrap_objid[w]) for w in wraps]
-    ratio, rest = 0.0, 0.0
-    for w, joint in zip(wraps, joints, strict=True):
-        follows = followed_ratio(model, joint, joints[0])
-        if follows is None:
+    row: dict[int, float] = {}
+    for w in wraps:
+        joint = int(model.wrap_objid[w])
+        row[joint] = row.get(joint, 0.0) + float(model.wrap_prm[w])
+    names = {joint: model.joint(joint).name for joint in row}
+    follow = {joint: followed_ratio(model, joint, next(iter(row))) for joint in row}
+    tied = {joint: each for joint, each in follow.items() if each is not None}
+    if len(tied) < len(row):
+        if len(tied) > 1 or followers(model) & set(row) or not model.tendon(tendon).name:
             raise ValueError(
-                f"The actuator {name} pulls the tendon {label} over {model.joint(joint).name} and "
-                f"{model.joint(joints[0]).name}, which can move against each other: one drive cannot be assigned to "
-                f"one of them. Tie them with <equality><joint/></equality>, or give each its own actuator: see "
-                f"{_REFERENCE}."
+                f"The actuator {name} pulls the tendon {label} over {listed(list(names.values()))}: a motor of several "
+                "joints needs a tendon with a name, over joints that follow no other. Name it, and take joints that "
+                f"<equality><joint/></equality> ties to others out of it: see {_REFERENCE}."
             )
-        ratio += float(model.wrap_prm[w]) * follows[0]
-        rest += float(model.wrap_prm[w]) * follows[1]
-    return model.joint(joints[0]).name, ratio, rest
+        return label, 1.0, 0.0, {names[joint]: ratio for joint, ratio in row.items()}
+    ratio = sum(row[joint] * of_first for joint, (of_first, _) in tied.items())
+    rest = sum(row[joint] * offset for joint, (_, offset) in tied.items())
+    shares = len(row) > 1 and ratio and not rest
+    pulls = {names[joint]: each / ratio for joint, each in row.items()} if shares else {}
+    return names[next(iter(row))], ratio, rest, pulls
 
 
 def _law(model: mujoco.MjModel, i: int, name: str) -> tuple[float, np.ndarray, float]:
@@ -194,6 +215,8 @@ def _both(one: FileDrive, other: FileDrive) -> FileDrive:
 
 
 def _within_joint_limit(model: mujoco.MjModel, drive: FileDrive) -> FileDrive:
+    if drive.row and drive.joint not in drive.row:
+        return drive
     joint = model.joint(drive.joint)
     if not int(model.jnt_actfrclimited[joint.id]):
         return drive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import FileDrive, Kind
+from pace_envs.motor_coordinates import DrivenJoints, joint_ranges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +19,9 @@ class JointFacts:
     """A driven joint; of a slide, lengths [m] stand for angles and forces [N] for torques."""
 
     name: str
-    """Its name."""
+    """Its name; of a motor that moves several joints, its tendon's."""
+    joints: tuple[str, ...]
+    """The joints that its drive moves."""
     is_slide: bool
     """Whether it slides."""
     inertia: float
@@ -67,30 +71,42 @@ def joint_facts(
         velocity_limits: Largest speeds by joint, where known.
         command: What joints without a drive in the file are commanded by, where known.
     """
-    data = mujoco.MjData(model)
+    driven = DrivenJoints.of_model(model, names)
+    places = [model.joint(joint) for joint in driven.joints]
+    dofs, turn = [int(place.dofadr[0]) for place in places], driven.inverse
+    own = copy.copy(model)  # without what drives leave to the simulation
+    driven.clear(own)
+    data = mujoco.MjData(own)
     data.qpos[:] = home
-    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(own, data)
     mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
+    mujoco.mj_fullM(own, data, mass)
+    inertia = np.diag(turn.T @ mass[np.ix_(dofs, dofs)] @ turn)
+    gravity = driven.efforts_of_motors((data.qfrc_bias - data.qfrc_gravcomp)[dofs])
+    limits = driven.range_within(joint_ranges(model, driven.joints), home[[int(place.qposadr[0]) for place in places]])
+    at_home = driven.to_motors(home[[int(place.qposadr[0]) for place in places]])
     result = []
-    for name in names:
-        joint = model.joint(name)
-        j, dof = joint.id, int(model.jnt_dofadr[joint.id])
-        limited = bool(model.jnt_limited[j])
+    for i, (name, place) in enumerate(zip(names, places, strict=True)):
         drive = drives.get(name)
-        effort = drive.effort_limit if drive else _joint_effort_limit(model, j)
-        armature = float(model.dof_armature[dof])
+        is_joint = name == place.name
+        effort = drive.effort_limit if drive else _joint_effort_limit(model, place.id) if is_joint else np.inf
+        carrier, at = ("dof", dofs[i]) if is_joint else ("tendon", model.tendon(name).id)
+        armature, viscous, friction = (
+            float(getattr(model, f"{carrier}_{field}")[at]) for field in ("armature", "damping", "frictionloss")
+        )
+        slides = [int(model.joint(joint).type[0]) == mujoco.mjtJoint.mjJNT_SLIDE for joint in driven.joints_of(name)]
         result.append(
             JointFacts(
                 name=name,
-                is_slide=int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_SLIDE,
-                inertia=max(float(mass[dof, dof]) - armature, 0.0),
-                gravity=abs(float(data.qfrc_bias[dof] - data.qfrc_gravcomp[dof])),
+                joints=driven.joints_of(name),
+                is_slide=all(slides),
+                inertia=max(float(inertia[i]), 0.0),
+                gravity=abs(float(gravity[i])),
                 armature=armature,
-                viscous_friction=float(model.dof_damping[dof]),
-                friction=float(model.dof_frictionloss[dof]),
-                range=tuple(model.jnt_range[j].tolist()) if limited else (-np.inf, np.inf),
-                home=float(home[model.jnt_qposadr[j]]),
+                viscous_friction=viscous,
+                friction=friction,
+                range=(float(limits[i, 0]), float(limits[i, 1])),
+                home=float(at_home[i]),
                 drive=drive,
                 command=drive.kind if drive else _KINDS.get(command.get(name, ""), "position"),
                 velocity_limit=velocity_limits.get(name, np.inf),

@@ -32,6 +32,7 @@ from pace_envs.from_model.scaling import (
     start_values,
 )
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
+from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -76,7 +77,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
     if not names:
         raise ValueError(f"The model {path} has no hinge or slide joint that a drive could move.")
     home, key = home_posture(model)
-    home = at_rest(model, home, names)
+    home = at_rest(model, home, DrivenJoints.of_model(model, names).joints)
     stated = {drive.joint: drive for drive in drives}
     velocity, command = ({}, {}) if file.urdf is None else (file.urdf.velocity_limits, file.urdf.command)
     joints = joint_facts(model, home, names, stated, velocity, command)
@@ -90,7 +91,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
             *_degrees_note(joints, file),
             *file.notes,
             *notes,
-            *_beside_drives(model, names),
+            *_beside_drives(model, [name for joint in joints for name in joint.joints]),
             *_assumptions(joints, key, model, control_dt),
             _loop_note(joints, model, control_dt),
         ),
@@ -126,6 +127,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
+        couplings={joint.name: dict(joint.drive.row) for joint in joints if joint.drive and joint.drive.row},
     )
     bounds = {name: [base_bounds(joint)[name] for joint in joints] for name in PER_JOINT}
     moves = [motion(joint) for joint in joints]
@@ -195,8 +197,12 @@ def _on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> InitialSt
     ground = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, -depth])
     model = spec.compile()
     data = mujoco.MjData(model)
+    driven = DrivenJoints.of_model(model, robot.joint_order or ())
+    positions = driven.to_joints(np.array([stance.get(re.escape(name), 0.0) for name in driven.names]))
+    of_joints = dict(zip(driven.joints, positions.tolist(), strict=True))
     for j in range(model.njnt):
-        data.qpos[model.jnt_qposadr[j]] = stance.get(re.escape(model.joint(j).name), 0.0)
+        name = model.joint(j).name
+        data.qpos[model.jnt_qposadr[j]] = of_joints.get(name, stance.get(re.escape(name), 0.0))
     mujoco.mj_kinematics(model, data)
     colliding = model.geom_contype | model.geom_conaffinity
     own = [g for g in range(model.ngeom) if colliding[g] and model.geom_bodyid[g]]
@@ -224,7 +230,16 @@ def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous
 
 
 def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
-    """Joints to drive where the file has no actuators: those that it names, else all that follow no other."""
+    """What to drive where the file has no actuators: joints that it names, else all that follow no other; motors."""
+    motors = {} if file.urdf is None else file.urdf.motors
+    result = _joints_to_drive(model, file)
+    for motor, row in motors.items():
+        if motor not in result and (place := next((joint for joint in row if joint in result), "")):
+            result[result.index(place)] = motor
+    return result
+
+
+def _joints_to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
     if file.urdf is not None and file.urdf.driven:
         return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -243,14 +258,15 @@ def _base_pose(robot: Robot) -> tuple[tuple[float, float, float], tuple[float, f
 
 
 def _home_positions(robot: Robot) -> dict[str, float]:
-    """Positions of the hinge and slide joints at home, by name, where they are not 0."""
-    model, result = robot.model, {}
+    """Positions at home, by name, where they are not 0: of drives, and of the hinge and slide joints without."""
+    model = robot.model
+    driven = {joint for facts in robot.joints for joint in facts.joints}
+    result = {facts.name: facts.home for facts in robot.joints}
     for j in range(model.njnt):
-        if int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            value = float(robot.home[model.jnt_qposadr[j]])
-            if value:
-                result[re.escape(model.joint(j).name)] = value
-    return result
+        single = int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        if single and model.joint(j).name not in driven:
+            result[model.joint(j).name] = float(robot.home[model.jnt_qposadr[j]])
+    return {re.escape(name): value for name, value in result.items() if value}
 
 
 def _gravity(model: mujoco.MjModel) -> tuple[float, float, float]:

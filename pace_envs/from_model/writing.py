@@ -71,6 +71,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
         ),
         actuators={"drives": drives},
         joint_order=names,
+        couplings=_COUPLINGS_,
     )
     bounds = {
         "armature": [(1e-5 * a, a) for a in column(6)],
@@ -158,6 +159,7 @@ def configuration_text(
             "_MODEL_": os.path.relpath(Path(model).resolve(), Path(output).resolve().parent),
             "_POSITION_": tuple(robot.init_state.pos),
             "_ROTATION_": tuple(robot.init_state.rot),
+            "_COUPLINGS_": {motor: dict(row) for motor, row in robot.couplings.items()},
             "_STEP_": _number(cfg.sim.dt),
             "_INTEGRATOR_": cfg.sim.integrator,
             "_STEPS_": sim2real.physics_steps,
@@ -169,7 +171,7 @@ def configuration_text(
             "_TASK_": task,
         },
     )
-    return text, task, cfg
+    return text.replace("        couplings={},\n", ""), task, cfg
 
 
 def _of(values: object, i: int) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from pace_envs.model_file.limits import check_limits
 from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
 from pace_envs.model_file.urdf import UrdfFacts, read_urdf
+from pace_envs.motor_coordinates import add_motors
 from pace_envs.mujoco_warnings import keep_quiet
 
 MODEL_SUFFIXES = (".xml", ".urdf", ".mjcf")
@@ -118,6 +119,7 @@ def _write_urdf_facts(spec: mujoco.MjSpec, facts: UrdfFacts) -> None:
         equality.data = [mimic.offset, mimic.multiplier, *[0.0] * (len(equality.data) - 2)]
         equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
         equality.solref, equality.solimp = [0.005, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+    add_motors(spec, facts.motors, facts.name)
     for body in spec.bodies:
         if not body.explicitinertial:
             for geom in body.geoms:

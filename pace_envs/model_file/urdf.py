@@ -61,6 +61,8 @@ class UrdfFacts:
     mimics: tuple[Mimic, ...]
     driven: tuple[str, ...]
     """Joints that have a transmission or a ros2_control command; empty where the file names none."""
+    motors: Mapping[str, Mapping[str, float]]
+    """Actuators of transmissions that move two joints together, {actuator: {joint: ratio}}, behind their own gears."""
     command: Mapping[str, str]
     """Their command interface, such as ``"velocity"``, where the file names it."""
     notes: tuple[str, ...]
@@ -95,7 +97,8 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
         notes.append(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
-    command = _command_interfaces(root)
+    command, (motors, told) = _command_interfaces(root), _motors(root, path)
+    notes += told
     named = {e.get("name", "") for e in root.iterfind("transmission/joint")} | set(command)
     return UrdfFacts(
         name=root.get("name", ""),
@@ -103,6 +106,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
         velocity_limits=_velocity_limits(root),
         mimics=tuple(_mimics(root)),
         driven=tuple(name for name in moving if name in named),
+        motors=motors,
         command=command,
         notes=tuple(notes),
     )
@@ -310,6 +314,62 @@ def _mimics(root: ElementTree.Element) -> list[Mimic]:
         for name, mimic in found
         if mimic is not None
     ]
+
+
+def _motors(root: ElementTree.Element, path: Path) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Motors of differential and four-bar transmissions of ROS (``transmission_interface``), and notes on them.
+
+    With n the reductions of the joints, and x the motors' positions divided by their own reductions:
+
+        differential:  x₁ = n₁ q₁ + n₂ q₂,  x₂ = n₁ q₁ - n₂ q₂        four-bar linkage:  x₁ = n₁ q₁,  x₂ = q₁ + n₂ q₂
+    """
+    rows: dict[str, dict[str, float]] = {}
+    left_out, joints = [], {joint.get("name", "") for joint in root.findall("joint")}
+    for element in root.iter("transmission"):
+        kind = (element.findtext("type") or element.findtext("plugin") or "").rpartition("/")[2]
+        if kind not in ("DifferentialTransmission", "FourBarLinkageTransmission"):
+            continue
+        name = element.get("name", "")
+        parts = {
+            each.get("role") or each.findtext("role") or "": each
+            for each in [*element.iter("actuator"), *element.iter("joint")]
+        }
+        if missing := [role for role in ("actuator1", "actuator2", "joint1", "joint2") if role not in parts]:
+            raise ValueError(f"{path}: the transmission {name} has no {listed(missing)}. Add it, with its role.")
+        (one, other), (first, second) = (
+            [parts[f"{what}{i}"].get("name", "") for i in (1, 2)] for what in ("actuator", "joint")
+        )
+        one, other = (f"{each}_motor" if each in joints else each for each in (one, other))
+        n, m = (_reduction(parts[f"joint{i}"], path, name) for i in (1, 2))
+        if kind == "DifferentialTransmission":
+            rows |= {one: {first: n, second: m}, other: {first: n, second: -m}}
+        else:
+            rows |= {one: {first: n}, other: {first: 1.0, second: m}}
+        left_out += [
+            f"{parts[role].get('name')}" for role in ("joint1", "joint2") if parts[role].find("offset") is not None
+        ]
+    notes = []
+    if rows:
+        notes.append(
+            f"motors of two joints: {listed(list(rows))}: their positions and torques are those behind their gears"
+        )
+    if left_out:
+        notes.append(
+            f"offsets of transmissions are left out ({listed(left_out, 3)}): the encoder bias takes their place"
+        )
+    return rows, notes
+
+
+def _reduction(element: ElementTree.Element, path: Path, name: str) -> float:
+    """The mechanical reduction of a part of a transmission; 1 where it states none."""
+    text = element.findtext("mechanicalReduction") or element.findtext("mechanical_reduction") or "1"
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or value == 0:
+        raise ValueError(f"{path}: a reduction of the transmission {name} is {text!r}; expected a number. Correct it.")
+    return value
 
 
 def _command_interfaces(root: ElementTree.Element) -> dict[str, str]:

@@ -56,7 +56,8 @@ def main() -> None:
         nargs="+",
         default=[],
         metavar="REGEX",
-        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia with some of these",
+        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia,load with some of "
+        "these; load is a point mass on the link, such as a tool",
     )
     parser.add_argument(
         "--unknown",

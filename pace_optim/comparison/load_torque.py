@@ -10,6 +10,7 @@ import numpy as np
 from scipy import signal
 
 from pace_envs import ManagerBasedEnv
+from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.moving_frame import FrameState, bias_in_frame
 from pace_optim.problem.evaluator import Evaluator
 
@@ -65,6 +66,7 @@ def model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
         getattr(model, name)[:] = env.sim.expand(name)[row].numpy().reshape(getattr(model, name).shape)
     for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
         getattr(model, name)[:] = 0.0
+    env.scene["robot"].driven.clear(model)
     return model
 
 
@@ -81,16 +83,17 @@ def inverse_dynamics(
 
     Args:
         model: The links.
-        joints: Names, (n,).
+        joints: Names, (n,); motors that move several joints among them.
         position: (K, n) [rad].
         speed: (K, n) [rad/s].
         acceleration: (K, n) [rad/s²].
         frame: How the model's frame moves, (K, 9): see :mod:`pace_envs.moving_frame`; ``None``: it rests.
         point: Where its specific force acts, (3,) [m].
     """
-    data = mujoco.MjData(model)
-    qpos = [model.joint(name).qposadr[0] for name in joints]
-    dof = [model.joint(name).dofadr[0] for name in joints]
+    data, driven = mujoco.MjData(model), DrivenJoints.of_model(model, joints)
+    qpos = [model.joint(name).qposadr[0] for name in driven.joints]
+    dof = [model.joint(name).dofadr[0] for name in driven.joints]
+    position, speed, acceleration = (driven.to_joints(each) for each in (position, speed, acceleration))
     torque = np.empty_like(position)
     moves = frame is not None and point is not None
     state = FrameState.empty(model, len(position) if moves else 0)
@@ -101,4 +104,6 @@ def inverse_dynamics(
         if moves:
             torque[k] -= data.qfrc_bias[dof]
             state.keep(k, data)
-    return torque if frame is None or point is None else torque + bias_in_frame(model, state, frame, point)[:, dof]
+    if frame is not None and point is not None:
+        torque = torque + bias_in_frame(model, state, frame, point)[:, dof]
+    return driven.efforts_of_motors(torque)

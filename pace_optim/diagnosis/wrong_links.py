@@ -22,7 +22,7 @@ import torch
 
 from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import effect_cfgs, get_effect
-from pace_envs.link_inertia import NAMES, PARTS, UNITS, Reference
+from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
 from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
 from pace_optim.estimate.derivatives import Colouring, colour, stencil
@@ -34,7 +34,7 @@ from pace_optim.problem.problem import Problem
 
 LOOK_ALIKES = ("torque_gain", "proportional_gain", "parallel_spring", "torque_offset")
 """Effects on one joint that look like a wrong link."""
-_CHOICES = (("mass",), ("com",), ("mass", "com"), tuple(PARTS))
+_CHOICES = (("mass",), ("com",), ("mass", "com"), OF_BODY)
 """What may be wrong with a link, the fewest parameters first."""
 
 
@@ -179,7 +179,7 @@ def _best_addition(
     env.close()
     # what is found stays as the file has it: its parameters begin where the last round left them
     every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
-    whole = problem.seeking(tuple(replace(each, names=NAMES) for each in every))
+    whole = problem.seeking(tuple(replace(each, names=TEN) for each in every))
     values = _values_of(now)
     candidates = _screened(whole, _values_in(whole, values), every, found, cfg)
     fitted: list[tuple[int, _Fitted]] = []

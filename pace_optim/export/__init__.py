@@ -9,9 +9,10 @@ from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.files import write_atomically
+from pace_actuators.text import listed
 from pace_envs.link_inertia import NAMES
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
-from pace_optim.export.mjcf import mjcf
+from pace_optim.export.mjcf import mjcf, motors_of, pulled_notes
 from pace_optim.export.mjlab_native import mjlab_native_python
 from pace_optim.export.newton import newton_python
 
@@ -35,7 +36,7 @@ class Export:
 
 
 def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
-    """Values per joint, what all joints share written out, in SI units."""
+    """Values per joint, what all joints share written out, in SI units; how motors of several joints turn with them."""
     joints = drives.joint_names
     names = [name for name in drives.parameters if name != "delay" and name not in NAMES]
     content = {
@@ -49,6 +50,7 @@ def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         "effects": [effect.label for effect in drives.effects],
         "links": {name: asdict(link) for name, link in drives.links.items()},
         "parameters": {name: drives.determined(name, joints) for name in names},
+        **({"couplings": motors} if (motors := motors_of(drives)) else {}),
     }
     return json.dumps(content, indent=2) + "\n", []
 
@@ -63,6 +65,8 @@ FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
     "json": _json,
 }
 """Format -> what writes it."""
+_OF_JOINTS = ("mjlab", "mjlab_native", "isaaclab", "newton")
+"""Formats of simulators in which a drive is one of a joint."""
 
 
 def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str | None = None) -> Export:
@@ -84,5 +88,12 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
     drives = IdentifiedDrives.load(path)
     if task is not None:
         drives = replace(drives, task=task, environment={})
+    if fmt in _OF_JOINTS and (motors := motors_of(drives)):
+        raise ValueError(
+            f"{fmt} gives each joint a drive, and the motors {listed(list(motors))} move several joints together. Use "
+            "the format mjcf, whose tendons carry them, or json."
+        )
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
+    if fmt in _OF_JOINTS:
+        notes = [*notes, *pulled_notes(drives)]
     return Export(text=text, notes=notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,9 +15,12 @@ from pace_actuators import IdentifiedDrives
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction
+from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
-from pace_envs.model_file import missing_files, read_model_file
+from pace_envs.model_file import compile_model, missing_files, read_model_file
+from pace_envs.motor_coordinates import DrivenJoints, add_motors
+from pace_envs.robot_spec import load_robot_spec
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
 
@@ -42,15 +46,17 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     env = ManagerBasedRLEnv(cfg)
     robot, model = env.scene["robot"], env.sim.model
     spec, left_out = model_of(source)
+    couplings = cfg.scene.robot.couplings
+    add_motors(spec, couplings, source)
     for name, column in zip(robot.joint_names, robot.dof_columns.tolist(), strict=True):
-        joint = spec.joint(name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
+        joint = _carrier(spec, name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
         for parameter in BASE_PARAMETERS.values():
             if parameter.mujoco and not is_undetermined(drives, parameter.name, name):
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.solref_friction = model.dof_solref[column]
         joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
-        joint = spec.joint(name)
+        joint = _carrier(spec, name)
         joint.solref_friction = [time_constant, 1.0]
         joint.solimp_friction = [SoftFriction.impedance, SoftFriction.widest, 0.001, 0.5, 2.0]
     if spec.meshes:
@@ -65,12 +71,36 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         actuators, notes = plain_drives(drives)
         actuators, more = _in_plain_steps(spec, actuators, drives.at.physics_dt)
         notes += more
-        notes += write_drives(spec, actuators, drives.at.physics_dt)
+        notes += write_drives(spec, actuators, drives.at.physics_dt, couplings)
         held += GAIN_EFFECTS
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def pulled_notes(drives: IdentifiedDrives) -> list[str]:
+    """Which drives pull joints that follow theirs, which a drive of a joint does not, in words."""
+    try:
+        couplings = load_identified_cfg(drives).scene.robot.couplings
+    except ValueError:
+        return []
+    return [
+        f"the drive of {name} pulls {listed([joint for joint in row if joint != name])} too: not held; here the drive "
+        "moves its joint, and the others follow."
+        for name, row in couplings.items()
+        if name in row and name in drives.joint_names
+    ]
+
+
+def motors_of(drives: IdentifiedDrives) -> dict[str, dict[str, float]]:
+    """The drives that move several joints together, {motor: {joint: ratio}}; none where the robot is not known."""
+    try:
+        robot = load_identified_cfg(drives).scene.robot
+        driven = DrivenJoints.of_model(compile_model(load_robot_spec(robot), robot.mjcf_path), drives.joint_names)
+    except ValueError:
+        return {}
+    return {name: driven.row_of(name) for name in driven.names if name not in driven.joints}
 
 
 def _in_plain_steps(
@@ -81,8 +111,9 @@ def _in_plain_steps(
     for name, drive in actuators.items():
         if not drive.second_order:
             continue
-        joint = spec.joint(name)
-        result[name], more = drive.for_steps_of(dt, float(np.ravel(joint.damping)[0]))
+        joint = _carrier(spec, name)
+        viscous = float(np.ravel(joint.damping)[0])
+        result[name], more = drive.for_steps_of(dt, viscous if spec.joint(name) else -viscous)  # a tendon's: explicit
         if joint.armature + more < 0 or drive.damping > 0 == result[name].damping:
             least.append(name)
         joint.armature = max(0.0, joint.armature + more)
@@ -95,6 +126,11 @@ def _in_plain_steps(
     if least:
         notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
     return result, notes
+
+
+def _carrier(spec: mujoco.MjSpec, name: str) -> Any:
+    """What carries a drive's armature, damping and friction: its joint, or the tendon of a motor of several."""
+    return spec.joint(name) or spec.tendon(name)
 
 
 def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:
@@ -119,7 +155,7 @@ def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dic
     return {name: value for name, value in values.items() if value > 0}
 
 
-def _set(joint: mujoco.MjsJoint, attribute: str, value: float) -> None:
+def _set(joint: Any, attribute: str, value: float) -> None:
     """Armature, frictionloss, or linear damping: since MuJoCo 3.5 damping is a polynomial."""
     if np.ndim(before := getattr(joint, attribute)):
         setattr(joint, attribute, [value, *[0.0] * (len(before) - 1)])
@@ -164,6 +200,8 @@ def _with_comment(spec: mujoco.MjSpec, notes: list[str], drives: IdentifiedDrive
     except ValueError as error:
         raise ValueError(f"MuJoCo does not take the robot's model with the identified values: {error}") from None
     what = "armature, damping, frictionloss" if joints_only else "joints and drives (actuators)"
+    if motors := [name for name in drives.joint_names if not spec.joint(name)]:
+        notes.append(f"{listed(motors)}: tendons, which carry the motors' armature, damping and frictionloss.")
     lines = [f"Identified with {drives.task}: {what}. Beside that:", *(f"- {note}" for note in notes)]
     if not joints_only:
         lines.append(f"The timestep is the identification's ({1e3 * drives.at.physics_dt:g} ms).")

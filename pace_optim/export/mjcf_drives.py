@@ -16,6 +16,8 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from pace_envs.from_model.couplings import followed_ratio
+from pace_envs.motor_coordinates import DrivenJoints, Rows
 from pace_optim.export.plain_drive import PlainDrive
 
 _LINEAR = 1
@@ -25,13 +27,16 @@ _INPUT = mujoco.mjtCtrlInput
 _OF_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
-def write_drives(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
-    """Give each joint its drive: an actuator that it has is changed in its place, otherwise one is added.
+def write_drives(
+    spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], dt: float, couplings: Rows | None = None
+) -> list[str]:
+    """Give each joint or motor its drive: an actuator that it has is changed in its place, otherwise one is added.
 
     Args:
         spec: The model; it is changed.
-        drives: The drives by joint.
+        drives: The drives by joint, and of motors that move several by their tendon.
         dt: Physics step that they were identified at [s].
+        couplings: Joints whose drives pull joints that follow them too: each gets a tendon with this row.
 
     Returns:
         What the model does not hold, or holds in an unexpected way, in words.
@@ -41,21 +46,39 @@ def write_drives(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], dt: floa
     spec.option.integrator = _integrator(drives)
     notes += _rate_notes(drives, dt)
     keys = [key for key in spec.keys if len(key.ctrl)]
-    _shift_encoders(spec, drives, notes)
+    _shift_encoders(spec, drives, notes, couplings or {})
     for name, drive in drives.items():
-        first, *more = [a for a in spec.actuators if a.target == name and a.trntype in _OF_JOINT] or [None]
+        joints = {joint.name for joint in spec.joints}
+        row = (couplings or {}).get(name, {}) if name in joints else {}
+        kinds = _OF_JOINT if name in joints else (mujoco.mjtTrn.mjTRN_TENDON,)
+        own = [a for a in spec.actuators if a.target == name and a.trntype in kinds]
+        if name in joints:
+            own += [a for a in spec.actuators if _pulled_by(spec, a) == set(row or [name])]
+        first, *more = own or [None]
         for other in more:
             _delete(spec, other, notes)
         if first is None:
             taken = {a.name for a in spec.actuators}
             first = spec.add_actuator(name=name if name not in taken else f"{name}_drive")
-            first.target, first.trntype = name, mujoco.mjtTrn.mjTRN_JOINT
+        first.target, first.trntype = name, kinds[0]
+        if row:
+            tendon = spec.add_tendon(name=f"{name}_drive")
+            for joint, ratio in row.items():
+                tendon.wrap_joint(joint, ratio)
+            first.target, first.trntype = tendon.name, mujoco.mjtTrn.mjTRN_TENDON
         _write(first, drive, dt)
     if keys:
         notes.append("control values of keyframes were those of other actuators: they are left out.")
         for key in keys:
             key.ctrl = []
     return notes
+
+
+def _pulled_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> set[str]:
+    """The joints of an actuator's tendon."""
+    if actuator.trntype != mujoco.mjtTrn.mjTRN_TENDON:
+        return set()
+    return {wrap.target.name for wrap in spec.tendon(actuator.target).path if wrap.target is not None}
 
 
 def _write(actuator: mujoco.MjsActuator, drive: PlainDrive, dt: float) -> None:
@@ -95,12 +118,19 @@ def _write(actuator: mujoco.MjsActuator, drive: PlainDrive, dt: float) -> None:
         actuator.delay, actuator.nsample = 0.0, 0
 
 
-def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str]) -> None:
-    """Let joint positions be what the encoders show: q - bias."""
-    shifted = {name: drive.encoder_bias for name, drive in drives.items() if drive.encoder_bias}
-    if not shifted:
+def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str], couplings: Rows) -> None:
+    """Let joint positions be what the encoders show: q - bias; joints that follow a drive's move with it."""
+    if not any(drive.encoder_bias for drive in drives.values()):
         return
-    addresses = {name: int(spec.compile().joint(name).qposadr[0]) for name in shifted} if spec.keys else {}
+    model = spec.compile()
+    driven = DrivenJoints.of_model(model, list(drives))
+    of_joints = driven.to_joints(np.array([drive.encoder_bias for drive in drives.values()]))
+    shifted = {name: bias for name, bias in zip(driven.joints, of_joints.tolist(), strict=True) if bias}
+    for name, row in couplings.items():
+        if bias := shifted.get(name):
+            follow = {j: followed_ratio(model, model.joint(j).id, model.joint(name).id) for j in row}
+            shifted |= {joint: ratio[0] * bias for joint, ratio in follow.items() if ratio is not None}
+    addresses = {name: int(model.joint(name).qposadr[0]) for name in shifted} if spec.keys else {}
     for name, bias in shifted.items():
         joint = spec.joint(name)
         is_degree = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
@@ -113,7 +143,7 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
                 qpos = np.array(key.qpos)
                 qpos[addresses[name]] -= bias
                 key.qpos = qpos
-    most = max(map(abs, shifted.values()))
+    most = max(abs(drive.encoder_bias) for drive in drives.values())
     notes.append(
         f"encoder bias (up to {most:.3g} rad, of slides m): joint positions, targets and keyframes of this model are "
         "what the encoders show, q - bias (the joints' ref is shifted)."

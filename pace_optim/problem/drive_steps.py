@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -181,12 +182,15 @@ def _inverse_inertia(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
 
 def _inertia(env: ManagerBasedRLEnv, armature: np.ndarray | float) -> np.ndarray:
     """M + armature of the joints at the default posture, (n, n) [kg m²]."""
-    robot, model = env.scene["robot"], env.sim.model
+    robot = env.scene["robot"]
+    model, driven = copy.copy(env.sim.model), robot.driven
+    columns, turn = robot.dof_columns.numpy(), driven.inverse
+    driven.clear(model)
     data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    columns = robot.dof_columns.numpy()
-    data.qpos[model.jnt_qposadr[model.dof_jntid[columns]]] = robot.data.default_joint_pos[0].numpy()
+    posture = driven.to_joints(robot.data.default_joint_pos[0].numpy())
+    data.qpos[model.jnt_qposadr[model.dof_jntid[columns]]] = posture
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, mass)
-    own = mass[np.ix_(columns, columns)]
-    own[np.diag_indices(len(columns))] += armature - model.dof_armature[columns]
+    own = turn.T @ mass[np.ix_(columns, columns)] @ turn
+    own[np.diag_indices(len(columns))] += armature
     return own + 1e-12 * np.eye(len(columns))

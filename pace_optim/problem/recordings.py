@@ -14,12 +14,14 @@ import numpy as np
 from pace_actuators import match_names
 from pace_actuators.joint_units import units_for
 from pace_actuators.text import listed
+from pace_envs.motor_coordinates import joint_ranges
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import with_columns
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, with_rate
+from pace_optim.recording.motors import of_motors
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -92,8 +94,16 @@ def read_logs(
     wanted = () if joints is None else tuple(names[i] for i in sorted(match_names(joints, names)[0]))
     known = replace(known, wanted=wanted)
 
+    driven = env.scene["robot"].driven
+
     def read(path: str) -> list[Recording]:
-        return load_recordings(path, known, chosen, tell)
+        try:
+            found = load_recordings(path, known, chosen, tell)
+        except ValueError:
+            if not driven.are_coupled or not Path(path).exists():
+                raise
+            found = load_recordings(path, known_joints(env), chosen, tell)
+        return [of_motors(recording, driven) for recording in found]
 
     read_groups = [_each(paired_files([str(path) for path in group]), read, strict, tell) for group in groups]
     every = [recording for group in read_groups for recording in group]
@@ -158,6 +168,18 @@ def known_robot(env: ManagerBasedEnv) -> Robot:
         joint_types=robot.joint_types,
         stiffness=np.where(assumed, np.nan, of_joints(env, "stiffness")),  # type: ignore[arg-type]
         effort_limit=of_joints(env, "effort_limit"),  # type: ignore[arg-type]
+    )
+
+
+def known_joints(env: ManagerBasedEnv) -> Robot:
+    """What a log is read for whose columns are joints that motors move together: nothing is stated of their drives."""
+    driven, n = env.scene["robot"].driven, env.scene["robot"].num_joints
+    return Robot(
+        joint_names=driven.joints,
+        limits=joint_ranges(env.sim.model, driven.joints),
+        joint_types=env.scene["robot"].joint_types,
+        stiffness=np.full(n, np.nan),
+        effort_limit=np.full(n, np.inf),
     )
 
 

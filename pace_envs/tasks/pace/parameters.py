@@ -17,7 +17,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, units_for
-from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, PRIOR, UNITS, Reference, moved_by
+from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, POSITIVE, PRIOR, UNITS, Reference, moved_by
 from pace_envs.tasks.pace.pace_cfg import PaceCfg
 
 if TYPE_CHECKING:
@@ -181,8 +181,8 @@ def link_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
                 apply=partial(_apply_link, references=own, name=name),
                 keys=tuple(link.link for link in own),
                 scale="log" if name in POSITIVE else "linear",
-                start=tuple(link.values[NAMES.index(name)] for link in own),
-                prior=PRIOR,
+                start=tuple(link.start(name) for link in own),
+                prior=None if name in PARTS["load"] else PRIOR,
                 joints=tuple(link.joint for link in own),
             )
         )
@@ -195,7 +195,8 @@ def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[
     Args:
         model: The robot's model.
         joints: The driven joints.
-        wanted: Regular expressions of links' names, each as ``NAME`` or ``NAME@mass,com,inertia`` with some of these.
+        wanted: Regular expressions of links' names, each as ``NAME``, or ``NAME@mass,com,inertia,load`` with some of
+            these.
 
     Raises:
         ValueError: If an expression matches nothing, a part is unknown, or a link does not move or has no mass.
@@ -206,7 +207,7 @@ def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[
     found: dict[str, tuple[str, ...]] = {}
     for text in wanted:
         pattern, at, parts = text.rpartition("@")
-        pattern, chosen = (pattern, parts.split(",")) if at else (text, list(PARTS))
+        pattern, chosen = (pattern, parts.split(",")) if at else (text, list(OF_BODY))
         if unknown := [part for part in chosen if part not in PARTS]:
             raise ValueError(
                 f"--links {text!r} names {unknown[0]!r}. Available: {', '.join(PARTS)}; as in {pattern}@mass,com."

@@ -103,12 +103,12 @@ def _reachable(env: Any, cfg: ReachCommandCfg) -> np.ndarray:
     low = np.where(np.isfinite(low), low, start - np.pi)
     high = np.where(np.isfinite(high), high, start + np.pi)
     half = 0.5 * cfg.joint_share * (high - low)
-    at = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
+    at = [int(model.joint(name).qposadr[0]) for name in robot.driven.joints]
     base, found = 1, []
     is_site = any(model.site(i).name == cfg.site for i in range(model.nsite))
     hand = data.site(cfg.site) if is_site else data.body(cfg.site)
     for drawn in rng.uniform(-1.0, 1.0, (_PLACES, len(at))):
-        data.qpos[at] = np.clip(start + half * drawn, low, high)
+        data.qpos[at] = robot.driven.to_joints(np.clip(start + half * drawn, low, high))
         mujoco.mj_kinematics(model, data)
         found.append(data.xmat[base].reshape(3, 3).T @ (hand.xpos - data.xpos[base]))
     places = np.stack(found)

@@ -268,7 +268,11 @@ def _critical_delays(problem: Problem, physical: torch.Tensor) -> list[str]:
     viscous = physical[space["viscous_friction"]].tolist()
     shortest: dict[str, float] = {}
     for r in range(problem.dataset.num_recordings):
-        inertia = torch.as_tensor(sim.model_of(r).dof_M0)[robot.dof_columns].tolist()
+        if robot.driven.are_coupled:  # of the motors, where the recording begins
+            felt, armature = sim.felt_link(robot.dof_columns)[0], sim.expand("dof_armature")[:, robot.dof_columns]
+            inertia = (felt + armature)[r].tolist()
+        else:
+            inertia = torch.as_tensor(sim.model_of(r).dof_M0)[robot.dof_columns].tolist()
         for actuator in robot.actuators.values():
             for column, name in enumerate(actuator.joint_names):
                 j = robot.joint_names.index(name)

@@ -11,6 +11,7 @@ import torch
 
 from pace_envs import ManagerBasedEnv
 from pace_envs.closed_loops import ClosedLoops
+from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FrameState, bias_in_frame
 from pace_optim.recording.moving_base import Carried
 
@@ -100,6 +101,8 @@ class Links:
     """The driven joints' degrees of freedom, (n,)."""
     loops: ClosedLoops | None
     """What passive joints follow."""
+    coordinates: MotorCoordinates | None = None
+    """Of motors that move several joints; motions and what is felt are theirs."""
 
     @classmethod
     def of(cls, env: ManagerBasedEnv) -> Links:
@@ -108,9 +111,12 @@ class Links:
         columns = robot.dof_columns.numpy()
         env.sim.forward()
         models = [env.sim.batch.get_model(r, None) for r in range(env.num_envs)]
+        turn = env.sim.coordinates
         for model in models:
             model.dof_armature[columns] = model.dof_damping[columns] = 0.0
-        return cls(models=models, columns=columns, loops=robot.closed_loops)
+            for field, carried in ({} if turn is None else turn.carried).items():
+                getattr(model, f"dof_{field}")[carried.columns] = carried.own
+        return cls(models=models, columns=columns, loops=robot.closed_loops, coordinates=env.sim.coordinates)
 
     def feel(self, motion: Motion) -> JointLoad:
         """Inertia of each joint, and the torque that the rest of the robot leaves on it.
@@ -122,7 +128,7 @@ class Links:
         """
         shape = (*motion.qpos.shape[:2], len(self.columns))
         inertia, torque, load = (np.empty(shape) for _ in range(3))
-        qpos, qvel, qacc = (each.numpy() for each in (motion.qpos, motion.qvel, motion.qacc))
+        qpos, qvel, qacc = (each.numpy() for each in self._of_joints(motion))
         for r, model in enumerate(self.models):
             data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
             carried = self._carried(model, motion, r)
@@ -133,16 +139,40 @@ class Links:
                 mujoco.mj_fullM(model, data, mass)
                 bias = data.qfrc_bias if carried is None else carried[k]
                 missing = mass @ qacc[k, r] + bias - data.qfrc_passive
-                load[k, r] = -bias[self.columns]
-                if self.loops is None:
+                load[k, r] = -self._efforts(bias)[self.columns]
+                if (follow := self.following(data.qpos)) is None:
                     inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]
                 else:
-                    follow = self.loops.following(data.qpos)[:, self.columns]
                     inertia[k, r], missing = np.einsum("ij,ik,kj->j", follow, mass, follow), follow.T @ missing
-                torque[k, r] = inertia[k, r] * qacc[k, r, self.columns] - missing
+                torque[k, r] = inertia[k, r] * motion.qacc[k, r, self.columns].numpy() - missing
         return JointLoad(
             inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load)
         )
+
+    def _of_joints(self, motion: Motion) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """MuJoCo's own positions (T, R, nq), speeds and accelerations (T, R, nv) of a motion."""
+        turn = self.coordinates
+        if turn is None:
+            return motion.qpos, motion.qvel, motion.qacc
+        return (
+            turn.positions_of_joints(motion.qpos),
+            turn.speeds_of_joints(motion.qvel),
+            turn.speeds_of_joints(motion.qacc),
+        )
+
+    def _efforts(self, bias: np.ndarray) -> np.ndarray:
+        """Torques (nv,) in the columns of motors, of MuJoCo's."""
+        return bias if self.coordinates is None else self.coordinates.efforts_of_motors(torch.from_numpy(bias)).numpy()
+
+    def following(self, qpos: np.ndarray) -> np.ndarray | None:
+        """How all speeds follow from the drives' at a posture (nq,), (nv, n); ``None``: each is its joint's."""
+        if self.loops is None and self.coordinates is None:
+            return None
+        every = np.eye(self.models[0].nv) if self.loops is None else self.loops.following(qpos)
+        if self.coordinates is None:
+            return every[:, self.columns]
+        driven = self.coordinates.of_driven(torch.eye(len(every), dtype=torch.float64), self.coordinates.columns)
+        return (every @ driven.numpy().T)[:, self.columns]
 
     def _carried(self, model: mujoco.MjModel, motion: Motion, r: int) -> np.ndarray | None:
         """Forces of a recording's motion in the frame of a base that moves, (T, nv); ``None`` where it rests."""
@@ -150,8 +180,9 @@ class Links:
             return None
         count, data = len(motion.qpos), mujoco.MjData(model)
         state = FrameState.empty(model, count)
+        qpos, qvel, _ = self._of_joints(motion)
         for k in range(count):
-            data.qpos[:], data.qvel[:] = motion.qpos[k, r].numpy(), motion.qvel[k, r].numpy()
+            data.qpos[:], data.qvel[:] = qpos[k, r].numpy(), qvel[k, r].numpy()
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
             state.keep(k, data)
@@ -166,10 +197,13 @@ class Links:
             result[..., places] = by
             return result
         step, moved = np.zeros(model.nv), np.empty(model.nq)
+        qpos, _, _ = self._of_joints(motion)
         for k in range(result.shape[0]):
             for r in range(result.shape[1]):
-                moved[:] = motion.qpos[k, r]
-                step[:] = by * self.loops.following(moved)[:, self.columns[list(joints)]].sum(axis=1)
+                moved[:] = qpos[k, r]
+                follow = self.following(moved)
+                assert follow is not None  # there are loops
+                step[:] = by * follow[:, list(joints)].sum(axis=1)
                 mujoco.mj_integratePos(model, moved, step, 1.0)
-                result[k, r] = torch.from_numpy(moved) - motion.qpos[k, r]
-        return result
+                result[k, r] = torch.from_numpy(moved) - qpos[k, r]
+        return result if self.coordinates is None else self.coordinates.positions_of_motors(result)

@@ -43,6 +43,8 @@ class ReferencePath:
     """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
     columns: torch.Tensor
     """The joints' degrees of freedom in the model, (n,)."""
+    names: tuple[str, ...]
+    """The joints; motors that move several of the model's are among them."""
     control_dt: float
     """[s]."""
     phases: FreePhases | None = None
@@ -84,7 +86,9 @@ class ReferencePath:
         """Of some of the joints, by index."""
         chosen = list(joints)
         phases = None if self.phases is None else self.phases.on_joints(chosen)
-        return self._part((..., chosen), columns=self.columns[chosen], phases=phases)
+        return self._part(
+            (..., chosen), columns=self.columns[chosen], names=tuple(self.names[j] for j in chosen), phases=phases
+        )
 
     def select(self, recordings: Sequence[int]) -> ReferencePath:
         """Some of the recordings, by index."""
@@ -195,14 +199,17 @@ def _taken(
         positions[..., robot.qpos_columns] += beside
         speeds[..., robot.dof_columns] += faster
         return positions, speeds
-    model, columns, moved = rollout.env.sim.model, robot.dof_columns.numpy(), np.empty(positions.shape[-1])
+    model, turn, links = rollout.env.sim.model, rollout.env.sim.coordinates, Links.of(rollout.env)
+    if turn is not None:
+        positions, speeds = turn.positions_of_joints(positions), turn.speeds_of_joints(speeds)
+    moved = np.empty(positions.shape[-1])
     for k, r in np.ndindex(positions.shape[:2]):
         moved[:] = positions[k, r]
-        follow = robot.closed_loops.following(moved)[:, columns]
+        follow = links.following(moved)
         mujoco.mj_integratePos(model, moved, follow @ beside[k, r].numpy(), 1.0)
         positions[k, r] = torch.from_numpy(moved)
         speeds[k, r] += torch.from_numpy(follow @ faster[k, r].numpy())
-    return positions, speeds
+    return (positions, speeds) if turn is None else (turn.positions_of_motors(positions), turn.speeds_of_motors(speeds))
 
 
 def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
@@ -252,6 +259,7 @@ def _along(
         stiffness=stiffness,
         model_effects=changes,
         columns=rollout.robot.dof_columns,
+        names=tuple(rollout.robot.joint_names),
         control_dt=problem.control_dt,
         phases=phases,
     )

@@ -24,6 +24,7 @@ class TwinSimulation(Simulation):
     """
 
     is_trapezoidal = True
+    turns_motors = False
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int, path: ReferencePath):
         """Set up the state.
@@ -187,11 +188,14 @@ class TwinSimulation(Simulation):
         columns, self.model = self.path.columns, super()._compile(spec)
         names = [self.model.joint(self.model.dof_jntid[column]).name for column in columns.tolist()]
         alone = self._stands_alone[columns]
-        if others := [joint for joint in spec.joints if joint.name not in names]:
+        coupled = tuple(names) != self.path.names
+        if (others := [joint for joint in spec.joints if joint.name not in names]) or coupled:
             for element in [*spec.sensors, *spec.equalities, *spec.tendons, *others]:
                 spec.delete(element)
+            for joint, name in zip([spec.joint(name) for name in names], self.path.names, strict=True):
+                joint.name = name  # a motor stands in the place of a joint that it moves
             self.model = super()._compile(spec)
-        self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in names])
+        self._columns = torch.tensor([int(self.model.joint(name).dofadr[0]) for name in self.path.names])
         self._stands_alone = torch.zeros(self.model.nv, dtype=torch.bool).index_put((self._columns,), alone)
         return self.model
 

@@ -243,7 +243,8 @@ def _other_load(problem: Problem, like: Recording, joint: int, cfg: MenuCfg) -> 
         return
     env = problem.make_env(1)
     model = env.sim.model
-    body = model.body(int(model.jnt_bodyid[model.joint(problem.joint_names[joint]).id]))
+    moved = env.scene["robot"].driven.joints[joint]
+    body = model.body(int(model.jnt_bodyid[model.joint(moved).id]))
     mass = max(1, round(10 * (cfg.factor - 1) * float(body.mass[0]))) / 10
     env.close()
     added = {**like.load.added_mass, body.name: like.load.added_mass.get(body.name, 0.0) + mass}

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from pace_envs.motor_coordinates import DrivenJoints
+
 from ..run_data import RecordingData
 from .scene import scalar_joints
 
@@ -52,14 +54,20 @@ def motions_of(
     Raises:
         ValueError: If the model has no such joint.
     """
-    columns = _columns(model, joint_names)
+    driven = DrivenJoints.of_model(model, joint_names)
+    columns = _columns(model, driven.joints)
     home = _home(model)
     bias = np.asarray(encoder_bias, dtype=float)
-    return [_motion(model, columns, home, recording, bias) for recording in recordings]
+    return [_motion(model, driven, columns, home, recording, bias) for recording in recordings]
 
 
 def _motion(
-    model: mujoco.MjModel, columns: np.ndarray, home: np.ndarray, recording: RecordingData, bias: np.ndarray
+    model: mujoco.MjModel,
+    driven: DrivenJoints,
+    columns: np.ndarray,
+    home: np.ndarray,
+    recording: RecordingData,
+    bias: np.ndarray,
 ) -> Motion:
     time = recording.time - recording.time[0]
     count = int(min(max(2, np.ceil(time[-1] * _RATE)), len(time), _MOST_PICTURES))
@@ -67,16 +75,13 @@ def _motion(
     positions = []
     for shown in (recording.measured, recording.measured + recording.error):
         whole = np.tile(home, (len(kept), 1))
-        whole[:, columns] = np.nan_to_num(shown[kept] - bias)
+        whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] - bias))
         positions.append(_closed(model, columns, whole) if model.neq else whole)
     return Motion(name=recording.name, time=time[kept], measured=positions[0], simulated=positions[1])
 
 
 def _columns(model: mujoco.MjModel, joint_names: Sequence[str]) -> np.ndarray:
     names = [model.joint(j).name for j in scalar_joints(model)]
-    missing = [name for name in joint_names if name not in names]
-    if missing:
-        raise ValueError(f"The model has no joint {missing[0]!r}. Available: {', '.join(names)}.")
     return np.array([names.index(name) for name in joint_names], dtype=int)
 
 
