@@ -189,8 +189,15 @@ def run_case(robot: Robot, hidden: str, args: argparse.Namespace) -> dict:
         if first:
             diagnosis = json.loads(first[-1].read_text())
             row |= {"found": diagnosis["added"], "diagnosis": diagnosis["verdict"]}
+            row["links"] = {each["label"]: moved_by(each["link"], load(path)) for each in diagnosis["links"]}
         row.setdefault("verdict", verdict(row))
     return row
+
+
+def moved_by(link: str, plant: Plant) -> str:
+    """The joint that moves a link: that of the body that it is fixed to."""
+    root = int(plant.model.body_weldid[plant.model.body(link).id])
+    return plant.model.joint(int(plant.model.body_jntadr[root])).name if plant.model.body_jntnum[root] else ""
 
 
 def _call(command: list[str], file: Path, args: argparse.Namespace) -> tuple[int | None, str, float, float]:
@@ -290,6 +297,9 @@ def verdict(row: dict) -> str:
         if "found" not in row:
             return "not diagnosed"
         names = {text.partition("@")[0] for text in row["found"]}
+        hidden_on = row["truth_hidden"][1]
+        # a payload is a wrong link
+        names |= {"payload" if joint in hidden_on else label for label, joint in row.get("links", {}).items()}
         wanted = HIDDEN[row["hidden"]]
         return "named" if names == {wanted} else "named with others" if wanted in names else "not named"
     if row["held_out_over_noise"] > AT_NOISE:
@@ -310,7 +320,8 @@ def table(rows: list[dict]) -> str:
         if "stated" in row:
             share = f"{100 * row['right'] / max(row['stated'], 1):.0f} % ({row['stated']}; {len(row['open'])})"
             cells = [f"{row['held_out_over_noise']:.2f}", share, _worst(row["wrong"])]
-        said = row["verdict"] + (f": {' '.join(row['found'])}" if row.get("found") else "")
+        found = [*row.get("links", {}), *row.get("found", [])]
+        said = row["verdict"] + (f": {' '.join(found)}" if found else "")
         if row.get("message"):
             said += f": {row['message'][:160]}"
         said = said.replace("|", "/")

@@ -44,6 +44,8 @@ def test_a_strong_drive_s_torques_are_sought_as_far_as_its_friction_says():
     effort, velocity = get_effect("stribeck_friction").parameters
     assert effort.widest(1.0) == (0.0, 16.0) and effort.widest(30.0) == (0.0, 120.0)
     assert velocity.widest(30.0) == velocity.widest()
+    stiffness, _ = get_effect("parallel_spring").parameters  # 80.6 N m/rad on a drive of 440 N m stood at 80
+    assert stiffness.widest(1.0) == (-8.0, 80.0) and stiffness.widest(44.0) == (-176.0, 176.0)
     cfg = load_env_cfg("Pace-AnymalD-v0").sim2real
     cfg.bounds["friction"][3, 1] = 30.0
     cfg.effects = ["stribeck_friction@wide"]

@@ -38,7 +38,8 @@ SURE = Evidence(
     left=40.0,
     floor=1.0,
     harm=0.0,
-    beside=False,
+    larger=0.0,
+    slight=False,
     bars=50.0,
     uneven=0.0,
     at_bound=False,
@@ -63,8 +64,10 @@ SURE = Evidence(
         ),  # it explains everything
         ({"left": 8.0, "harm": 2.0, "at_bound": True}, ["it is at a bound"]),
         ({"without": 8.0, "left": 1.0}, []),  # the first one of a joint
-        ({"without": 8.0, "left": 1.0, "beside": True}, ["the error is near the floor without it"]),
-        ({"without": 12.0, "left": 1.0, "beside": True}, []),
+        ({"without": 8.0, "left": 1.0, "slight": True}, ["the error is near the floor without it"]),
+        ({"without": 8.0, "left": 1.0, "larger": 600.0}, ["the error is near the floor without it"]),
+        ({"without": 12.0, "left": 1.0, "larger": 600.0}, []),
+        ({"without": 12.0, "left": 1.0, "larger": 2000.0}, ["it explains next to nothing beside a larger effect"]),
     ],
 )
 def test_a_name_is_earned_by_one_rule(changes, said):

@@ -78,7 +78,8 @@ class EffectParameter:
     def widest(self, friction: float = 0.0) -> tuple[float, float]:
         """Its bounds four times as far from the null, or on a logarithmic scale from each other; the null stays one.
 
-        Torques have them at least four times as far as the joint's own friction is sought: drives differ in size.
+        Torques, and torques per angle or speed, have them at least four times as far as the joint's own friction is
+        sought: drives differ in size.
 
         Args:
             friction: Upper bound of the joint's Coulomb friction [N m].
@@ -88,7 +89,7 @@ class EffectParameter:
             low, high = low / _WIDER, high * _WIDER
         elif self.null is not None and math.isfinite(self.null):
             low, high = (self.null + _WIDER * (bound - self.null) for bound in (low, high))
-            if self.unit == "N m":
+            if self.unit.startswith("N m"):
                 reach = _WIDER * friction
                 low = min(low, self.null - reach) if low < self.null else low
                 high = max(high, self.null + reach) if high > self.null else high

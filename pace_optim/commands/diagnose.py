@@ -32,7 +32,9 @@ def main() -> None:
         metavar="FACT",
         help=f"facts that you measured ({', '.join(MEASURED_FACTS)}): effects that contradict them are not tried",
     )
-    parser.add_argument("--links", action="store_true", help="look for wrong links of the model file first")
+    parser.add_argument(
+        "--no_links", dest="links", action="store_false", help="do not look for wrong links of the model file first"
+    )
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
     parser.add_argument("--physics_dt", type=number, metavar="S", help="physics step (default: half a control step)")
     refit = parser.add_mutually_exclusive_group()

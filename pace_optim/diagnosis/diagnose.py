@@ -60,7 +60,7 @@ def diagnose(
     whole = _as_found(run.problem(physics_dt=physics_dt), result).with_links(result.links)
     values = {name: result.parameters[name] for name in whole.space.slices}
     wrong = LinkFindings()
-    if settings.links:
+    if settings.links and not whole.joints_stand_alone:  # there an effect on the joint says the same
         wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, settings.cfg.links)
     problem = whole.with_effects(()).with_links(wrong.links)
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}

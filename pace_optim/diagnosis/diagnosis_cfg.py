@@ -75,6 +75,9 @@ class VerdictCfg:
     most: float = 0.5
     """An effect must explain this part of what lies above the floor without it. A curve says more where it leaves less
     than this part of what effects leave, and an effect dominates above this share."""
+    least: float = 0.01
+    """An effect beside a larger one on joints that move each other must explain this part of what that explains: so
+    much of its squared error the larger one's own model may leave to others, 10 % of its error."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15
@@ -111,6 +114,8 @@ class LinksCfg:
     clear: float = 5.0
     """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
     a link."""
+    explains: float = 0.5
+    """A link is fitted if it would explain this part of the score above the noise, to first order."""
     pays: float = 1.5
     """What a link must lower the error by."""
     alike: float = 1.10

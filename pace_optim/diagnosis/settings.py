@@ -28,8 +28,9 @@ class DiagnosisSettings:
     measured: list[str] = field(default_factory=list)
     """Facts that were measured, of ``MEASURED_FACTS``: effects that would contradict them are not tried."""
 
-    links: bool = False
-    """Whether wrong masses, centres and inertias of the model file's links are looked for, before effects."""
+    links: bool = True
+    """Whether wrong masses, centres and inertias of the model file's links are looked for, before effects: one of them
+    moves many joints."""
 
     max_effects: int = 3
     """Most effects that are added to a joint."""

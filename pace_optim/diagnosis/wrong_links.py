@@ -199,12 +199,13 @@ def _best_addition(
 def _screened(
     whole: Problem, x: torch.Tensor, every: Sequence[Reference], found: Sequence[Reference], cfg: LinksCfg
 ) -> list[Reference]:
-    """Links with what may be wrong about each, the most promising first."""
-    hessian, gradient = _look(whole, x, cfg)
+    """Links with what may be wrong about each, the most promising first: those that would explain most of the error."""
+    hessian, gradient, left = _look(whole, x, cfg)
     space = whole.space
     own = [i for i, label in enumerate(space.labels) if label.split("/")[0] not in NAMES]
     own += [space.labels.index(f"{name}/{each.link}") for each in found for name in each.names]
     score = _score_of(gradient, hessian, own)
+    least = cfg.explains * (left - score - noise_score(whole))
     gains: list[tuple[float, Reference]] = []
     for each in every:
         if any(each.link == known.link for known in found):
@@ -213,7 +214,8 @@ def _screened(
             names = tuple(name for part in PARTS if part in parts for name in PARTS[part])
             entries = [*own, *(space.labels.index(f"{name}/{each.link}") for name in names)]
             gain = _score_of(gradient, hessian, entries) - score
-            gains.append((gain / len(names) ** cfg.cost, replace(each, names=names)))
+            if gain > least:
+                gains.append((gain / len(names) ** cfg.cost, replace(each, names=names)))
     result: list[Reference] = []
     for _, each in sorted(gains, key=lambda each: -each[0]):
         if sum(each.link == other.link for other in result) < cfg.of_link:
@@ -221,13 +223,13 @@ def _screened(
     return result
 
 
-def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor]:
-    """H and g at a normalised vector, on pieces."""
+def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """H, g and the score [rad²] at a normalised vector, on pieces."""
     pieces, colouring = problem.on_pieces(cfg.share), _colouring(problem)
     around = stencil(x, colouring, first=cfg.step)
     vectors = torch.cat([x[None], around.vectors])
     residuals = pieces.training_evaluator().residuals(problem.space.to_physical(vectors))
-    return around.jacobian(residuals).normal_equations()
+    return *around.jacobian(residuals).normal_equations(), float(residuals.rows(0, 1).score)
 
 
 def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[int]) -> float:
@@ -249,7 +251,7 @@ def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
         size = next(p for p in get_effect(effect).parameters if p.null is not None)
         name = f"{effect}.{size.name}"
         start = _values_in(whole, {**values, name: dict.fromkeys(problem.joint_names, size.null or 0.0)})
-        hessian, gradient = _look(whole, start, cfg)
+        hessian, gradient, _ = _look(whole, start, cfg)
         labels = whole.space.labels
         own = [i for i, label in enumerate(labels) if not label.startswith(f"{effect}.")]
         gains = {

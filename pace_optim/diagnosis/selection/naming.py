@@ -19,9 +19,10 @@ class Evidence:
     """Below this there is nothing to explain."""
     harm: float
     """What the joint's effects add to the errors of other joints of its tree."""
-    beside: bool
-    """Whether it counts only where the joint is far from the floor without it: beside others, or if it only smooths
-    friction."""
+    larger: float
+    """What the largest effect on its joint's tree explains, if that is another one; else 0."""
+    slight: bool
+    """Whether it counts only where the joint is far from the floor without it: it only smooths friction."""
     bars: float
     """How many of its error bars its size is away from none."""
     uneven: float
@@ -43,12 +44,14 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
 
     An effect is named where it explains most of what lies above the floor without it, and leads near the floor. Where
     it does not lead near the floor, its size must be far from none in its own error bars, alike in every recording,
-    away from its bounds, and one that drives have. Beside other effects it counts only on what they leave far from the
-    floor.
+    away from its bounds, and one that drives have. Beside a larger effect it counts only on what that leaves far from
+    the floor, and if it explains a part of what that does: effects beside it take up what its model gets wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
-    if evidence.beside and evidence.without <= near:
+    if (evidence.larger or evidence.slight) and evidence.without <= near:
         return ["the error is near the floor without it"]
+    if evidence.without - evidence.left < cfg.verdict.least * evidence.larger:
+        return ["it explains next to nothing beside a larger effect"]
     if evidence.explained < cfg.verdict.most:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
     if evidence.left + evidence.harm <= near:

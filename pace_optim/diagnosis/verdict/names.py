@@ -75,7 +75,7 @@ def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = u
     while bool(open_.any()):
         if now.jacobian is None or now.error is None:
             now = fits.looked_at(outcome.problem, [now])[0]
-        every = _left_out(fits, outcome, now, errors, open_, floor)
+        every = _left_out(fits, outcome, now, errors, open_, floor, rises)
         count = new_effects(outcome, now.model).sum(dim=0)
         earned = {effect: _earned(effect, own, outcome, errors, log) for effect, own in every.items()}
         for j in open_.nonzero()[:, 0].tolist():
@@ -153,9 +153,15 @@ def shares_of(names: Names, outcome: Outcome) -> dict[type[Effect], float]:
 
 
 def _left_out(
-    fits: Fits, outcome: Outcome, now: Fitted, errors: BlockErrors, joints: torch.Tensor, floor: torch.Tensor
+    fits: Fits,
+    outcome: Outcome,
+    now: Fitted,
+    errors: BlockErrors,
+    joints: torch.Tensor,
+    floor: torch.Tensor,
+    rises: Mapping[tuple[type[Effect], int], float],
 ) -> dict[type[Effect], _LeftOut]:
-    """Each effect left out of a model on some joints, (n,) bool, and the rest fitted again."""
+    """Each effect left out of a model on some joints, (n,) bool, and the rest fitted again; ``rises`` of the others."""
     model = now.model
     found = [(e, has & joints) for e, has in zip(model.effects, new_effects(outcome, model), strict=True)]
     found = [(effect, has) for effect, has in found if bool(has.any())]
@@ -170,6 +176,12 @@ def _left_out(
 
     after = fits.shared_out(fitted, found, [effect for effect, _ in found])
     count, bars, uneven = new_effects(outcome, model).sum(dim=0), error_bars_from_none(now), unevenness(now)
+    left_without = {
+        (effect, j): float(own.mse[j] if count[j] > 1 else min(own.mse[j], outcome.base_errors.mse[j]))
+        for (effect, has), (_, own) in zip(found, after, strict=True)
+        for j in has.nonzero()[:, 0].tolist()
+    }
+    rises = {**rises, **{(effect, j): mse - float(errors.mse[j]) for (effect, j), mse in left_without.items()}}
     stuck, implausible = model.has_at_bounds(now.x, now.moves), model.implausible(now.physical)
     harm, hardly_shows = _harm(outcome, errors), outcome.base_errors.mse.sqrt() <= outcome.cfg.judging.far * floor
     result = {}
@@ -177,11 +189,12 @@ def _left_out(
         row, places = model.effects.index(effect), has.nonzero()[:, 0].tolist()
         evidence = {
             j: Evidence(
-                without=float(own.mse[j] if count[j] > 1 else min(own.mse[j], outcome.base_errors.mse[j])),
+                without=left_without[effect, j],
                 left=float(errors.mse[j]),
                 floor=float(floor[j] ** 2),
                 harm=float(harm[j]),
-                beside=bool(count[j] > 1 or (effect.smooths_friction and hardly_shows[j])),
+                larger=_larger(effect, j, model, rises, outcome.trees),
+                slight=bool(effect.smooths_friction and hardly_shows[j]),
                 bars=float(bars[row, j]),
                 uneven=float(uneven[row, j]),
                 at_bound=bool(stuck[row, j]),
@@ -195,6 +208,21 @@ def _left_out(
     return result
 
 
+def _larger(
+    effect: type[Effect],
+    joint: int,
+    model: JointModel,
+    rises: Mapping[tuple[type[Effect], int], float],
+    trees: Sequence[Sequence[int]],
+) -> float:
+    """What the largest effect of a joint's tree explains [rad²]; 0 if that is the effect on the joint itself."""
+    tree = next((own for own in trees if joint in own), [joint])
+    names = model.names_of_joints
+    others = (rise for (each, j), rise in rises.items() if j in tree and each.name in names[j])
+    largest = max(others)
+    return largest if largest > rises[effect, joint] else 0.0
+
+
 def _together(own: Sequence[Evidence]) -> Evidence:
     """The evidence of all joints that share an effect, as that of one joint."""
     return Evidence(
@@ -202,7 +230,8 @@ def _together(own: Sequence[Evidence]) -> Evidence:
         left=sum(each.left for each in own),
         floor=sum(each.floor for each in own),
         harm=0.0,
-        beside=all(each.beside for each in own),
+        larger=max(each.larger for each in own),
+        slight=all(each.slight for each in own),
         bars=max(each.bars for each in own),
         uneven=max(each.uneven for each in own),
         at_bound=any(each.at_bound for each in own),
