@@ -20,6 +20,7 @@ from pace_optim.data_collection.plant import Case, library_effects, outside_effe
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.selection.decisions import Decision, as_lines
+from pace_optim.diagnosis.verdict.sizes import sizes
 from pace_optim.diagnosis.verdict.verdict import ranking
 from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import BlockErrors
@@ -158,6 +159,10 @@ def run_case(job: Job) -> dict[str, Any]:
         "floor": float(found.data.floor.square().mean().sqrt()),
         "shares": {effect.name: share for effect, share in found.shares.items()},
         "ranking": ranking(outcome, problem.joint_names, found.verdict, list(found.shares)),
+        "sizes": [
+            {**size, "true": truth["effects"].get(size["effect"], {}).get(size["parameter"], {}).get(size["joint"])}
+            for size in sizes(fits, outcome, problem.joint_names)
+        ],
         "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
         "truth": truth["effects"],

@@ -55,6 +55,8 @@ def make_table(lines: Sequence[Line]) -> str:
     groups = sorted({line["group"] for line in done})
     if judged:
         parts += ["", _summary(judged, groups), "", _confusion(judged), "", _false_alarms(judged)]
+    if covered := _coverage(judged):
+        parts += ["", covered]
     if besides := [line for line in judged if line.get("alone")]:
         parts += ["", _backgrounds(besides)]
     if done:
@@ -105,6 +107,15 @@ def _false_alarms(lines: Sequence[Line]) -> str:
         f"{len(wrong)} outside cases given a name, {len(more)} single effects with a second one added, "
         f"{len(extra)} cases with an effect beside the declared set"
     )
+
+
+def _coverage(lines: Sequence[Line]) -> str:
+    """How often the error bars of single effects that were named hold the truth."""
+    own = [size for line in lines if line["group"] == "effects" for size in line.get("sizes", [])]
+    off = [abs(each["value"] - each["true"]) / each["std"] for each in own if each["true"] is not None and each["std"]]
+    if not off:
+        return ""
+    return f"sizes of single effects: {_share(o < 2 for o in off)} within two error bars, median {np.median(off):.2g}"
 
 
 def _backgrounds(lines: Sequence[Line]) -> str:

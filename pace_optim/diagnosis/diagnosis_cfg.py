@@ -107,13 +107,10 @@ RULES = (
 class LinksCfg:
     """Numbers of the search for wrong links; ratios are of RMSE."""
 
-    above: float = 1.15
-    """Nothing is looked for where the error is less than this many times the noise."""
     left: float = 1.15
-    """At this many times the noise nothing is left."""
-    clear: float = 5.0
-    """Nor is much left where the error is this many times lower than with the file: no other effect looks so much like
-    a link."""
+    """At this many times the noise nothing is left to look for."""
+    near: float = 3.0
+    """Links are named if at most this many times the noise is left: it is what an effect must lead to, too."""
     explains: float = 0.5
     """A link is fitted if it would explain this part of the score above the noise, to first order."""
     pays: float = 1.5

@@ -7,8 +7,9 @@ and g = Jᵀr of the base parameters and of what is tried, a part of a link woul
 
     Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
 
-The most promising are fitted to the whole robot. Links are named if little is left: the error on samples that were not
-fitted is at the noise, or a small part of what it was. What leaves as little on a single joint is a look-alike.
+Parts that would explain most of the error, and more than any look-alike on a single joint, are fitted to the whole
+robot. Links are named if they lead near the noise on samples that were not fitted. A look-alike that leaves as little
+is reported instead.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from pace_optim.estimate.error_bars.uncertainty import SURE, inverse_of
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.problem.problem import Problem
 
-LOOK_ALIKES = ("torque_gain", "proportional_gain", "parallel_spring", "torque_offset")
+LOOK_ALIKES = ("torque_gain", "proportional_gain", "gravity_compensation", "parallel_spring", "torque_offset")
 """Effects on one joint that look like a wrong link."""
 _CHOICES = (("mass",), ("com",), ("mass", "com"), OF_BODY)
 """What may be wrong with a link, the fewest parameters first."""
@@ -112,22 +113,24 @@ def find_wrong_links(
     cfg = cfg or LinksCfg()
     noise = (noise_score(problem) / len(problem.joint_names)) ** 0.5
     base = _Fitted(problem, problem.space.to_normalised(physical), _held_out(problem, physical))
-    if not noise > 0 or base.rmse < cfg.above * noise:
+    if not noise > 0 or base.rmse < cfg.left * noise:
         return LinkFindings()
-    now, found = base, tuple[Reference, ...]()
+    now, found, joint_of = base, tuple[Reference, ...](), dict[str, str]()
     while len(found) < cfg.most and now.rmse > cfg.left * noise:
         say(f"screening the links of the model file ({len(found)} found to be wrong)")
-        best = _best_addition(now, found, noise, say, cfg)
+        screened = _screened(now, found, cfg)
+        joint_of = joint_of or screened.joint_of
+        best = _best_addition(now, found, screened.links, noise, say, cfg)
         if best is None or best.rmse * cfg.pays > now.rmse:
             break
         now, found = best, best.problem.env_cfg.sim2real.links
     if not found:
         return LinkFindings()
     now = _fit(now.problem, _values_of(now), cfg, whole=True)
-    if now.rmse > max(cfg.left * noise, base.rmse / cfg.clear):
+    if now.rmse > cfg.near * noise:
         return LinkFindings()
     say("fitting what looks like a wrong link")
-    likes = _look_alikes(base, cfg)
+    likes = _look_alikes(base, joint_of, cfg)
     left = max(now.rmse, noise)
     if any(rmse * cfg.alike < left for rmse in likes.values()):
         return LinkFindings()
@@ -170,18 +173,15 @@ def _told(base: _Fitted, now: _Fitted, found: Sequence[Reference]) -> LinkFindin
 
 
 def _best_addition(
-    now: _Fitted, found: tuple[Reference, ...], noise: float, say: Callable[[str], None], cfg: LinksCfg
+    now: _Fitted,
+    found: tuple[Reference, ...],
+    candidates: Sequence[Reference],
+    noise: float,
+    say: Callable[[str], None],
+    cfg: LinksCfg,
 ) -> _Fitted | None:
     """The model with one more wrong link that leaves least; of those alike, the one with the fewest parameters."""
-    problem = now.problem
-    env = problem.make_env(1)
-    every = sought_links(env.sim.model, problem.joint_names, [".*"])
-    env.close()
-    # what is found stays as the file has it: its parameters begin where the last round left them
-    every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
-    whole = problem.seeking(tuple(replace(each, names=TEN) for each in every))
-    values = _values_of(now)
-    candidates = _screened(whole, _values_in(whole, values), every, found, cfg)
+    problem, values = now.problem, _values_of(now)
     fitted: list[tuple[int, _Fitted]] = []
     for addition in sorted(candidates[: cfg.tried], key=lambda each: len(each.names)):
         if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
@@ -196,31 +196,62 @@ def _best_addition(
     return min(alike, key=lambda each: each[:2])[2] if alike else None
 
 
-def _screened(
-    whole: Problem, x: torch.Tensor, every: Sequence[Reference], found: Sequence[Reference], cfg: LinksCfg
-) -> list[Reference]:
-    """Links with what may be wrong about each, the most promising first: those that would explain most of the error."""
-    hessian, gradient, left = _look(whole, x, cfg)
-    space = whole.space
-    own = [i for i, label in enumerate(space.labels) if label.split("/")[0] not in NAMES]
-    own += [space.labels.index(f"{name}/{each.link}") for each in found for name in each.names]
+@dataclass(frozen=True, eq=False)
+class _Screened:
+    """What one look says of all links, and of effects on single joints."""
+
+    links: list[Reference]
+    """With what may be wrong about each, the most promising first."""
+    joint_of: dict[str, str]
+    """The joint on which each look-alike would explain most."""
+
+
+def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Screened:
+    """Links that would explain most of the error, and more than any effect on a single joint does."""
+    problem = now.problem
+    env = problem.make_env(1)
+    every = sought_links(env.sim.model, problem.joint_names, [".*"])
+    env.close()
+    # what is found stays as the file has it: its parameters begin where the last round left them
+    every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
+    had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
+    likes = {effect: get_effect(effect).parameters for effect in LOOK_ALIKES if effect not in had}
+    sizes = {effect: next(p for p in own if p.null is not None) for effect, own in likes.items()}
+    whole = problem.seeking(tuple(replace(each, names=TEN) for each in every))
+    whole = whole.with_effects([*problem.effects, *likes])
+    none = {f"{effect}.{p.name}": dict.fromkeys(problem.joint_names, p.null or 0.0) for effect, p in sizes.items()}
+    hessian, gradient, left = _look(whole, _values_in(whole, {**_values_of(now), **none}), cfg)
+    place = {label: i for i, label in enumerate(whole.space.labels)}
+    tried = {*NAMES, *(f"{effect}.{p.name}" for effect, own in likes.items() for p in own)}
+    own = [i for label, i in place.items() if label.split("/")[0] not in tried]
+    own += [place[f"{name}/{each.link}"] for each in found for name in each.names]
     score = _score_of(gradient, hessian, own)
+
+    def gain(labels: Sequence[str]) -> float:
+        """How much more the score falls with these parameters."""
+        return _score_of(gradient, hessian, [*own, *(place[label] for label in labels)]) - score
+
+    on_joints: dict[str, dict[str, float]] = {}
+    for effect, p in sizes.items():
+        labels = {joint: f"{effect}.{p.name}/{joint}" for joint in problem.joint_names}
+        on_joints[effect] = {joint: gain([label]) for joint, label in labels.items() if label in place}
     least = cfg.explains * (left - score - noise_score(whole))
-    gains: list[tuple[float, Reference]] = []
+    single = max((each for gains in on_joints.values() for each in gains.values()), default=0.0)
+    promising: list[tuple[float, Reference]] = []
     for each in every:
         if any(each.link == known.link for known in found):
             continue
         for parts in _CHOICES:
             names = tuple(name for part in PARTS if part in parts for name in PARTS[part])
-            entries = [*own, *(space.labels.index(f"{name}/{each.link}") for name in names)]
-            gain = _score_of(gradient, hessian, entries) - score
-            if gain > least:
-                gains.append((gain / len(names) ** cfg.cost, replace(each, names=names)))
-    result: list[Reference] = []
-    for _, each in sorted(gains, key=lambda each: -each[0]):
-        if sum(each.link == other.link for other in result) < cfg.of_link:
-            result.append(each)
-    return result
+            explained = gain([f"{name}/{each.link}" for name in names])
+            by_size = explained / len(names) ** cfg.cost
+            if explained > least and by_size > single:
+                promising.append((by_size, replace(each, names=names)))
+    links: list[Reference] = []
+    for _, each in sorted(promising, key=lambda each: -each[0]):
+        if sum(each.link == other.link for other in links) < cfg.of_link:
+            links.append(each)
+    return _Screened(links, {effect: max(gains, key=gains.__getitem__) for effect, gains in on_joints.items() if gains})
 
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -239,29 +270,12 @@ def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[i
     return float(g @ inverse_of(hessian[at[:, None], at].numpy())[0] @ g)
 
 
-def _look_alikes(base: _Fitted, cfg: LinksCfg) -> dict[str, float]:
-    """The error with each effect on the joint where it explains most, {effect on joint: RMSE [rad]}."""
-    problem, found = base.problem, dict[str, float]()
-    values = _values_of(base)
-    had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
-    for effect in LOOK_ALIKES:
-        if effect in had:
-            continue
-        whole = problem.with_effects([*problem.effects, effect])
-        size = next(p for p in get_effect(effect).parameters if p.null is not None)
-        name = f"{effect}.{size.name}"
-        start = _values_in(whole, {**values, name: dict.fromkeys(problem.joint_names, size.null or 0.0)})
-        hessian, gradient, _ = _look(whole, start, cfg)
-        labels = whole.space.labels
-        own = [i for i, label in enumerate(labels) if not label.startswith(f"{effect}.")]
-        gains = {
-            joint: _score_of(gradient, hessian, [*own, labels.index(f"{name}/{joint}")])
-            for joint in problem.joint_names
-            if f"{name}/{joint}" in labels
-        }
-        joint = max(gains, key=lambda each: gains[each])
-        alone = _fit(problem.with_effects([*problem.effects, f"{effect}@{re.escape(joint)}"]), values, cfg)
-        found[f"{effect} on {joint}"] = alone.rmse
+def _look_alikes(base: _Fitted, joint_of: Mapping[str, str], cfg: LinksCfg) -> dict[str, float]:
+    """The error with each effect on the joint where it would explain most, {effect on joint: RMSE [rad]}."""
+    found, values = dict[str, float](), _values_of(base)
+    for effect, joint in joint_of.items():
+        alone = base.problem.with_effects([*base.problem.effects, f"{effect}@{re.escape(joint)}"])
+        found[f"{effect} on {joint}"] = _fit(alone, values, cfg).rmse
     return found
 
 
