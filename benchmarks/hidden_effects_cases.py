@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +17,7 @@ import torch
 
 from pace_actuators.effects import Effect, get_effect
 from pace_optim.data_collection.plant import Case, library_effects, outside_effects, write_case
+from pace_optim.data_collection.plant.hidden import effect_named
 from pace_optim.diagnosis import candidate_effects, search_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.selection.decisions import Decision, as_lines
@@ -160,8 +161,7 @@ def run_case(job: Job) -> dict[str, Any]:
         "shares": {effect.name: share for effect, share in found.shares.items()},
         "ranking": ranking(outcome, problem.joint_names, found.verdict, list(found.shares)),
         "sizes": [
-            {**size, "true": truth["effects"].get(size["effect"], {}).get(size["parameter"], {}).get(size["joint"])}
-            for size in sizes(fits, outcome, problem.joint_names)
+            {**size, "true": _true(truth["effects"], size)} for size in sizes(fits, outcome, problem.joint_names)
         ],
         "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},
@@ -172,6 +172,14 @@ def run_case(job: Job) -> dict[str, Any]:
             "true_fit": fitted - diagnosed,
         },
     }
+
+
+def _true(hidden: Mapping[str, Mapping[str, Mapping[str, float]]], size: Mapping[str, Any]) -> float | None:
+    """The true value of a size; the plant has the library's parameters, in order, under its own names."""
+    if size["effect"] not in hidden:
+        return None
+    place = [p.name for p in get_effect(size["effect"]).parameters].index(size["parameter"])
+    return hidden[size["effect"]][list(effect_named(size["effect"]).draws)[place]].get(size["joint"])
 
 
 def _load(job: Job, case: Case) -> tuple[Problem, dict[str, Any]]:

@@ -252,9 +252,9 @@ class LinkInertias:
 
     def turn(self, rows: slice, body: int, joint: int, angle: torch.Tensor) -> None:
         """Turn a body's mass about the axis of a joint that moves it by (rows,) [rad]."""
-        if (body, joint) not in self._turns:
-            self._turns[body, joint] = _Turn(*self._axis_in(body, joint), self._zeros())
-        self._turns[body, joint].angle[rows] = angle.double()
+        axis, anchor = self._axis_in(body, joint)
+        turn = self._turns.setdefault((body, joint), _Turn(axis, anchor, self._zeros()))
+        turn.anchor[rows], turn.angle[rows] = anchor[rows], angle.double()
         self._write(rows, body)
 
     def _load_of(self, body: int) -> torch.Tensor:
@@ -286,7 +286,7 @@ class LinkInertias:
         for (turned, _), turn in self._turns.items():
             if turned == body:
                 angle = turn.angle[rows]
-                move = _turning(turn.axis, turn.anchor, angle)
+                move = _turning(turn.axis, turn.anchor[rows], angle)
                 own, same = move @ own @ move.transpose(-1, -2), same & (angle == 0)
         after = _fields_of(own + load)
         for field in _FIELDS:
@@ -295,19 +295,21 @@ class LinkInertias:
             self.sim.expand(field)[rows, body] = value.to(self.sim.dtype)
 
     def _axis_in(self, body: int, joint: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """A joint's axis and anchor in the frame of a body that is fixed to the one it moves, (3,) each."""
+        """A joint's axis (3,) and anchors (num_envs, 3) in the frame of a body that is fixed to the one it moves."""
         model, moved = self.sim.model, int(self._joints[joint].bodyid[0])
-        axis, anchor = np.array(self._joints[joint].axis), np.array(self._joints[joint].pos)
+        own = np.stack([self._joints[joint].axis, self._joints[joint].pos])
+        axis, anchor = torch.tensor(own, dtype=torch.float64, device=self.sim.device)
+        anchor = anchor.repeat(self.sim.num_envs, 1)
         chain = [body]
         while chain[-1] != moved:
             chain.append(int(model.body_parentid[chain[-1]]))
         for b in reversed(chain[:-1]):
             turn = np.zeros(9)
             mujoco.mju_quat2Mat(turn, model.body_quat[b])
-            back = turn.reshape(3, 3).T
-            axis, anchor = back @ axis, back @ (anchor - model.body_pos[b])
-        found = np.stack([axis, anchor])
-        return tuple(torch.tensor(found, dtype=torch.float64, device=self.sim.device))  # type: ignore[return-value]
+            back = axis.new_tensor(turn.reshape(3, 3).T)
+            place = self.sim.expand("body_pos")[:, b].double()  # a load may sit elsewhere in each simulation
+            axis, anchor = back @ axis, (anchor - place) @ back.T
+        return axis, anchor
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +319,7 @@ class _Turn:
     axis: torch.Tensor
     """In the body's frame, (3,)."""
     anchor: torch.Tensor
-    """There, (3,) [m]."""
+    """There, (num_envs, 3) [m]."""
     angle: torch.Tensor
     """(num_envs,) [rad]."""
 
@@ -370,11 +372,11 @@ def _fields_of(j: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def _turning(axis: torch.Tensor, anchor: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """The rotations by angles (n,) about an axis through an anchor, (n, 4, 4)."""
+    """The rotations by angles (n,) about an axis (3,) through anchors (n, 3), (n, 4, 4)."""
     half = 0.5 * angle
     turn = _matrix(torch.cat([half.cos()[:, None], half.sin()[:, None] * axis], dim=1))
     result = torch.eye(4, dtype=turn.dtype, device=turn.device).repeat(len(angle), 1, 1)
-    result[:, :3, :3], result[:, :3, 3] = turn, anchor - turn @ anchor
+    result[:, :3, :3], result[:, :3, 3] = turn, anchor - (turn @ anchor[..., None])[..., 0]
     return result
 
 

@@ -244,13 +244,18 @@ def test_payload_and_com_offset_are_a_hand_changed_model():
     heavier = {**HEAVY, "load_mass": 2.0 * 1.25, "arm_mass": 0.33 * 1.25}
     assert rms(payload, Bench(load=heavier).follow(MOVING)) < 1e-9
     assert rms(payload, Bench(load=HEAVY).follow(MOVING)) > 1e-3
-    # turning the mass by α is a joint whose zero is elsewhere: q -> q + α in gravity alone
-    angle = 0.2
-    turned = Bench(["com_offset"], {"com_offset.angle": angle}, load=HEAVY)
-    turned.start(0.3)
-    plain = Bench(load=HEAVY)
-    plain.start(0.3 + angle)
-    assert torch.allclose(turned.robot.load_effort, plain.robot.load_effort, rtol=1e-9)
+
+
+def test_turning_the_mass_is_a_joint_whose_zero_is_elsewhere_wherever_the_load_sits():
+    """It was turned as if the load sat where the model file has it: one of another length was not found."""
+    reads_load = ["load_dependent_friction"]
+    turned = Bench(["com_offset", *reads_load], {"com_offset.angle": 0.2}, load=HEAVY, num_envs=2)
+    plain = Bench(reads_load, load=HEAVY, num_envs=2)
+    for bench, start in ((turned, 0.3), (plain, 0.5)):  # q -> q + α in gravity alone
+        bench.start(start)
+        bench.env.simulate(torch.full((2, 1), start).double())
+    assert torch.allclose(turned.robot.load_effort, plain.robot.load_effort, rtol=1e-6)
+    assert float(plain.robot.load_effort[1].abs()) > 2.0
     turned.env.close()
     plain.env.close()
 

@@ -306,6 +306,16 @@ def test_a_diagnosis_names_a_wrong_link_and_what_is_wrong_with_it(tmp_path, monk
     assert found.wrong[0].sentence.startswith("The model file is wrong about the link fore (mass): mass 0.92")
 
 
+def test_what_one_number_on_a_joint_explains_as_well_is_no_wrong_link(tmp_path):
+    """Two wrong torques of a robot were two wrong links, which left a ninth of the error."""
+    recording = dataclasses.replace(recorded(tmp_path, {}, noise=1e-4), drive=Drive(stiffness=np.array([30.0, 25.0])))
+    problem = make_problem(recording, cfg=arm_cfg(tmp_path), train_fraction=0.6)
+    x, _ = fit(problem, iterations=4)
+    said: list[str] = []
+    assert find_wrong_links(problem, problem.space.to_physical(x), said.append) == LinkFindings()
+    assert said == ["screening the links of the model file (0 found to be wrong)"]
+
+
 def test_a_diagnosis_names_no_link_of_a_file_that_is_right(tmp_path):
     problem = make_problem(recorded(tmp_path, {}, noise=1e-4), cfg=arm_cfg(tmp_path), train_fraction=0.6)
     assert find_wrong_links(problem, problem.space.from_dict(TRUE)) == LinkFindings()

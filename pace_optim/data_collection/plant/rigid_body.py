@@ -136,6 +136,9 @@ class RigidBody:
             bench = {key: value for key in _BENCH_DEFAULTS if (value := getattr(load, key)) is not None}
             if bench:
                 _write_bench_load(model, names, {**_BENCH_DEFAULTS, **bench}, row, mass, inertia, ipos, pos)
+            unturned = {
+                body: _in_parent(pos[row, body], quat[row, body], ipos[row, body]) for body in range(model.nbody)
+            }
             for j, joint in enumerate(joint_names):
                 body = int(model.joint(joint).bodyid[0])
                 for link in _welded(model, body):
@@ -148,11 +151,28 @@ class RigidBody:
                 if name not in names:
                     raise ValueError(f"added_mass names {name!r}, which is no body. Available: {', '.join(names[1:])}.")
                 body = names.index(name)
-                if (place := load.added_mass_at.get(name)) is not None and kg > 0:
+                # without a place it is at the centre of mass of the model file, whatever turned the body's own mass
+                place = load.added_mass_at.get(name, _from_parent(pos[row, body], quat[row, body], unturned[body]))
+                if kg > 0 and not np.allclose(place, ipos[row, body], rtol=0, atol=1e-9):
                     _bolt_on(body, kg, np.array(place), row, mass, inertia, ipos, iquat)
                 else:
                     mass[row, body] += kg
         bat.set_const()
+
+
+def _in_parent(pos, quat, place) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """A place in a body's frame in that of its parent, (3,) [m]."""
+    turned = np.zeros(3)
+    mujoco.mju_rotVecQuat(turned, np.asarray(place), np.asarray(quat))
+    return np.asarray(pos) + turned
+
+
+def _from_parent(pos, quat, place) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """A place in the frame of a body's parent in that of the body, (3,) [m]."""
+    back, turned = np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(back, np.asarray(quat))
+    mujoco.mju_rotVecQuat(turned, np.asarray(place) - np.asarray(pos), back)
+    return turned
 
 
 def _welded(model: mujoco.MjModel, body: int) -> list[int]:
