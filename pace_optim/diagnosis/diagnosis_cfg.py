@@ -76,8 +76,8 @@ class VerdictCfg:
     """An effect must explain this part of what lies above the floor without it. A curve says more where it leaves less
     than this part of what effects leave, and an effect dominates above this share."""
     least: float = 0.01
-    """An effect beside a larger one on joints that move each other must explain this part of what that explains: so
-    much of its squared error the larger one's own model may leave to others, 10 % of its error."""
+    """An effect that does not lead near the floor must explain this part of what a larger one explains on joints of
+    its tree: a tenth of its error may be an error of its own model."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15

@@ -44,19 +44,20 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
 
     An effect is named where it explains most of what lies above the floor without it, and leads near the floor. Where
     it does not lead near the floor, its size must be far from none in its own error bars, alike in every recording,
-    away from its bounds, and one that drives have. Beside a larger effect it counts only on what that leaves far from
-    the floor, and if it explains a part of what that does: effects beside it take up what its model gets wrong.
+    away from its bounds, and one that drives have; and it must explain a part of what a larger effect beside it does.
+    Beside a larger effect it counts only on what that leaves far from the floor. For effects beside a larger one, also
+    on other joints of its tree, take up what the model of the larger one gets wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:
         return ["the error is near the floor without it"]
-    if evidence.without - evidence.left < cfg.verdict.least * evidence.larger:
-        return ["it explains next to nothing beside a larger effect"]
     if evidence.explained < cfg.verdict.most:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
     if evidence.left + evidence.harm <= near:
         return []
+    rise = evidence.without - evidence.left
     return [
+        *(["it explains little beside a larger effect"] if rise < cfg.verdict.least * evidence.larger else []),
         *(["its size is not significant"] if evidence.bars < cfg.verdict.bars else []),
         *(["its size differs between recordings"] if evidence.uneven > cfg.verdict.uneven else []),
         *(["it is at a bound"] if evidence.at_bound else []),
