@@ -105,7 +105,7 @@ def test_sizes_and_error_bars_are_those_of_least_squares():
     assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
 
 
-def test_a_value_that_joints_share_has_the_error_bar_of_them_all():
+def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step(monkeypatch):
     robot = joint_alone()
     base, both = JointModel.base(robot.problem), torch.tensor([True, True])
     none = torch.zeros(0, 2, dtype=torch.bool)
@@ -125,14 +125,25 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all():
     shared = replace(alone, model=replace(model, shared=frozenset({GAIN})), jacobian=None)
 
     class Fits:
+        change = 0.0
+
         def looked_at(self, problem, models):
             return [replace(each, jacobian=one, error=error) for each in models]
 
+        def trained_errors(self, problem, now):
+            return error + self.change * one[model.columns(GAIN).start]
+
+    problem = SimpleNamespace(physics_dt=1e-3, with_physics_dt=lambda dt: None)
     stds = [
-        [size["std"] for size in sizes(Fits(), SimpleNamespace(problem=None, final=final), ("hip", "knee"))]
+        [size["std"] for size in sizes(Fits(), SimpleNamespace(problem=problem, final=final), ("hip", "knee"))]
         for final in (alone, shared)
     ]
     assert stds[0][0] == stds[0][1] > 0 and stds[1] == pytest.approx([stds[0][0] / np.sqrt(2)] * 2)
+    # a finer step changes the errors as 0.01 more of the normalised gain does: the value makes up for that
+    monkeypatch.setattr(Fits, "change", 0.01)
+    (with_step, _) = sizes(Fits(), SimpleNamespace(problem=problem, final=alone), ("hip", "knee"))
+    slope = float(model.box.slope(alone.x)[0, model.columns(GAIN).start])
+    assert with_step["std"] == pytest.approx(np.hypot(stds[0][0], 0.01 * slope * 4 / 3), rel=1e-3)
 
 
 def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():

@@ -9,9 +9,11 @@ import torch
 
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.estimate.error_bars.step_share import FINER, TO_NO_STEP
 from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.simulation.problem import TwinProblem
 
 
 def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
@@ -34,6 +36,7 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
     if now.jacobian is None or now.error is None or now.model.shared:  # a common value was held while it was fitted
         now = fits.looked_at(outcome.problem, [now])[0]
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
+    std = torch.where(std > 0, torch.hypot(std, _step_shares(fits, outcome.problem, now)), std)
     result = []
     for effect, has in zip(now.model.effects, found, strict=True):
         columns = now.model.columns(effect)
@@ -82,6 +85,24 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
             covariance = sandwich(own[free].numpy(), error[..., j].double().numpy(), ANYWHERE)
             result[j, free] = torch.as_tensor(covariance.diagonal().copy()).clamp(min=0.0).sqrt() * slope[j, free]
     return result
+
+
+def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
+    """What of each value makes up for the physics step, physical (n, P), as in a fit's error bars (``step_share``).
+
+    The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c.
+    """
+    columns, error, result = now.free_jacobian, now.error, torch.zeros_like(now.x)
+    if error is None:
+        raise ValueError("Error bars need a model that was fitted with keep_jacobian.")
+    finer = fits.trained_errors(problem.with_physics_dt(problem.physics_dt / FINER), now)
+    change = (TO_NO_STEP * (finer - error)).double()
+    for j in range(now.model.num_joints):
+        own = columns[..., j].double().flatten(1)
+        free = own.norm(dim=1).nonzero()[:, 0]
+        move = torch.linalg.lstsq(own[free].T, change[..., j].flatten()[:, None], driver="gelsd").solution[:, 0]
+        result[j, free] = move
+    return result * now.model.box.slope(now.x)
 
 
 def error_bars_from_none(now: Fitted) -> torch.Tensor:

@@ -11,10 +11,10 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
-_FINER = 4
+FINER = 4
 """A step this many times finer stands for none: what is left then is a third of what changes (an error of first order,
 as that of friction that turns within a step, whatever the integrator)."""
-_TO_NO_STEP = _FINER / (_FINER - 1)
+TO_NO_STEP = FINER / (FINER - 1)
 
 
 def change_without_step(problem: Problem, physical: torch.Tensor, there: Residuals) -> torch.Tensor | None:
@@ -28,8 +28,8 @@ def change_without_step(problem: Problem, physical: torch.Tensor, there: Residua
     Returns:
         The change; ``None`` where the finer simulation diverges.
     """
-    finer = problem.with_physics_dt(problem.physics_dt / _FINER)
-    change = _TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
+    finer = problem.with_physics_dt(problem.physics_dt / FINER)
+    change = TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
     return change if bool(change.isfinite().all()) else None
 
 

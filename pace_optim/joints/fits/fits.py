@@ -120,6 +120,11 @@ class Fits:
         cut = partial(block_errors, where=where[:count], control_dt=problem.control_dt, weight=weight, cfg=self.cfg)
         return [cut(error) for error in errors]
 
+    def trained_errors(self, problem: TwinProblem, now: Fitted) -> torch.Tensor:
+        """A model's errors on what is trained on, where fits take them, (K, R, n) [rad]."""
+        batch = self.batch(problem, [Slot(model=now.model, rows=1)], training=True)
+        return batch.simulate([now.physical[None]], batch.dataset.train, self.cfg.stride)[0].cpu()
+
     def on_joints(
         self, problem: TwinProblem, starts: Sequence[Fitted], joints: torch.Tensor, errors: BlockErrors
     ) -> tuple[list[Fitted], list[BlockErrors]]:
