@@ -112,9 +112,8 @@ class LinksCfg:
     near: float = 3.0
     """Links are named if at most this many times the noise is left: it is what an effect must lead to, too."""
     explains: float = 0.5
-    """A link is fitted if it would explain this part of the score above the noise, to first order."""
-    pays: float = 1.5
-    """What a link must lower the error by."""
+    """A link is fitted if it would explain this part of the squared error above the noise, to first order, and is kept
+    if it does."""
     alike: float = 1.10
     """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
     share: float = 0.25

@@ -121,7 +121,7 @@ def find_wrong_links(
         screened = _screened(now, found, cfg)
         joint_of = joint_of or screened.joint_of
         best = _best_addition(now, found, screened.links, noise, say, cfg)
-        if best is None or best.rmse * cfg.pays > now.rmse:
+        if best is None or best.rmse**2 > (1 - cfg.explains) * now.rmse**2 + cfg.explains * noise**2:
             break
         now, found = best, best.problem.env_cfg.sim2real.links
     if not found:
