@@ -11,6 +11,11 @@ from pace_optim.joints.fits.reference_update import ReferenceUpdate
 FLOOR = 0.5
 
 
+def fitted_with(score):
+    """A model without effects, by its score."""
+    return SimpleNamespace(score=score, model=SimpleNamespace(effects=()))
+
+
 class Robot:
     """How far its model is from its reference, where it moves, and how well the model fits there, each time one looks.
 
@@ -33,7 +38,7 @@ class Robot:
     def side_by_side(self, problem, starts, max_iteration):
         assert problem == "windows"
         self.fits += 1
-        return [SimpleNamespace(score=torch.tensor(next(self.scores)))]
+        return [fitted_with(torch.tensor(next(self.scores)))]
 
     def follow(self, position, n=1):
         """Whether it is the same reference and the same model, and where the reference is."""
@@ -54,7 +59,7 @@ class Robot:
                 return robot.side_by_side(*args)
 
         motion = Made(fits=Fake(), problem=self.problem, candidates=(), enough=torch.full((n,), FLOOR))
-        twins, now = self.twins(self.path(position)), SimpleNamespace(score=torch.full((n,), 40.0))
+        twins, now = self.twins(self.path(position)), fitted_with(torch.full((n,), 40.0))
         along, fitted = motion.follow(twins, now)
         return along is twins, fitted is now, float(along.path.position)
 

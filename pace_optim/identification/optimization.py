@@ -186,12 +186,12 @@ class Optimization:
             end = other.way.begin([least.x])
             if end.score < least.score:
                 found, least = other, end
-        refuted = best.score - least.score > UNEXPLAINED * (least.score - noise)
-        return (found, least) if refuted else (course, best)
+        return (found, least) if _refutes(least, best, noise) else (course, best)
 
     def _finer_step(self, course: _Course, best: Descent) -> _Course:
         """The way at a finer physics step, where the step makes much of what the pieces leave above the noise."""
-        while best.score > _STEP_IN_DOUBT**2 * noise_score(course.problem):
+        noise = noise_score(course.problem)
+        while best.score > _STEP_IN_DOUBT**2 * noise:
             physical = course.problem.space.to_physical(best.x)
             with course.way.pieces.again():  # it was simulated before
                 there = course.way.pieces.residuals(physical[None])
@@ -199,7 +199,7 @@ class Optimization:
             if finer is None:
                 break
             end = finer.way.begin([best.x])
-            if not end.score < best.score:
+            if not _refutes(end, best, noise):
                 break
             course, best = finer, end
         return course
@@ -402,3 +402,8 @@ class Optimization:
         if self.optimizer is not None and self.optimizer.generation:
             return self._best_of(self.optimizer)
         return self.problem.space.start
+
+
+def _refutes(end: Descent, best: Descent, noise: float) -> bool:
+    """Whether the end with other facts explains more than what it leaves open, not only a little by going on."""
+    return best.score - end.score > UNEXPLAINED * (end.score - noise)
