@@ -35,8 +35,8 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
-"""What the stages' names begin with on the way of another loop, and at a finer step."""
+OTHER_LOOP, FINER_STEP, LAST_STEP = "loop of {:g} s, ", "step of {:g} s, ", "at the end, step of {:g} s, "
+"""What the stages' names begin with on the way of another loop, and at a finer step: tried on pieces, or at the end."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _STEP_IN_DOUBT = 1.3
@@ -195,7 +195,8 @@ class Optimization:
             physical = course.problem.space.to_physical(best.x)
             with course.way.pieces.again():  # it was simulated before
                 there = course.way.pieces.residuals(physical[None])
-            finer = self._at_half_the_step(course.problem, there, change_without_step(course.pieces, physical, there))
+            change = change_without_step(course.pieces, physical, there)
+            finer = self._at_half_the_step(course.problem, there, change, FINER_STEP)
             if finer is None:
                 break
             end = finer.way.begin([best.x])
@@ -204,13 +205,16 @@ class Optimization:
             course, best = finer, end
         return course
 
-    def _at_half_the_step(self, problem: Problem, there: Residuals, change: torch.Tensor | None) -> _Course | None:
+    def _at_half_the_step(
+        self, problem: Problem, there: Residuals, change: torch.Tensor | None, name: str
+    ) -> _Course | None:
         """The course at half the physics step, where the step makes much of what residuals (m = 1) leave.
 
         Args:
             problem: Of these residuals.
             there: The residuals.
             change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
+            name: What its stages' names begin with, for the step.
         """
         noise, score = noise_score(problem), float(there.score[0])
         if change is None or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
@@ -221,7 +225,7 @@ class Optimization:
         self._halvings += 1
         finer = problem.with_physics_dt(problem.physics_dt / 2)
         self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
-        return self._course(finer, FINER_STEP.format(finer.physics_dt))
+        return self._course(finer, name.format(finer.physics_dt))
 
     def at_half_the_step(
         self, problem: Problem, x: torch.Tensor, there: Residuals, change: torch.Tensor | None
@@ -237,7 +241,7 @@ class Optimization:
         Returns:
             The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
         """
-        finer = self._at_half_the_step(problem, there, change)
+        finer = self._at_half_the_step(problem, there, change, LAST_STEP)
         if finer is None:
             return None
         end = finer.way.near(x, NEAR)
