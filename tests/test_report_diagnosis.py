@@ -1,5 +1,7 @@
 """The report tells what a diagnosis found."""
 
+from dataclasses import replace
+
 import pytest
 from browser import CHROMIUM, Browser
 from diagnoses import make_diagnosis
@@ -45,6 +47,21 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     text = page_of(with_it).text
     assert "This run is the fit with it." in text and "What was missing is in this run" in text
     assert "Add it" not in text and "An effect is missing" not in text
+
+
+def test_the_run_with_a_wrong_link_is_not_told_to_add_it(tmp_path):
+    mass = {"parameter": "link_mass", "unit": "kg", "file": 0.5, "found": 0.8, "std": 0.01}
+    wrong = [{"link": "shank", "parts": ["mass"], "values": [mass], "label": "shank@mass"}]
+    told = make_diagnosis("link") | {"added": [], "paying": [], "links": wrong}
+    without, with_it = (folder_with(tmp_path / name, told) for name in ("without", "with"))
+    result = make_result()
+    link = {"parameters": {"shank": 0.8}, "std": {"shank": 0.01}, "units": "kg"}
+    result = replace(result, **{name: {**getattr(result, name), "link_mass": value} for name, value in link.items()})
+    result.save(with_it / "result.json")
+    text = page_of(without).text
+    assert "A link of the model file is wrong" in text and "--links shank@mass" in text
+    text = page_of(with_it).text
+    assert "What was missing is in this run" in text and "Add it" not in text
 
 
 def test_commands_in_the_advice_can_be_copied(tmp_path):

@@ -28,7 +28,7 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        callout(content, run.result.effects),
+        callout(content, run.result),
         _sizes(content),
         _ladder(content),
         _error_map(content),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from pace_actuators.text import in_words, size_text
+from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
 from ..markup import bullets, html, joined
@@ -47,16 +47,18 @@ def _in_short(run: RunData) -> Markup:
     ]
     link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
     more = [*([bullets(said, "notes")] if said else []), _refit_link(run, content), link]
-    return callout(content, run.result.effects, joined(more))
+    return callout(content, run.result, joined(more))
 
 
-def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = "") -> Markup:
-    """What is missing, and how to add it to a run that had these effects."""
+def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") -> Markup:
+    """What is missing, and how to add it to a run, unless that has it."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
-    links = [link["label"] for link in content.get("links", [])]
-    has_it = bool(effects) and set(effects) <= set(had)
-    if has_it and content["verdict"] == "effect":
+    links = {link["label"]: link for link in content.get("links", [])}
+    found = {(value["parameter"], link["link"]) for link in links.values() for value in link["values"]}
+    sought = {(name, key) for name, values in run.parameters.items() for key in values}
+    has_it = bool(effects or links) and set(effects) <= set(run.effects) and found <= sought
+    if has_it and content["verdict"] in ("effect", "link"):
         heading = "What was missing is in this run"
     if content.get("free_form"):
         part_known = "only a part of it is known" if content["added"] else "no known effect explains it"
@@ -72,7 +74,7 @@ def callout(content: dict[str, Any], had: Sequence[str], more: Markup | str = ""
         heading=heading,
         summary=content["summary"],
         has_it=has_it,
-        effects=shlex.join(dict.fromkeys([*had, *effects])),
+        effects=shlex.join(dict.fromkeys([*run.effects, *effects])),
         links=shlex.join(links),
         why="Add it" if content["added"] or links else "Until it is known, this lowers the error",
         command=command("fit"),
