@@ -127,6 +127,7 @@ def run(name: str, case: Case, cases: Path, folder: Path) -> None:
     result = json.loads((path / "result.json").read_text())
     kept = {name: result[name] for name in ("parameters", "delay_s", "std", "rmse", "undetermined", "at_bound")}
     kept |= {name: result[name] for name in ("warnings", "notes", "times_noise")}
+    kept["findings"] = result.get("findings", [])
     text = {"command": " ".join(command), "said": "\n".join(said), "wall_time_s": time.monotonic() - started}
     done.write_text(json.dumps({**kept, **text, "right": right}, indent=1))
 

@@ -48,7 +48,7 @@ def test_a_fit_reaches_what_is_true(name, tmp_path):
         assert value == pytest.approx(case.right["encoder_bias"], abs=2e-3)
     right = LEG_ACTS_AT if name == "leg_mcap" else case.right["delay_ms"]
     assert 1e3 * found["delay_s"] == pytest.approx(right, abs=0.4)
-    assert ("up to 7.5 ms" in " ".join(found["notes"])) == (name == "leg_mcap")
+    assert ("up to 7.5 ms" in " ".join([*found["notes"], *found["findings"]])) == (name == "leg_mcap")
     assert name in table(tmp_path)
 
 

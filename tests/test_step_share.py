@@ -7,11 +7,13 @@ from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
 from test_uncertainty import linear
 
 from pace_envs import set_physics_dt
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim import fit
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
 from pace_optim.recording import save_recording
 from pace_optim.run.folder import RunFolder
@@ -103,13 +105,11 @@ def test_a_step_that_shows_in_the_error_is_halved_unless_it_is_stated(tmp_path, 
 
 
 def test_a_fit_goes_on_at_a_finer_step_where_its_step_shows(tmp_path):
-    """On pieces, before the whole recordings are simulated at a step that is too long."""
     recorded = env_cfg()
     set_physics_dt(recorded, 0.0003125)
-    problem = make_problem(record(chirp(1.0), CALM, cfg=recorded, noise=3e-6))
+    problem = make_problem(record(chirp(1.0), CALM, cfg=recorded, noise=4e-5))
     settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path))
     run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
-    run.run()
-    stages = [each.stage for each in run.descents]
-    assert stages == ["pieces", "step of 0.00125 s, pieces", "step of 0.000625 s, pieces", "step of 0.000625 s, whole"]
-    assert run.problem.physics_dt == 0.000625 and run.ended.score < 0.1 * run.descents[0].score
+    result = conclude(run, EnvironmentRecord.of(BENCH, problem.env_cfg), run.run())
+    assert [each.stage for each in run.descents] == ["pieces", "whole", "step of 0.00125 s, whole"]
+    assert result.physics_dt == 0.00125 and run.ended.score < 0.5 * run.descents[1].score

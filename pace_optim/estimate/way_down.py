@@ -2,8 +2,8 @@
 
 1. Descend on pieces: windows of two seconds, a share of each recording. Over a short time the error bends less, and
    has fewer valleys.
-2. Where that ends above the noise, descend with other facts: the rate of the drives' loops, the physics step. The way
-   goes on with those that explain more.
+2. Where that ends above the noise, and the rate of the drives' loops is assumed, descend with others. The way goes on
+   with one that explains more.
 3. Where that ends far above the noise, search the pieces around the best end by CMA-ES, one strategy for each kinematic
    tree. Armatures, frictions and the like are searched by magnitude. The search may simulate a stated multiple of what
    the descents took. Descend again from its best.

@@ -14,7 +14,6 @@ from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
-from pace_optim.estimate.error_bars.step_share import change_without_step
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
@@ -35,8 +34,8 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP, LAST_STEP = "loop of {:g} s, ", "step of {:g} s, ", "at the end, step of {:g} s, "
-"""What the stages' names begin with on the way of another loop, and at a finer step: tried on pieces, or at the end."""
+OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
+"""What the stages' names begin with on the way of another loop, and at a finer step."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _STEP_IN_DOUBT = 1.3
@@ -68,8 +67,6 @@ class _Course:
     """A problem and the way down with it."""
 
     problem: Problem
-    pieces: Problem
-    """The same on pieces of the recordings."""
     evaluator: Evaluator
     """On the recordings that are trained on."""
     assessor: Evaluator
@@ -130,7 +127,7 @@ class Optimization:
             name=name,
         )
         way.descents = [d for d in self._restored if d.stage in way.stages]
-        course = _Course(problem=problem, pieces=pieces, evaluator=evaluator, assessor=problem.evaluator(), way=way)
+        course = _Course(problem=problem, evaluator=evaluator, assessor=problem.evaluator(), way=way)
         self._courses.append(course)
         return course
 
@@ -161,22 +158,12 @@ class Optimization:
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
-    def _elsewhere(self, best: Descent) -> WayDown | None:
-        """The way with another loop rate or a finer step, begun at the best end on pieces, where they explain more."""
-        course, best = self._other_loop(self._in_use, best)
-        course = self._finer_step(course, best)
-        if course is self._in_use:
-            return None
-        self._use(course)
-        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
-        return course.way
-
-    def _other_loop(self, course: _Course, best: Descent) -> tuple[_Course, Descent]:
-        """The way of loops at another rate and its end on pieces, where that refutes the assumed rate."""
-        problem, noise = course.problem, noise_score(course.problem)
+    def _with_other_loop(self, best: Descent) -> WayDown | None:
+        """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
+        problem, noise = self.problem, noise_score(self.problem)
         if not problem.assumes_loop_rate:
-            return course, best
-        found, least = course, best
+            return None
+        found, least = None, best
         for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
             if period == problem.loop_dt or least.score <= _LOOP_IN_DOUBT**2 * noise:
                 continue
@@ -186,46 +173,11 @@ class Optimization:
             end = other.way.begin([least.x])
             if end.score < least.score:
                 found, least = other, end
-        return (found, least) if _refutes(least, best, noise) else (course, best)
-
-    def _finer_step(self, course: _Course, best: Descent) -> _Course:
-        """The way at a finer physics step, where the step makes much of what the pieces leave above the noise."""
-        noise = noise_score(course.problem)
-        while best.score > _STEP_IN_DOUBT**2 * noise:
-            physical = course.problem.space.to_physical(best.x)
-            with course.way.pieces.again():  # it was simulated before
-                there = course.way.pieces.residuals(physical[None])
-            change = change_without_step(course.pieces, physical, there)
-            finer = self._at_half_the_step(course.problem, there, change, FINER_STEP)
-            if finer is None:
-                break
-            end = finer.way.begin([best.x])
-            if not _refutes(end, best, noise):
-                break
-            course, best = finer, end
-        return course
-
-    def _at_half_the_step(
-        self, problem: Problem, there: Residuals, change: torch.Tensor | None, name: str
-    ) -> _Course | None:
-        """The course at half the physics step, where the step makes much of what residuals (m = 1) leave.
-
-        Args:
-            problem: Of these residuals.
-            there: The residuals.
-            change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
-            name: What its stages' names begin with, for the step.
-        """
-        noise, score = noise_score(problem), float(there.score[0])
-        if change is None or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+        if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
             return None
-        of_step = float(change.square().sum() / there.where.sum())
-        if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
-            return None
-        self._halvings += 1
-        finer = problem.with_physics_dt(problem.physics_dt / 2)
-        self.progress.say(f"the physics step shows: going on with one of {1e3 * finer.physics_dt:g} ms")
-        return self._course(finer, name.format(finer.physics_dt))
+        self._use(found)
+        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
+        return found.way
 
     def at_half_the_step(
         self, problem: Problem, x: torch.Tensor, there: Residuals, change: torch.Tensor | None
@@ -241,11 +193,18 @@ class Optimization:
         Returns:
             The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
         """
-        finer = self._at_half_the_step(problem, there, change, LAST_STEP)
-        if finer is None:
+        noise, score = noise_score(problem), float(there.score[0])
+        if change is None or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
             return None
+        of_step = float(change.square().sum() / there.where.sum())
+        if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
+            return None
+        self._halvings += 1
+        problem = problem.with_physics_dt(problem.physics_dt / 2)
+        self.progress.say(f"the physics step shows: going on with one of {1e3 * problem.physics_dt:g} ms")
+        finer = self._course(problem, FINER_STEP.format(problem.physics_dt))
         end = finer.way.near(x, NEAR)
-        if not end.score < float(there.score[0]):
+        if not end.score < score:
             return None
         self._use(finer)
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
@@ -285,7 +244,7 @@ class Optimization:
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)
-            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._with_other_loop)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
@@ -406,8 +365,3 @@ class Optimization:
         if self.optimizer is not None and self.optimizer.generation:
             return self._best_of(self.optimizer)
         return self.problem.space.start
-
-
-def _refutes(end: Descent, best: Descent, noise: float) -> bool:
-    """Whether the end with other facts explains more than what it leaves open, not only a little by going on."""
-    return best.score - end.score > UNEXPLAINED * (end.score - noise)
