@@ -276,11 +276,16 @@ class MotorCoordinates:
             damping = sim.expand("dof_damping")
             damping[:, self.columns] = damping[:, self.columns] @ self._share.T
 
+    def _turn(self, matrix: torch.Tensor) -> None:
+        """Multiply positions and speeds of all groups by a matrix."""
+        sim = self._sim
+        sim.qpos[:, self.places] = sim.qpos[:, self.places] @ matrix.T
+        sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ matrix.T
+
     def to_joints(self) -> None:
         """Turn motors' coordinates, torques and what they carry into those of joints: before MuJoCo computes."""
         sim = self._sim
-        sim.qpos[:, self.places] = sim.qpos[:, self.places] @ self.inverse.T
-        sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ self.inverse.T
+        self._turn(self.inverse)
         sim.qfrc_applied[:, self.columns] = sim.qfrc_applied[:, self.columns] @ self.matrix
         for field, carried in self.carried.items():
             of_joints = sim.expand(f"dof_{field}")
@@ -293,8 +298,7 @@ class MotorCoordinates:
     def to_motors(self) -> None:
         """Turn them back."""
         sim = self._sim
-        sim.qpos[:, self.places] = sim.qpos[:, self.places] @ self.matrix.T
-        sim.qvel[:, self.columns] = sim.qvel[:, self.columns] @ self.matrix.T
+        self._turn(self.matrix)
         if self._shares:
             damping = sim.expand("dof_damping")
             damping[:, self.columns] = damping[:, self.columns] @ self._gather.T

@@ -175,8 +175,10 @@ class Simulation:
             yield
             return
         self.coordinates.to_joints()
-        yield
-        self.coordinates.to_motors()
+        try:
+            yield
+        finally:
+            self.coordinates.to_motors()
 
     @property
     def qfrc_bias(self) -> torch.Tensor:

@@ -388,6 +388,23 @@ def test_a_weak_combination_is_found_and_its_error_bars_are_those_without_the_ra
     assert best.iteration < 20 and rattling.rows < 200
 
 
+class Misled(Rattling):
+    """The same, whose longer step sees nothing but a rattle that is larger than the error."""
+
+    looks_coarser = True
+
+    def look_around(self, x, where=None, own_step=False):
+        every = self.residuals(x, where)
+        wild = torch.randn(every.error.shape, generator=torch.Generator().manual_seed(self.rows))
+        return every.rows(0, 1), every if own_step else dataclasses.replace(every, error=wild.double())
+
+
+def test_where_a_longer_step_leads_nowhere_the_fits_own_leads_on():
+    """Hands of small links ended as converged with a fifth of their values wrong."""
+    best, right = (least_squares(each(), dense(3), [rattling_start()])[0] for each in (Misled, Rattling))
+    assert best.own_step and not right.own_step and best.score < 1.05 * right.score
+
+
 def test_a_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
     whole = least_squares(Rattling(), dense(3), [rattling_start()])[0]
     for stop in range(1, whole.iteration):

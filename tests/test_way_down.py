@@ -6,6 +6,7 @@ from problems import chirp, env_cfg, make_problem, normalised, record
 
 from pace_envs import set_physics_dt
 from pace_optim.estimate.derivatives import colour
+from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, checkpoint_of, least_squares
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
 
@@ -65,6 +66,18 @@ def test_derivatives_of_a_longer_step_lead_to_the_end_of_the_finer_one(problem, 
     torch.testing.assert_close(best.x, expected.x, atol=1e-4, rtol=0)
     at_the_finer_step = sum(rollout.simulated_steps for rollout in nearby._rollouts.values())
     assert at_the_finer_step < 0.65 * plain.simulated_steps
+
+
+def test_the_derivatives_of_the_error_bars_lead_from_beside_the_minimum_into_it(colouring):
+    """A descent by derivatives of a longer step stops beside it."""
+    cfg = env_cfg()
+    set_physics_dt(cfg, cfg.sim.dt / 4)
+    fine = make_problem(record(cfg=cfg)).with_physics_dt(cfg.sim.dt)
+    nearby = fine.training_evaluator()
+    beside = least_squares(nearby, colouring, [centre(fine)], LeastSquaresCfg(max_iteration=2))[0]
+    known = assess(fine, fine.evaluator(), colouring, beside.x, beside, nearby)
+    assert beside.score > 1e-8 and float(known.jacobian.residuals.score[0]) < 1e-6 * beside.score
+    torch.testing.assert_close(known.x, normalised(fine), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

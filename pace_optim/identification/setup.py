@@ -34,7 +34,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str
     Args:
         settings: What to fit, and how.
         env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
-        tell: Is told how the recordings are understood, and warnings of them.
+        tell: Gets how the recordings are understood, and warnings of them.
 
     Raises:
         ValueError: If anything does not fit.

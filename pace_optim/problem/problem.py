@@ -349,7 +349,7 @@ def load_problem(
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
         max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
             as a fit can afford.
-        tell: Is told what was understood of logs, set aside, and cut.
+        tell: Gets what was understood of logs, set aside, and cut.
 
     Raises:
         ValueError: If anything does not fit.

@@ -82,7 +82,7 @@ def read_logs(
         columns: Column map of the logs among them; ``None``: guessed.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one that cannot be used refuses all, instead of being set aside.
-        tell: Is told what was understood of logs, and what was set aside.
+        tell: Gets what was understood of logs, and what was set aside.
 
     Raises:
         ValueError: If none of a group can be used, or one cannot and ``strict``; or a joint can be neither identified
@@ -132,7 +132,7 @@ def conform_all(
         env: The robot, its other joints held.
         control_dt: Control step [s].
         strict: As for :func:`read_logs`.
-        tell: Is told what was set aside.
+        tell: Gets what was set aside.
 
     Raises:
         ValueError: As for :func:`read_logs`.

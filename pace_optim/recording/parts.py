@@ -50,7 +50,7 @@ def affordable(
         columns: Parameters whose derivatives are computed each by itself.
         evaluations: Of the accelerations in a control step.
         max_duration: How long each may be [s]; ``None``: as long as there are not too many derivatives.
-        tell: Is told what was left out.
+        tell: Gets what was left out.
 
     Raises:
         ValueError: If there is too little memory for what was asked.

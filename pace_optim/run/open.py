@@ -151,7 +151,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str],
     Args:
         settings: Of a fit; its task and effects are known.
         env_cfg: The task's configuration, if it has been loaded.
-        tell: Is told how the recordings are understood.
+        tell: Gets how the recordings are understood.
     """
     return load_problem(
         settings.task,

@@ -78,7 +78,7 @@ def assess(
     """
     training = training or problem.training_evaluator()
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
-    goes_on = ended is not None and ended.stop_reason and training.looks_coarser
+    by_longer = ended if ended is not None and ended.stop_reason and training.looks_coarser else None
     for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
         around = stencil(x, colouring, hessian, noise, score)
@@ -87,8 +87,8 @@ def assess(
         every = training.residuals(problem.space.to_physical(probes.vectors), initial_offset=probes.offset)
         there, noise, score = around.jacobian(every), around.noise(every), float(every.rows(0, 1).score[0])
         blind, initial = hessian is None, probes.initial(every.error)
-        if ended is not None and goes_on:
-            x, there = _gone_on(training, ended, x, there)
+        if by_longer is not None:
+            x, there = _gone_on(training, by_longer, x, there)
         gained = score - float(there.residuals.score[0])
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break

@@ -56,8 +56,6 @@ class LoopRates:
     """The period that is taken where the recordings tell none [s]."""
     fitted: float
     """The period that was fitted with [s]."""
-    score: float = 0.0
-    """The lowest that any of them leaves on the training samples [rad²]."""
 
     @property
     def allowed(self) -> tuple[float, ...]:
@@ -187,7 +185,6 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         weights=likelihood / likelihood.sum(),
         assumed=problem.assumed_loop,
         fitted=fitted,
-        score=least,
     )
 
 

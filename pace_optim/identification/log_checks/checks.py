@@ -681,7 +681,7 @@ def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] =
     Args:
         problem: What is to be fitted.
         trust: Whether a log that no fit can be right of is only warned of.
-        tell: Is told the warnings.
+        tell: Gets the warnings.
 
     Raises:
         ValueError: If no fit of the log can be right.

@@ -54,7 +54,7 @@ def load_recordings(
             folder of a LeRobot dataset, a .csv with any names, or CSV files of one log joined by `+`.
         robot: The robot's joints and limits; without it, the log's own names are kept.
         columns: Which column is what; without it, it is guessed.
-        tell: Is told what a guess understood.
+        tell: Gets what a guess understood.
 
     Raises:
         ValueError: If nothing can be read; the message says all that is missing.
