@@ -3,7 +3,7 @@
 python benchmarks/hidden_effects.py --cases effects,clean --seeds 5
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --number alike=1.05 --number next_effect=1.15
-python benchmarks/decisions.py logs/hidden_effects/*/*.jsonl --save tests/decisions/reference.jsonl.gz
+python benchmarks/decisions.py logs/hidden_effects/*/*.jsonl --save reference.jsonl.gz
 """
 
 from __future__ import annotations

@@ -1,0 +1,174 @@
+"""The verdict comes first: on the terminal, in the report, and how large what was found is."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from diagnoses import FITS, joint_alone, make_diagnosis, outcome_of
+from pages import page_of
+from run_folders import write_run
+
+from pace_actuators.effects import get_effect
+from pace_actuators.files import write_json
+from pace_actuators.text import size_text
+from pace_optim.diagnosis import Diagnosis
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
+from pace_optim.diagnosis.findings.findings import percent_text
+from pace_optim.diagnosis.findings.text import lines_of
+from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
+from pace_optim.diagnosis.verdict.verdict import likes
+from pace_optim.estimate.error_bars.uncertainty import sandwich
+from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.model import JointModel
+
+GAIN = get_effect("torque_gain")
+SIZE = {
+    "effect": "torque_gain",
+    "parameter": "gain",
+    "joint": "knee",
+    "value": 0.45,
+    "std": 0.0023,
+    "unit": "1",
+    "factor": 0.45,
+    "at_bound": False,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, "0.45 ± 0.002 times what was stated"),
+        ({"std": None, "at_bound": True}, "0.45 times what was stated, at its bound"),
+        ({"factor": None, "value": 1.2345, "unit": "N m", "std": 0.01}, "1.234 ± 0.01 N m"),
+        ({"factor": None, "value": 0.1, "std": None}, "0.1"),
+    ],
+)
+def test_a_size_is_told_with_its_error_bar_and_as_a_factor_where_it_is_one(changes, text):
+    assert size_text(SIZE | changes) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.876, "88"), (0.0042, "0.4"), (7e-7, "below 0.1"), (0.0, "below 0.1"), (-0.02, "-2")]
+)
+def test_a_share_is_told_as_a_person_reads_it(share, text):
+    """It said 7e-05 %."""
+    assert percent_text(share) == text
+
+
+def test_what_multiplies_what_was_stated_is_a_factor():
+    gain = GAIN.parameters[0]
+    assert factor_of(GAIN, gain, gain.null) == 1.0
+    assert factor_of(get_effect("torque_offset"), get_effect("torque_offset").parameters[0], 2.0) is None
+
+
+def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
+    content = make_diagnosis() | {
+        "sizes": [SIZE | {"at_bound": True}],
+        "likes": {"torque_gain": ["payload"]},
+        "advice": ["Record more."],
+    }
+    lines = lines_of(Diagnosis(**content))
+    assert lines[0] == "verdict: effect" and lines[1] == content["summary"]
+    assert lines[2].endswith("times what was stated, at its bound")
+    assert lines[3:6] == [
+        "At its bound: torque_gain (knee).",
+        "torque_gain cannot be separated from payload.",
+        "- Record more.",
+    ]
+
+
+def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
+    folder, refit = write_run(tmp_path / "run"), write_run(tmp_path / "refit")
+    content = make_diagnosis() | {"sizes": [SIZE] * 6, "likes": {"torque_gain": ["payload"]}}
+    content["runs"] = [str(folder), str(refit)]
+    for each in (folder, refit):
+        write_json(each / "diagnosis.json", content)
+    pages = [page_of(each) for each in (folder, refit)]
+    for page in pages:
+        first = page.text.split("Error of each joint")[0]
+        assert "An effect is missing, and it is known" in first and "0.45 ± 0.002 times what was stated" in first
+        assert "and 2 more" in first and "torque_gain cannot be separated from payload" in first
+    html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
+    assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
+
+
+def test_sizes_and_error_bars_are_those_of_least_squares():
+    robot = joint_alone()
+    model, none = JointModel.base(robot.problem), torch.zeros(1, 1, dtype=torch.float64)
+    extended, values = model.extended(robot.truth_values, GAIN, torch.tensor([True]), none + GAIN.parameters[0].null)
+    now = FITS.side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
+    outcome = SimpleNamespace(problem=robot.twins, final=now, cfg=DEFAULT)
+    (size,) = sizes(FITS, outcome, ("servo",))
+    assert size["effect"] == "torque_gain" and size["joint"] == "servo" and not size["at_bound"]
+    assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
+
+
+def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step(monkeypatch):
+    robot = joint_alone()
+    base, both = JointModel.base(robot.problem), torch.tensor([True, True])
+    none = torch.zeros(0, 2, dtype=torch.bool)
+    base = replace(
+        base,
+        has=none,
+        lower=base.lower.repeat(2, 1),
+        upper=base.upper.repeat(2, 1),
+        ranges=base.ranges.repeat(2, 1),
+        efforts=base.efforts.repeat(2),
+    )
+    model, physical = base.extended(robot.truth_values.repeat(2, 1), GAIN, both, torch.ones(2, 1).double())
+    generator = torch.Generator().manual_seed(0)
+    one = torch.randn(model.size, 400, 1, 1, generator=generator).repeat(1, 1, 1, 2)
+    error = 1e-4 * torch.randn(400, 1, 1, generator=generator).repeat(1, 1, 2)
+    alone = replace(Fitted.start(model, physical), jacobian=one, error=error)
+    shared = replace(alone, model=replace(model, shared=frozenset({GAIN})), jacobian=None)
+
+    class Fits:
+        change = 0.0
+
+        def looked_at(self, problem, models):
+            return [replace(each, jacobian=one, error=error) for each in models]
+
+        def trained_errors(self, problem, now):
+            return error + self.change * one[model.columns(GAIN).start]
+
+    problem = SimpleNamespace(physics_dt=1e-3, with_physics_dt=lambda dt: None)
+    stds = [
+        [size["std"] for size in sizes(Fits(), SimpleNamespace(problem=problem, final=final), ("hip", "knee"))]
+        for final in (alone, shared)
+    ]
+    assert stds[0][0] == stds[0][1] > 0 and stds[1] == pytest.approx([stds[0][0] / np.sqrt(2)] * 2)
+    # a finer step changes the errors as 0.01 more of the normalised gain does: the value makes up for that
+    monkeypatch.setattr(Fits, "change", 0.01)
+    (with_step, _) = sizes(Fits(), SimpleNamespace(problem=problem, final=alone), ("hip", "knee"))
+    slope = float(model.box.slope(alone.x)[0, model.columns(GAIN).start])
+    assert with_step["std"] == pytest.approx(np.hypot(stds[0][0], 0.01 * slope * 4 / 3), rel=1e-3)
+
+
+def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():
+    generator = np.random.default_rng(0)
+    columns, error = generator.normal(size=(2, 4000, 1)), 0.1 * generator.normal(size=(4000, 1))
+    flat = columns[..., 0]
+    expected = 0.01 * np.linalg.inv(flat @ flat.T)
+    assert np.sqrt(sandwich(columns, error).diagonal()) == pytest.approx(np.sqrt(expected.diagonal()), rel=0.1)
+
+
+def test_what_only_a_sum_shows_is_known_by_its_bounds_alone():
+    """An encoder bias and the phase of a ripple on a joint that gravity does not load: had error bars of 200 N m."""
+    generator = np.random.default_rng(0)
+    first, second = generator.normal(size=(2, 4000, 1))
+    error = 0.1 * generator.normal(size=(4000, 1))
+    covariance = sandwich(np.stack([first, first, second]), error, prior=1 / 3)
+    apart = sandwich(np.stack([first, second]), error)
+    assert covariance[0, 0] == pytest.approx(1 / 6, rel=0.01)  # half of what both were free by
+    assert covariance[:2, :2].sum() == pytest.approx(apart[0, 0], rel=0.01)  # while their sum is known
+    assert covariance[2, 2] == pytest.approx(apart[1, 1], rel=0.01)
+
+
+def test_likes_are_the_rivals_of_what_the_model_has_in_the_end():
+    other = get_effect("payload")
+    round_ = SimpleNamespace(chosen=[GAIN, None], rivals=[[other], []], models={GAIN: None, other: None})
+    outcome = outcome_of([1e-3, 1e-3], [1e-4, 1e-3], [GAIN], [[True, False]], [round_])
+    assert likes(outcome) == {"torque_gain": ["payload"]}
+    assert likes(outcome_of([1e-3] * 2, [1e-4] * 2, [GAIN], [[False, True]], [round_])) == {}

@@ -1,0 +1,25 @@
+"""What a resume restores is what was interrupted, whatever kernels the libraries choose for the processor."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from places import ROOT, SUPPORT
+
+
+@pytest.mark.parametrize(
+    ("core", "capability", "threads"),
+    [("Haswell", "default", 1), ("SkylakeX", "avx2", 2), ("Zen", "avx2", 1), ("Zen", "default", 2)],
+)
+def test_a_resumed_fit_is_the_one_that_was_interrupted_bit_for_bit(core, capability, threads):
+    chosen = {"OPENBLAS_CORETYPE": core, "ATEN_CPU_CAPABILITY": capability, "OMP_NUM_THREADS": str(threads)}
+    path = os.pathsep.join([str(SUPPORT), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, str(SUPPORT / "bit_for_bit.py"), str(threads)],
+        env={**os.environ, **chosen, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[0]) > 6

@@ -1,0 +1,165 @@
+"""What is exported holds what was identified."""
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from command_lines import run_script
+from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
+
+from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_envs import load_env_cfg
+from pace_optim.export import FORMATS, export
+from pace_optim.export.mjlab_native import mjlab_actuator
+from pace_optim.export.plain_drive import PlainDrive
+
+
+@pytest.fixture
+def result(tmp_path):
+    return write_result(tmp_path / "result.json")
+
+
+def with_effects(path: Path, effects: list[str], parameters: dict[str, dict[str, float]]) -> Path:
+    content = json.loads(path.read_text())
+    content["effects"] += effects
+    content["parameters"] |= parameters
+    path.write_text(json.dumps(content))
+    return path
+
+
+def torques(cfg: PaceDCMotorCfg) -> np.ndarray:
+    motor, data = PaceDCMotor(cfg, JOINTS, slice(None), ENVS, physics_dt=DT, dtype=torch.float64), sequence()
+    return np.stack(
+        [
+            motor.compute(ActuatorActions(torch.tensor(c)), torch.tensor(p), torch.tensor(v)).joint_efforts.numpy()
+            for c, p, v in zip(data["command"], data["position"], data["velocity"], strict=True)
+        ]
+    )
+
+
+def test_the_mjcf_loads_and_its_joints_hold_the_values(result):
+    exported, drives = export(result, "mjcf"), IdentifiedDrives.load(result)
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    original = mujoco.MjModel.from_xml_path(str(load_env_cfg("Pace-AnymalD-v0").scene.robot.mjcf_path))
+    assert (model.nv, model.nbody) == (original.nv, original.nbody)
+    fields = {"armature": "dof_armature", "viscous_friction": "dof_damping", "friction": "dof_frictionloss"}
+    for name, field in fields.items():
+        for joint, value in drives.values(name, JOINTS).items():
+            assert getattr(model, field)[model.joint(joint).dofadr[0]] == pytest.approx(value, rel=1e-5), (name, joint)
+    assert np.allclose(model.dof_solref[6:], [2 * DT, 1.0])
+    assert np.allclose(model.body_mass, original.body_mass) and np.allclose(model.body_inertia, original.body_inertia)
+
+
+def test_the_mjcf_says_what_it_cannot_hold(result):
+    exported = export(result, "mjcf", joints_only=True)
+    said = " ".join(exported.notes)
+    for word in ("encoder bias", "delay of 8.5 ms", "drive_bandwidth", "torque_gain", "stribeck_friction"):
+        assert word in said and word in exported.text.split("-->")[0]
+
+
+def test_the_mjcf_holds_a_payload(result):
+    share = {joint: 0.3 if joint == "LF_KFE" else 0.0 for joint in JOINTS}
+    exported = export(with_effects(result, ["payload"], {"payload.ratio": share}), "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    original = mujoco.MjModel.from_xml_path(str(load_env_cfg("Pace-AnymalD-v0").scene.robot.mjcf_path))
+    body = int(original.joint("LF_KFE").bodyid[0])
+    expected = np.where(np.arange(model.nbody) == body, 1.3, 1.0)
+    assert np.allclose(model.body_mass, expected * original.body_mass, rtol=1e-5)
+    assert np.allclose(model.body_inertia[body], 1.3 * original.body_inertia[body], rtol=1e-4)
+    assert np.allclose(model.body_ipos, original.body_ipos, atol=1e-5)
+
+
+def test_the_mjcf_holds_a_soft_friction(result):
+    constants = {"LF_KFE": 0.02, "RF_KFE": 0.05, "LH_KFE": 0.0}
+    changed = with_effects(
+        result, ["soft_friction@.*KFE"], {"soft_friction.time_constant": {**dict.fromkeys(JOINTS, 0.0), **constants}}
+    )
+    exported = export(changed, "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    for name, constant in constants.items():
+        column = model.joint(name).dofadr[0]
+        assert model.dof_solref[column, 0] == pytest.approx(constant or 2 * DT)
+        assert (model.dof_solimp[column, 0] == pytest.approx(0.9)) == (constant > 0)
+    assert "soft_friction is held" in " ".join(exported.notes)
+
+
+def test_the_cfg_gives_the_same_torque(result):
+    space: dict = {}
+    exec(compile(export(result, "cfg").text, "exported.py", "exec"), space)
+    (cfg,) = space["ACTUATORS"].values()
+    expected = torques(PaceDCMotorCfg.from_result(result))
+    assert np.abs(expected).max() > 50 and np.abs(torques(cfg) - expected).max() < 1e-6
+
+
+def test_groups_of_drives_stay_groups(tmp_path):
+    """Go2 has two types of drive."""
+    cfg = load_env_cfg("Pace-Go2-v0")
+    joints = cfg.sim2real.joint_order
+    content = json.loads(write_result(tmp_path / "result.json").read_text())
+    content |= {"task": "Pace-Go2-v0", "joint_names": list(joints), "effects": [], "drive": {}}
+    for name, values in content["parameters"].items():
+        if name != "delay":
+            content["parameters"][name] = dict(zip(joints, values.values(), strict=True))
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    space: dict = {}
+    exec(export(tmp_path / "result.json", "cfg").text, space)
+    groups = space["ACTUATORS"]
+    assert set(groups) == {"hip_thigh", "calf"}
+    assert (groups["calf"].effort_limit, groups["hip_thigh"].effort_limit) == (45.43, 23.7)
+    assert len(groups["calf"].armature) == 4 and len(groups["hip_thigh"].armature) == 8
+
+
+def test_the_json_is_plain_and_complete(result):
+    content, drives = json.loads(export(result, "json").text), IdentifiedDrives.load(result)
+    assert content["delay_s"] == drives.delay_s and "delay" not in content["parameters"]
+    for name in content["parameters"]:
+        assert set(content["parameters"][name]) == set(JOINTS)
+    assert content["parameters"]["armature"]["LF_HAA"] == drives.parameters["armature"]["LF_HAA"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "left_out"),
+    [
+        ({"saturation_effort": 140.0, "velocity_limit": 8.5}, "DcMotorActuatorCfg", ()),
+        ({}, "IdealPdActuatorCfg", ()),
+        ({"effort_limit": np.inf}, "IdealPdActuatorCfg", ("effort_limit",)),
+        ({"stiffness": 0.0}, "IdealPdActuatorCfg", ()),
+        ({"run_dt": 0.0}, "BuiltinPositionActuatorCfg", ()),
+        ({"run_dt": 0.0, "stiffness": 0.0}, "BuiltinVelocityActuatorCfg", ("stiffness",)),
+    ],
+)
+def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out):
+    no_line = {"saturation_effort": np.inf, "velocity_limit": np.inf}
+    drive = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0, "run_dt": DT} | no_line | changes
+    plain = PlainDrive(**drive, encoder_bias=0.01, delay_s=3.4 * DT)
+    call = mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain)
+    assert call.name == kind
+    given = {name: value for name, value in drive.items() if np.isfinite(value) and name != "run_dt"}
+    joint = {"armature": 0.055, "frictionloss": 0.32, "viscous_damping": 0.45}
+    expected = {name: value for name, value in (given | joint).items() if name not in left_out}
+    names, delay = {"target_names_expr": ("LF_HFE",)}, {"delay_min_lag": 3, "delay_max_lag": 3}
+    assert call.values == expected | names | delay
+
+
+@pytest.mark.parametrize("fmt", FORMATS)
+def test_the_command_line_writes_every_format(result, tmp_path, fmt):
+    done = run_script("export", result, "--format", fmt, "--output", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out").read_text() == export(result, fmt).text
+    assert done.stdout.splitlines()[-1] == f"written: {tmp_path / 'out'}"
+    assert done.stdout.count("note: ") == len(export(result, fmt).notes)
+
+
+def test_bad_input_is_one_line_and_exit_code_2(result, tmp_path):
+    unknown = with_effects(write_result(tmp_path / "unknown.json"), ["warp_drive"], {})
+    for args, said in (
+        ((tmp_path / "missing.json", "--format", "json"), "does not exist"),
+        ((result, "--format", "urdf"), "invalid choice"),
+        ((unknown, "--format", "json"), "There is no effect 'warp_drive'"),
+    ):
+        done = run_script("export", *args)
+        assert done.returncode == 2 and said in done.stderr, done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr

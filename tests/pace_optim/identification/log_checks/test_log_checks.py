@@ -1,0 +1,119 @@
+"""The checks of a log name what is wrong with it before a search, and nothing where nothing is."""
+
+import re
+from dataclasses import replace
+
+import log_checks as inputs
+import numpy as np
+import pytest
+from places import SHARED
+from scipy.optimize import lsq_linear
+
+from pace_envs import load_env_cfg
+from pace_envs.task_source import use_task
+from pace_optim.identification.log_checks import check_log, checked
+from pace_optim.identification.log_checks.balance import _bounded
+from pace_optim.identification.log_checks.checks import _flat_ends
+from pace_optim.identification.setup import load_for_fit
+from pace_optim.problem.problem import load_problem
+from pace_optim.recording import Drive
+from pace_optim.run.settings import FitSettings
+
+STRANGERS = SHARED / "cases" / "strangers"
+FAULTS = ("sign_positions", "swapped", "wrapped", "frozen", "dead", "motor_side", "limit", "gravity", "spikes")
+
+
+def found_in(kind, seed, folder):
+    made = inputs.make(kind, seed)
+    return made, check_log(inputs.problem_of(made, folder))
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_clean_log_has_no_findings(seed, tmp_path):
+    assert found_in("clean", seed, tmp_path)[1] == []
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_fault_is_named_with_its_joints(kind, tmp_path):
+    made, found = found_in(kind, 0, tmp_path)
+    assert {each.check for each in found} == {made.check}
+    assert set(made.joints) <= {joint for each in found for joint in each.joints}
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("swapped", 705), ("limit", 701), ("gravity", 705)])
+def test_a_fault_that_one_joint_hides_is_named(kind, seed, tmp_path):
+    made, found = found_in(kind, seed, tmp_path)
+    assert {each.check for each in found} == {made.check}
+
+
+def test_a_robot_that_stands_is_refused_however_it_is_commanded(tmp_path):
+    made = inputs.make("still", 0)
+    torque = np.ones_like(made.recording.dof_pos)
+    log = replace(made.recording, des_dof_pos=None, des_dof_effort=torque, drive=Drive())
+    (found,) = check_log(inputs.problem_of(replace(made, recording=log), tmp_path))
+    assert found.stops and found.joints == made.recording.joint_names and "shows no parameter" in found.text
+
+
+def test_a_frozen_encoder_is_told_with_its_time(tmp_path):
+    made, (found,) = found_in("frozen", 1, tmp_path)
+    joint = made.recording.joint_names.index(made.joints[0])
+    held = np.flatnonzero(np.diff(made.recording.dof_pos[:, joint]) == 0)
+    assert f"{held[0] * inputs.CONTROL_DT:.4g} to {(held[-1] + 1) * inputs.CONTROL_DT:.4g} s" in found.text
+
+
+def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path, capsys):
+    inputs.problem_of(inputs.make("swapped", 0), tmp_path)
+    task = use_task(str(tmp_path / "robot.xml"))
+    settings = FitSettings(task=task, data=[str(tmp_path / "log.npz")])
+    with pytest.raises(ValueError, match=r"are swapped.*--trust_log"):
+        load_for_fit(settings, load_env_cfg(task))
+    settings.trust_log = True
+    problem = load_for_fit(settings, load_env_cfg(task))
+    assert "are swapped" in " ".join(problem.contradictions)
+    assert capsys.readouterr().err.count("are swapped") == 1
+
+
+def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
+    problem = inputs.problem_of(inputs.make("limit", 0), tmp_path)
+    told = []
+    assert "--unknown effort_limit" in " ".join(checked(problem, tell=told.append).contradictions)
+    assert told and all(text.startswith("warning: ") for text in told)
+
+
+def test_every_bound_is_kept_and_little_is_lost_by_it():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        table, values = rng.normal(size=(40, 6)), rng.normal(size=40)
+        lower, upper = -rng.uniform(0, 0.1, 6), rng.uniform(0, 0.1, 6)
+        found, left = _bounded(table, values, lower, upper)
+        assert (found >= lower - 1e-9).all() and (found <= upper + 1e-9).all()
+        best = 2 * lsq_linear(table, values, (lower, upper)).cost
+        assert best <= left * (1 + 1e-9) and left < 1.02 * best
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "says"),
+    [
+        ("swapped", "all columns of shoulder, elbow are swapped"),
+        ("sign_pos", r"positions \(dof_pos\) of elbow have the opposite sign"),
+        ("wrap_tg_only", "targets of shoulder are wrapped"),
+        ("frozen_1s", "of elbow is frozen from 2 to 2.997 s"),
+        ("dead_encoder", "of elbow never changes"),
+        ("motor_side", "gear of 9"),
+        ("torque_saturates_unstated", "torque of shoulder ends at"),
+        ("on_side", "gravity points along"),
+    ],
+)
+def test_logs_of_strangers_are_named(folder, says):
+    if not STRANGERS.is_dir():
+        pytest.skip("shared/cases/strangers is absent")
+    here = STRANGERS / folder
+    problem = load_problem(use_task(str(here / "arm.xml")), data=[here / "a.csv", here / "b.csv"], tell=lambda _: None)
+    assert re.search(says, " ".join(each.sentence for each in check_log(problem)))
+
+
+@pytest.mark.parametrize(("repeat", "cut", "flat"), [(1, 1.0, 0), (3, 1.0, 0), (1, 0.8, 77), (3, 0.8, 231)])
+def test_a_target_is_cut_where_it_stays_for_longer_than_commands_are_held(repeat, cut, flat):
+    target = np.repeat(np.clip(np.sin(0.1 * np.arange(200)), -cut, cut), repeat)
+    assert _flat_ends(target).sum() == flat

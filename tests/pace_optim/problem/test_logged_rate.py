@@ -1,0 +1,76 @@
+"""The control step of a model file is that of the log's commands, where they come faster than 400 Hz."""
+
+import mujoco
+import numpy as np
+import pytest
+from models import HEAD, KD, KP, MOTORS
+
+from pace_optim.identification.fit import fit
+from pace_optim.recording import Drive, Recording, save_recording
+from pace_optim.recording.commands import command_interval
+from pace_optim.run.open import open_problem
+from pace_optim.run.settings import FitSettings
+
+
+def recorded(robot, name, seconds=1.5, dt=0.001):
+    """Plain MuJoCo's motion under motors whose loop runs at this step."""
+    model = mujoco.MjModel.from_xml_path(str(robot))
+    model.dof_damping[:], model.opt.timestep = 0.05, dt / 10
+    data, time = mujoco.MjData(model), np.arange(round(seconds / dt)) * dt
+    target = np.stack([0.5 * np.sin(9 * time), 0.3 * np.sin(14 * time)], axis=1)
+    read = np.zeros_like(target)
+    for k, wanted in enumerate(target):
+        read[k] = data.qpos
+        data.ctrl[:] = np.clip(KP * (wanted - data.qpos) - KD * data.qvel, -1.5, 1.5)
+        mujoco.mj_step(model, data, 10)
+    read += 1e-5 * np.random.default_rng(0).standard_normal(read.shape)
+    drive = Drive(stiffness=KP, damping=KD)
+    recording = Recording(
+        name=name, joint_names=("pan", "tilt"), time=time, dof_pos=read, des_dof_pos=target, drive=drive
+    )
+    return str(save_recording(robot.parent / f"{name}.npz", recording))
+
+
+@pytest.mark.parametrize(
+    ("repeat", "own_clock", "interval"), [(1, False, 0.001), (10, False, 0.01), (1, True, 0.001), (3, False, 0.003)]
+)
+def test_a_command_that_is_repeated_is_none(repeat, own_clock, interval):
+    time = np.arange(2000) * 0.001 + 7.0 + 1e-7 * np.random.default_rng(0).standard_normal(2000)
+    held = np.repeat(np.sin(np.arange(2000 // repeat + 1)), repeat)[:2000, None]
+    clock = {"time": time, "dof_pos": held}
+    if own_clock:
+        clock = {"des_time": time, "time": time[::4], "dof_pos": held[::4]}
+    recording = Recording(name="r", joint_names=("j",), des_dof_pos=held, **clock)
+    assert command_interval(recording) == pytest.approx(interval, rel=1e-9)
+
+
+def test_commands_for_each_control_step_need_no_clock():
+    time, held = np.arange(500) * 0.004, np.sin(np.arange(1997.0))[:, None]
+    recording = Recording(name="r", joint_names=("j",), time=time, dof_pos=held[::4], des_dof_pos=held)
+    assert command_interval(recording) == pytest.approx(0.001)
+
+
+def test_a_fit_takes_the_rate_of_the_logs_commands_and_its_run_keeps_it(tmp_path):
+    robot = tmp_path / "head.xml"
+    robot.write_text(HEAD.format(MOTORS))
+    fast, slow = recorded(robot, "fast"), recorded(robot, "slow", dt=0.0025)
+
+    def fitted(**settings):
+        return fit(
+            FitSettings(
+                task=str(robot),
+                data=[fast],
+                optimizer="least_squares",
+                check_consistency=False,
+                log_dir=str(tmp_path / "logs"),
+                **settings,
+            )
+        )
+
+    result, run = fitted()
+    assert result.control_dt == 0.001 and any(note.startswith("control rate: 1000 Hz") for note in result.notes)
+    assert result.parameters["viscous_friction"]["pan"] == pytest.approx(0.05, rel=0.01)
+    assert open_problem(run, data=[slow]).control_dt == 0.001  # whatever is held against it
+    assert FitSettings.load(run / "settings.json")[0].control_dt == 0.001  # what processes that help are given
+    told, _ = fitted(control_dt=0.0025)
+    assert told.control_dt == 0.0025

@@ -1,0 +1,112 @@
+"""The report tells what a diagnosis found."""
+
+from dataclasses import replace
+
+import pytest
+from browser import CHROMIUM, Browser
+from diagnoses import make_diagnosis
+from pages import NASTY, page_of
+from run_folders import JOINTS, make_result, write_run
+
+from pace_actuators.files import write_json
+from pace_optim.report import write_report
+
+
+def folder_with(path, content):
+    folder = write_run(path)
+    write_json(folder / "diagnosis.json", content)
+    return folder
+
+
+def test_a_run_that_was_not_diagnosed_has_no_such_section(tmp_path):
+    assert "diagnosis" not in page_of(write_run(tmp_path / "run")).ids
+
+
+def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
+    page = page_of(folder_with(tmp_path / "run", make_diagnosis()))
+    assert {"diagnosis", "effect-ranking"} <= set(page.ids) and "error-map" not in page.ids
+    for text in (
+        "An effect is missing, and it is known",
+        "--effects stribeck_friction",
+        "4.30 → 0.400",
+        "does not pay",
+        "floor of noise and numerics",
+        "4 effects were tried.",
+        "cannot separate stribeck_friction from presliding_friction",
+        *JOINTS,
+    ):
+        assert text in page.text, text
+    assert "pre" in page.tags and not page.unbalanced
+
+
+def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
+    with_it = folder_with(tmp_path / "with", make_diagnosis())
+    make_result(effects=["stribeck_friction"]).save(with_it / "result.json")
+    without = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
+    assert "Add it" in without and "This run is the fit with it." not in without
+    text = page_of(with_it).text
+    assert "This run is the fit with it." in text and "What was missing is in this run" in text
+    assert "Add it" not in text and "An effect is missing" not in text
+
+
+def test_the_run_with_a_wrong_link_is_not_told_to_add_it(tmp_path):
+    mass = {"parameter": "link_mass", "unit": "kg", "file": 0.5, "found": 0.8, "std": 0.01}
+    wrong = [{"link": "shank", "parts": ["mass"], "values": [mass], "label": "shank@mass"}]
+    told = make_diagnosis("link") | {"added": [], "paying": [], "links": wrong}
+    without, with_it = (folder_with(tmp_path / name, told) for name in ("without", "with"))
+    result = make_result()
+    link = {"parameters": {"shank": 0.8}, "std": {"shank": 0.01}, "units": "kg"}
+    result = replace(result, **{name: {**getattr(result, name), "link_mass": value} for name, value in link.items()})
+    result.save(with_it / "result.json")
+    text = page_of(without).text
+    assert "A link of the model file is wrong" in text and "--links shank@mass" in text
+    text = page_of(with_it).text
+    assert "What was missing is in this run" in text and "Add it" not in text
+
+
+def test_commands_in_the_advice_can_be_copied(tmp_path):
+    text = write_report(folder_with(tmp_path / "run", make_diagnosis())).read_text("utf-8")
+    assert "<pre>scripts/data_collection.py --task Pace-Leg-v0 --excitation ramp</pre>" in text
+
+
+def test_what_is_unknown_has_an_error_map(tmp_path):
+    page = page_of(folder_with(tmp_path / "run", make_diagnosis("unknown")))
+    assert "error-map" in page.ids
+    assert "no known effect explains it" in page.text and "explains 80 % of it" in page.text
+
+
+def test_nothing_missing_needs_no_chart(tmp_path):
+    page = page_of(folder_with(tmp_path / "run", make_diagnosis("nothing_missing")))
+    assert "Nothing is missing" in page.text and "effect-ranking" not in page.ids
+
+
+def test_its_texts_are_escaped(tmp_path):
+    content = make_diagnosis()
+    content |= {"summary": NASTY, "advice": [NASTY], "data": [NASTY], "added": [NASTY]}
+    content["ranking"][0] |= {"effect": NASTY, "evidence": NASTY}
+    page = page_of(folder_with(tmp_path / "run", content))
+    assert NASTY in page.text and "img" not in page.tags and not page.unbalanced
+
+
+@pytest.mark.parametrize("verdict", ["effect", "unknown"])
+def test_it_is_drawn_without_a_complaint(tmp_path, verdict):
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here: apt-get install chromium")
+    browser = Browser(tmp_path / "profile")
+    try:
+        report = write_report(folder_with(tmp_path / "run", make_diagnosis(verdict)))
+        browser.open(report, ready="document.documentElement?.dataset.drawn === 'true'")
+        assert not browser.problems
+        assert browser.evaluate("document.querySelectorAll('#effect-ranking .barlayer .point').length") == 6
+        assert browser.evaluate("document.querySelectorAll('#error-map .main-svg').length > 0") == (
+            verdict == "unknown"
+        )
+    finally:
+        browser.close()
+
+
+def test_a_command_can_be_copied_where_joints_have_spaces_and_there_are_several(tmp_path):
+    """`fit.py … --effects torque_ripple@A1 shoulder|A2` is two effects and a pipe."""
+    folder = write_run(tmp_path / "run")
+    write_json(folder / "diagnosis.json", make_diagnosis() | {"added": ["torque_ripple@A1 shoulder|A2"], "paying": []})
+    assert "--effects 'torque_ripple@A1 shoulder|A2'" in page_of(folder).text
