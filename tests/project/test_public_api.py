@@ -6,13 +6,11 @@ import subprocess
 import sys
 import warnings
 
+import api
 import pytest
 from places import ROOT
 
 from pace_actuators.public_names import _warned, deprecated, homes_of
-
-sys.path.insert(0, str(ROOT / "docs" / "site"))
-import api
 
 ADAPTERS = ("pace_actuators.mjlab", "pace_actuators.isaaclab")
 TAUGHT = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.ipynb")])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Browser
-from pages import NASTY, page_of
+from report_pages import NASTY, page_of
 from run_folders import JOINTS, LABELS, make_result, make_trajectory, write_run
 
 from pace_actuators.files import write_json, write_tensors

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from browser import CHROMIUM, Browser
 from diagnoses import make_diagnosis
-from pages import NASTY, page_of
+from report_pages import NASTY, page_of
 from run_folders import JOINTS, make_result, write_run
 
 from pace_actuators.files import write_json

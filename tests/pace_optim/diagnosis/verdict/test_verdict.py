@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diagnoses import FITS, joint_alone, make_diagnosis, outcome_of
-from pages import page_of
+from report_pages import page_of
 from run_folders import write_run
 
 from pace_actuators.effects import get_effect
