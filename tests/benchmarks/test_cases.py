@@ -36,7 +36,7 @@ def test_the_rows_have_their_files():
 @pytest.mark.parametrize("name", ["plain", "feed_forward", "two_clocks", "timer_19_9_hz", "four_bar", "leg_mcap"])
 def test_a_fit_reaches_what_is_true(name, tmp_path):
     case = CASES[name]
-    run(name, case, CASES, tmp_path)
+    run(name, case, FILES, tmp_path)
     found = json.loads((tmp_path / f"{name}.found.json").read_text())
     for group in ("armature", "viscous_friction", "friction"):
         for value in found["parameters"][group].values():
@@ -51,6 +51,6 @@ def test_a_fit_reaches_what_is_true(name, tmp_path):
 
 @pytest.mark.slow
 def test_commands_logged_more_slowly_than_they_were_sent_are_told(tmp_path):
-    run("lerobot_leg", CASES["lerobot_leg"], CASES, tmp_path)
+    run("lerobot_leg", CASES["lerobot_leg"], FILES, tmp_path)
     found = json.loads((tmp_path / "lerobot_leg.found.json").read_text())
     assert "The drive probably received more commands than were logged" in " ".join(found["warnings"])

@@ -354,7 +354,7 @@ def test_names_and_places_are_read():
     assert not EffectCfg.parse("torque_gain").shared
     for text in ("torque_gain", "torque_gain@a|b", "torque_gain@shared", "torque_gain@a|b@shared", "clock_skew"):
         assert EffectCfg.parse(text).label == text
-    own = get_effect("test_effects:CableDrag")
+    own = get_effect(f"{__name__}:CableDrag")
     assert own.name == "cable_drag_of_test" and get_effect(own.name) is own
 
 
@@ -370,7 +370,7 @@ class CableDrag(Effect):
 
 
 def test_an_effect_of_ones_own_acts():
-    drive = Drive(["test_effects:CableDrag"], {"cable_drag_of_test.effort": 1.5})
+    drive = Drive([f"{__name__}:CableDrag"], {"cable_drag_of_test.effort": 1.5})
     assert drive.one(0.3, q=0.3) == pytest.approx(-1.5 * math.tanh(0.3))
 
 
