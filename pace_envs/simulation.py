@@ -17,6 +17,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
+from pace_envs.coulomb import impulses
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
@@ -33,6 +34,8 @@ _INTEGRATORS = {
 
 
 _STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
+_FRICTION = ("qfrc_constraint", "nf", "nefc")
+"""What tells the friction of a step, and whether it acted alone."""
 
 
 @dataclass(kw_only=True)
@@ -49,8 +52,8 @@ class SimulationCfg:
 
         x½ = x + h v / 2        M(x½) (v₊ - v) = h (f(x½, v) - D (v + v₊) / 2)        x₊ = x½ + h v₊ / 2
 
-    What is held over the step (a drive's torque) acts when it should. Of first order remain the forces that grow with
-    the square of the speed, and the instant within a step at which friction turns.
+    What is held over the step (a drive's torque) acts when it should, and Coulomb friction turns where the speed passes
+    zero (:mod:`pace_envs.coulomb`). Of first order remain the forces that grow with the square of the speed.
     """
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
@@ -128,6 +131,11 @@ class Simulation:
     def is_trapezoidal(self) -> bool:
         """Whether positions move with the mean of the old and the new speed; else with the new one (semi-implicit)."""
         return self.cfg.integrator == "leapfrog"
+
+    @property
+    def turns_friction(self) -> bool:
+        """Whether Coulomb friction turns within a step; soft friction does not."""
+        return self.is_trapezoidal and self.cfg.friction_timeconst is None
 
     def __init__(self, cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int):
         """Compile the model and start the thread pool.
@@ -352,10 +360,49 @@ class Simulation:
         self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
         drift(self.qpos, self.qvel, 0.5 * h)
         with self._in_joints():
-            self._step()
+            if not self.turns_friction:
+                self._step()
+            else:
+                before, _ = self.qvel.clone(), self._outcomes
+                self._step()
+                self._turn_friction(before, drift)
         drift(self.qpos, self.qvel, -0.5 * h)
         damping.copy_(whole)
         self.qfrc_applied.copy_(applied)
+
+    def _turn_friction(self, before: torch.Tensor, drift: Drift) -> None:
+        """Let friction turn where the speed passed zero in MuJoCo's step; speeds before it are (num_envs, nv)."""
+        most, weight = self.expand("dof_frictionloss"), self.expand("dof_invweight0")
+        force, free, constraints = (self._outcomes[name] for name in _FRICTION)
+        impulse = impulses(before, self.qvel, force, most, weight, self.cfg.dt)
+        alone = (free == (most > 0.0).sum(dim=1)) & (constraints == free)
+        change = self._speeds_of(torch.where(alone[:, None], impulse, 0.0))
+        self.qvel += change
+        drift(self.qpos, change, self.cfg.dt)
+
+    def _speeds_of(self, impulse: torch.Tensor) -> torch.Tensor:
+        """How impulses change the speeds, M⁻¹ of the step's middle applied to (num_envs, nv)."""
+        hit = impulse.any(dim=1).nonzero()[:, 0]
+        change = torch.zeros_like(impulse)
+        if len(hit):
+            entries = torch.nn.functional.pad(self._outcomes["M"][hit], (0, 1))
+            change[hit] = torch.linalg.solve(entries[:, self._place_in_inertia], impulse[hit])
+        return change
+
+    @cached_property
+    def _outcomes(self) -> dict[str, torch.Tensor]:
+        """What a step computes; bound before it."""
+        return {field: self.bind(field) for field in ("M", *_FRICTION)}
+
+    @cached_property
+    def _place_in_inertia(self) -> torch.Tensor:
+        """Where each entry of the inertia matrix is among MuJoCo's, (nv, nv); behind them where it is zero."""
+        model = self.model
+        place = torch.full((model.nv, model.nv), model.nM)
+        rows = torch.as_tensor(np.repeat(np.arange(model.nv), model.M_rownnz)).long()
+        columns = torch.as_tensor(model.M_colind).long()
+        place[rows, columns] = place[columns, rows] = torch.arange(model.nM)
+        return place
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""

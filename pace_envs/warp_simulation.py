@@ -6,6 +6,7 @@ import contextlib
 import copy
 import logging
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from types import ModuleType
 from typing import Any
 
@@ -61,6 +62,26 @@ class WarpSimulation(Simulation):
 
     def _step(self) -> None:
         self._run("step")
+
+    @cached_property
+    def _outcomes(self) -> dict[str, torch.Tensor]:
+        fields = ("qfrc_constraint", "nf", "nefc")
+        return {field: self._warp.to_torch(getattr(self.data, field)) for field in fields}
+
+    def _speeds_of(self, impulse: torch.Tensor) -> torch.Tensor:
+        self._impulse.copy_(impulse)
+        self._run("solve_m")
+        return self._response
+
+    @cached_property
+    def _impulse(self) -> torch.Tensor:
+        """What ``solve_m`` reads, (num_envs, nv)."""
+        return torch.zeros_like(self.qvel)
+
+    @cached_property
+    def _response(self) -> torch.Tensor:
+        """What ``solve_m`` writes, (num_envs, nv)."""
+        return torch.zeros_like(self.qvel)
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time.
@@ -177,7 +198,8 @@ class WarpSimulation(Simulation):
 
     def _call(self, name: str) -> None:
         function: Callable[..., None] = getattr(self._mjw, name)
-        function(self.warp_model, self.data)
+        more = [self._warp.from_torch(each) for each in (self._response, self._impulse)] if name == "solve_m" else []
+        function(self.warp_model, self.data, *more)
 
     @contextlib.contextmanager
     def _on_stream(self) -> Iterator[None]:

@@ -146,7 +146,7 @@ class RobotKernel:
             "series": self._series,
             "memory": torch.empty(env.num_envs, max(1, source.memory), dtype=torch.float64),
             "bias": env.sim.qfrc_bias.clone() if reads_load else torch.zeros_like(env.sim.qvel),
-            "before": torch.empty(env.num_envs, 2, env.sim.model.nv, dtype=torch.float64),
+            "before": torch.empty(env.num_envs, 5, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         if (course := self._course) is not None:
@@ -157,6 +157,7 @@ class RobotKernel:
             **dict.fromkeys(ARGUMENTS, 0),
             **{name: self._batch.address_of(f"mj_{name}") for name in ("step", "step1", "step2")},
             "drift": self._batch.address_of("mj_integratePos") if env.sim.is_trapezoidal else 0,
+            "solve": self._batch.address_of("mj_solveM") if env.sim.turns_friction else 0,
             "robots": env.num_envs,
             "recordings": self._dataset.num_recordings,
             "end": end,

@@ -11,6 +11,7 @@ import torch
 from pace_envs.compiled_drive.robot import STATE, WRITTEN, DriveProgram
 from pace_envs.compiled_drive.source import Names, changing_nodes, needed_nodes
 from pace_envs.compiled_drive.tape import Node, NotTraceableError
+from pace_envs.coulomb import SOURCE as TURN_FRICTION
 from pace_envs.kernels.expressions import PRELUDE
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import COLUMNS, SOURCE
@@ -19,7 +20,8 @@ ARGUMENTS = {
     "step": "void (*step)(const mjModel*, mjData*)",
     "step1": "void (*step1)(const mjModel*, mjData*)",
     "step2": "void (*step2)(const mjModel*, mjData*)",
-    "drift": "void (*drift)(const mjModel*, mjtNum*, const mjtNum*, mjtNum)",
+    "drift": "Drift drift",
+    "solve": "Solve solve",
     "robots": "long long robots",
     "recordings": "long long recordings",
     "first": "long long first",
@@ -40,11 +42,11 @@ ARGUMENTS = {
     "held": "const double* held",
     "shift": "const double* shift",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, and its ``mj_integratePos`` where steps
-are those of ``Simulation._leap``, else 0; environments and recordings; the control steps from ``first`` to before
+"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps
+are those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings; the control steps from ``first`` to before
 ``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to which row of
 ``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of
-gravity and motion of each environment; room for the forces applied and the damping before a step (environments, 2, nv);
+gravity and motion of each environment; room for what was before a step, and for its friction (environments, 5, nv);
 what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments,
 nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9),
 where its specific force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with
@@ -53,7 +55,7 @@ where its specific force was measured (recordings, 3), what is added to that (en
 of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
-_BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + PRELUDE
+_BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <string.h>\n" + PRELUDE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +110,7 @@ def robot_source(
     arguments = ";\n  ".join(ARGUMENTS.values())
     text = f"""// MuJoCo {version}
 {_BEGIN}
+{TURN_FRICTION}
 typedef struct {{
   {arguments};
   const double* leaves[{len(names)}];
@@ -137,8 +140,11 @@ static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
 {turns}
 static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
   {there}
+  double* before = a->before + (5 * robot + 2) * m->nv;
+  memcpy(before, d->qvel, m->nv * sizeof(double));
   if (!a->motion) {{
     a->step(m, d);
+    if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
     {back}
     return;
   }}
@@ -148,6 +154,7 @@ static void step(mjModel* m, mjData* d, long long robot, long long k, int part, 
   a->step1(m, d);
   bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
   a->step2(m, d);
+  if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
   {back}
 }}
 static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
@@ -157,7 +164,7 @@ static void advance(mjModel* m, mjData* d, long long robot, long long k, int par
   }}
   const int n = m->nv;
   const double h = m->opt.timestep;
-  double *applied = a->before + 2 * robot * n, *damping = applied + n;
+  double *applied = a->before + 5 * robot * n, *damping = applied + n;
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
   for (int i = 0; i < n; ++i) {{

@@ -178,6 +178,11 @@ def test_friction_of_second_order_steps_gives_way_at_once():
     assert np.abs(own - exact).max() < 0.05 * np.abs(default - exact).max()
 
 
+def test_friction_of_second_order_steps_turns_within_a_step():
+    """At the end of one, it would be 0.4 mrad off."""
+    assert np.abs(swung(0.0025) - swung(0.0001)).max() < 3e-5
+
+
 def test_friction_of_second_order_steps_holds():
     assert np.abs(swung(0.0025, amplitude=0.19)).max() < 1e-4
 

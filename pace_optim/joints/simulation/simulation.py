@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import Effect
+from pace_envs.coulomb import turned
 from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
 from pace_optim.joints.simulation.path import ReferencePath
 
@@ -151,7 +152,7 @@ class TwinSimulation(Simulation):
         push = bent.add_(self._joints(self.qfrc_applied)).add_(torque).addcmul_(damping, v, value=-1)
         pushed = torch.div(push, resisting).mul_(h)
         stop = torch.div(self._joints(self.expand("dof_frictionloss")), resisting).mul_(h)
-        new = _with_friction(v, pushed, stop)
+        new = turned(v, pushed, stop)
         self._set(self.qpos, torch.add(q, v, alpha=0.5 * h).add_(new, alpha=0.5 * h))
         self._set(self.qvel, new)
         self._steps += 1
@@ -263,17 +264,3 @@ def _at_instants(in_intervals: torch.Tensor) -> torch.Tensor:
     inner = 0.5 * (in_intervals[:-1] + in_intervals[1:])
     first, last = (1.5 * in_intervals[a] - 0.5 * in_intervals[b] for a, b in ((0, 1), (-1, -2)))
     return torch.cat([first[None], inner, last[None]])
-
-
-def _with_friction(speed: torch.Tensor, pushed: torch.Tensor, stop: torch.Tensor) -> torch.Tensor:
-    """Speed after a step under a constant push and Coulomb friction, which turns where the speed passes zero.
-
-    Args:
-        speed: Before the step.
-        pushed: What the push alone adds to it.
-        stop: What friction alone can take from it.
-    """
-    onward = speed + pushed - torch.copysign(stop, speed)
-    from_rest = pushed - torch.clamp(pushed, -stop, stop)
-    left = (onward / (onward - speed)).nan_to_num_(nan=1.0)  # part of the step after the speed has passed zero
-    return torch.where(onward * speed > 0, onward, left * from_rest)

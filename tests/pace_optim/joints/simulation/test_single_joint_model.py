@@ -9,9 +9,9 @@ from models import FINGER, FOUR_BAR
 from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, record
 
 from pace_envs import set_physics_dt
+from pace_envs.coulomb import turned
 from pace_envs.from_model import cfg_from_model
 from pace_optim.joints.simulation import measured_path, reference_path, twin_problem
-from pace_optim.joints.simulation.simulation import _with_friction
 from pace_optim.recording import Load
 
 TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.1, "encoder_bias": 0.0, "delay": 2.0}
@@ -35,16 +35,16 @@ def test_friction_turns_where_the_speed_passes_zero():
     for _ in range(parts):
         free = expected + pushed / parts
         expected = free - torch.clamp(free, -stop / parts, stop / parts)
-    assert float((_with_friction(speed, pushed, stop) - expected).abs().max()) < 4 / parts
+    assert float((turned(speed, pushed, stop) - expected).abs().max()) < 4 / parts
     at_once = speed + pushed - torch.clamp(speed + pushed, -stop, stop)
     assert float((at_once - expected).abs().max()) > 0.5  # friction of the new sign all along
 
 
 def test_a_joint_without_speed_push_and_friction_stays():
     zero = torch.zeros(1, dtype=torch.float64)
-    assert _with_friction(zero, zero, zero).tolist() == [0.0]
-    assert _with_friction(zero, zero + 0.5, zero + 0.5).tolist() == [0.0]
-    assert _with_friction(zero - 1.0, zero + 1.0, zero).tolist() == [0.0]
+    assert turned(zero, zero, zero).tolist() == [0.0]
+    assert turned(zero, zero + 0.5, zero + 0.5).tolist() == [0.0]
+    assert turned(zero - 1.0, zero + 1.0, zero).tolist() == [0.0]
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.3])
