@@ -42,12 +42,12 @@ ARGUMENTS = {
     "held": "const double* held",
     "shift": "const double* shift",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps
-are those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings; the control steps from ``first`` to before
-``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to which row of
-``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of
-gravity and motion of each environment; room for what was before a step, and for its friction (environments, 5, nv);
-what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments,
+"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
+those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings;
+the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
+steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);
+the drives' memory and the forces of gravity and motion of each environment; room for what was before a step, and for
+its friction (environments, 5, nv); what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions and speeds there (rows, environments,
 nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9),
 where its specific force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with
 (environments, 12 nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints,

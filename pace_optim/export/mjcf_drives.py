@@ -161,8 +161,8 @@ def _integrator(drives: Mapping[str, PlainDrive]) -> mujoco.mjtIntegrator:
 def _rate_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
     if any(drive.second_order for drive in drives.values()):
         return [
-            "the integrator is Euler; the identification's steps were of second order. MuJoCo's joint friction turns at "
-            "the end of a step, the identification's within it: where joints often reverse, take a shorter timestep."
+            "the integrator is Euler; the identification's steps were of second order. MuJoCo's joint friction turns "
+            "at the end of a step, the identification's within it: where joints often reverse, take a shorter timestep."
         ]
     rates = sorted({drive.run_dt for drive in drives.values()})
     how = "implicitfast: kd acts within the step" if rates[0] == 0 else "Euler: a drive's torque is held over the step"
