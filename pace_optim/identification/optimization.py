@@ -340,7 +340,7 @@ class Optimization:
             self.history.refine_steps.append(self.steps)
             self.history.refine_time_s.append(self.progress.elapsed)
             self.log.log_refinement(now.iteration, best)
-        name = "begin" if on_pieces else "refine"
+        name = "fit on pieces" if on_pieces else "fit on whole recordings"
         self.progress.show(name, now.iteration, cfg.max_iteration, best, None, self.steps)
         self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()

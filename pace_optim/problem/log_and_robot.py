@@ -146,13 +146,13 @@ def contradicted_limits(
     notes = []
     for field, words, unit, measured, own, configured in found:
         stated = np.broadcast_to(np.asarray(configured if own is None else own, dtype=float), (n,))
+        beyond = []
         for j, name in enumerate(recording.joint_names):
             values = measured[np.isfinite(measured[:, j]), j]
             largest = float(np.quantile(values, 0.999)) if values.size else 0.0
             if np.isfinite(stated[j]) and largest > _BEYOND * stated[j]:
                 own_unit = units_for(unit, joint_types[j : j + 1])
-                notes.append(
-                    f"the recording contradicts the stated {words}: {name} reaches {largest:.3g} {own_unit}, {field} "
-                    f"is {stated[j]:.3g} {own_unit}. Correct {field}. [W2]"
-                )
+                beyond.append(f"{name} reaches {largest:.3g} {own_unit}, {field} is {stated[j]:.3g} {own_unit}")
+        if beyond:
+            notes.append(f"the recording contradicts the stated {words}: {'; '.join(beyond)}. Correct {field}. [W2]")
     return notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -269,7 +270,13 @@ def make_result(
     return replace(result, findings=[*gains, *result.findings])
 
 
-def assumptions(problem: Problem) -> list[str]:
-    """What a fit assumes of the robot, and how its recordings were read, in sentences."""
+def assumptions(problem: Problem, shown: Container[str] = ()) -> list[str]:
+    """What a fit assumes of the robot, and how its recordings were read, in sentences.
+
+    Args:
+        problem: What is fitted.
+        shown: Notes that were printed already: they are omitted.
+    """
     of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes]
-    return [*of_robot, *notes_by_kind(problem.dataset.recordings)]
+    recordings = [replace(r, notes=tuple(n for n in r.notes if n not in shown)) for r in problem.dataset.recordings]
+    return [*(note for note in of_robot if note not in shown), *notes_by_kind(recordings)]
