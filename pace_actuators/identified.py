@@ -72,10 +72,10 @@ class IdentifiedDrives:
     """Value by parameter and joint (or ``"all"``), in the units of ``units``."""
 
     std: Mapping[str, Mapping[str, float | None]]
-    """Standard deviations of the same shape; ``None`` where there is none."""
+    """Standard deviations of the same shape; ``None`` without an error bar."""
 
     correlation: Mapping[str, Any]
-    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
+    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where it is unknown; may be empty."""
 
     effects: tuple[EffectCfg, ...]
     """The effects, without values."""

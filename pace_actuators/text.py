@@ -70,7 +70,7 @@ def three_figures(value: float) -> str:
 
 
 def value_and_error(value: float, std: float | None) -> tuple[str, str]:
-    """A value to the digits that its standard deviation leaves, and the standard deviation to two of its own."""
+    """A value to the digits that its standard deviation leaves, and the standard deviation to two digits."""
     if std is None or std <= 0:
         return f"{value:.4g}", "–"
     decimals = 1 - math.floor(math.log10(std))

@@ -97,7 +97,7 @@ def diagnose(
 
 
 def _as_found(problem: Problem, result: FitResult) -> Problem:
-    """The problem with gains and limits that nobody knew as the run found them."""
+    """The problem with unknown gains and limits as the run found them."""
     told = with_identified(
         problem.plain_cfg, problem.dataset.recordings, problem.unknown, result.parameters, result.undetermined
     )

@@ -1,9 +1,9 @@
 """Which link of the model file is wrong, and what is wrong with it: mass, centre of mass or inertia.
 
-A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`), so one look covers all
-of them along the measured motion: the derivatives of the whole robot's residuals r by the base parameters and by the
-ten parameters of each link, and, as look-alikes, by a torque gain, a spring and an offset of each joint. With H = JᵀJ
-and g = Jᵀr of the base parameters and of what is tried, a part of a link would lower the score by
+A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`). So one set of
+derivatives along the measured motion covers all links: those of the whole robot's residuals r by the base parameters
+and by the ten parameters of each link. Look-alikes have theirs too: a torque gain, a spring and an offset of each
+joint. With H = JᵀJ and g = Jᵀr of the base parameters and of what is tried, a part of a link would lower the score by
 
     Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
 

@@ -30,7 +30,7 @@ from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.summary import error_line
 
 _LONG = 60.0
-"""A fit that took longer tells its result before it is checked [s]."""
+"""A fit that took longer prints its error before it is checked [s]."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -40,7 +40,7 @@ class _End:
     """The vector that is kept, and what is known of it."""
 
     problem: Problem
-    """What was fitted; where the recordings tell the rate of the drives' loops, with that."""
+    """What was fitted; with the rate of the drives' loops where the recordings show it."""
     at: Assessment
     """The vector, and what noise alone leaves open."""
     train_rmse: float
@@ -132,7 +132,7 @@ def conclude(
 
 
 def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = False) -> FitResult:
-    """Write what is known so far; what takes simulations to tell only where all has been checked."""
+    """Write what is known so far; warnings that need simulations only where all has been checked."""
     run.folder.write_tensors("best_trajectory.pt", trajectories(end.problem, end.at.residuals))
     result = _result(run, record, end, checked)
     result.save(run.folder.path / "result.json")

@@ -45,7 +45,7 @@ _OF_THE_STEP = 0.25
 _HALVINGS = 2
 """... so many times."""
 _FEWEST_GENERATIONS = 5
-"""Of a search, whatever its budget."""
+"""Generations of a search, at least."""
 
 
 @dataclass(kw_only=True, eq=False)

@@ -30,7 +30,7 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     A damping that the recording states stays: it acts on the measured speed.
 
     Raises:
-        ValueError: If a joint is told nothing but positions, and its drive has no position loop.
+        ValueError: If a joint gets only positions, and its drive has no position loop.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
     stiffness, damping = (
@@ -131,8 +131,8 @@ def contradicted_limits(
 
     Args:
         recording: The recording; its own facts come before what is configured.
-        velocity_limit: No-load speed as configured, (n,) [rad/s]; NaN or infinite where there is none.
-        effort_limit: Torque limit as configured, (n,) [N m]; NaN or infinite where there is none.
+        velocity_limit: No-load speed as configured, (n,) [rad/s]; NaN or infinite without a limit.
+        effort_limit: Torque limit as configured, (n,) [N m]; NaN or infinite without a limit.
         joint_types: Whether each joint turns or slides; none: all turn.
     """
     n = recording.num_joints

@@ -49,7 +49,7 @@ class FitResult(DriveResult):
     objective: dict[str, float | None] = field(default_factory=dict)
     """What an objective of the user's own is at the result, in ``train`` and ``validation``; empty: it is ``score``."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
+    """The part of each value that comes from the physics step, shaped as ``std``, which includes it; empty: unknown."""
     assumes_loop_rate: bool = False
     """Whether the rate of the drives' loops is assumed. What depends on it is in ``step_error`` and ``std``."""
     loop_rate: dict[str, Any] = field(default_factory=dict)
@@ -144,13 +144,13 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
-    """Standard deviations, or other errors, shaped as the parameters; ``None`` where there is none."""
+    """Standard deviations, or other errors, shaped as the parameters; ``None`` without an error bar."""
     values = space.to_dict(torch.as_tensor(errors))
     return {name: {key: None if math.isnan(v) else v for key, v in entries.items()} for name, entries in values.items()}
 
 
 def correlation_matrix(space: ParameterSpace, uncertainty: Uncertainty) -> dict[str, Any]:
-    """The correlation matrix with its labels; ``None`` where there is none."""
+    """The correlation matrix with its labels; ``None`` where it is unknown."""
     rows = [[None if math.isnan(v) else round(v, 6) for v in row] for row in uncertainty.correlation.tolist()]
     return {"labels": list(space.labels), "matrix": rows}
 

@@ -46,7 +46,7 @@ class ProgressLine:
             done: Iterations so far in this phase.
             total: Most iterations in this phase.
             best: Best score so far [rad², of slides m²].
-            spread: Widest standard deviation of the search, normalised; ``None`` when there is none.
+            spread: Widest standard deviation of the search, normalised; ``None`` without a search.
             steps: Simulated steps so far.
         """
         elapsed = self.elapsed

@@ -30,7 +30,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 
 _LEAST_TOLD = 0.1
-"""Smaller shares are said to be below this [%]."""
+"""Smaller shares are printed as below this [%]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,7 +155,7 @@ def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: P
 
 
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
-    """What the run has, and why it tells another error of the same model, where it does."""
+    """The run's effects, and why its error of the same model differs, if it does."""
     said = []
     if run.effects:
         said.append(f"The search began with what the run has: {', '.join(run.effects)}.")

@@ -359,7 +359,7 @@ def _of_known_gains(evidence: Evidence) -> list[int]:
 
 
 def torque_limit(evidence: Evidence) -> Iterator[Change]:
-    """The drive gives no more than a torque that nobody states."""
+    """The drive's torque is limited, and the limit is not stated."""
     view = evidence.view
     for j in _of_known_gains(evidence):
         most = np.quantile(np.abs(view.asked(j)), np.linspace(0.3, 0.995, 15))
@@ -659,7 +659,7 @@ def _gain(before: Evidence, after: Evidence, change: Change) -> float:
 
 
 def check_log(problem: Problem) -> list[Finding]:
-    """What is wrong with the recordings of a problem; the same of several is said once."""
+    """What is wrong with the recordings of a problem; the same of several comes once."""
     merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
     views = views_of(problem)
     if all(np.ptp(view.position, axis=0).max() < _STANDS for view in views):

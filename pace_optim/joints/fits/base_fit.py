@@ -90,7 +90,7 @@ def _fit_along(
 
 
 def later_than_most(delay: torch.Tensor, *, cfg: FittingCfg = DEFAULT) -> torch.Tensor:
-    """Joints that are later than the delay that most joints have, (n,) bool; nobody knows it of one joint or two.
+    """Joints that are later than the delay that most joints have, (n,) bool; of one or two joints none is.
 
     Args:
         delay: Of each joint, (n,) [control steps].
