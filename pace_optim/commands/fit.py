@@ -1,5 +1,6 @@
 """Identify a robot's drives from recordings."""
 
+import os
 import sys
 
 from pace_actuators.text import listed
@@ -117,7 +118,7 @@ def main() -> None:
     del args["headless"]
     then_diagnose = args.pop("diagnose")
 
-    files = [*args["data"], *args["validation"]]
+    files = [os.path.basename(path) for path in (*args["data"], *args["validation"])]
     progress = ProgressLine()
     progress.wait_for(f"reading {listed(files, 6) if files else 'the recording'}")  # the imports take a while too
     import torch

@@ -129,7 +129,7 @@ def find_wrong_links(
     now = _fit(now.problem, _values_of(now), cfg, whole=True)
     if now.rmse > cfg.near * noise:
         return LinkFindings()
-    say("fitting what looks like a wrong link")
+    say("fitting the links that may be wrong")
     likes = _look_alikes(base, joint_of, cfg)
     left = max(now.rmse, noise)
     if any(rmse * cfg.alike < left for rmse in likes.values()):
@@ -187,7 +187,7 @@ def _best_addition(
         if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
-        say(f"fitting {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
+        say(f"fitting the links {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
         fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg)))
     if not fitted:
         return None

@@ -274,7 +274,9 @@ class Optimization:
         generations = max(_FEWEST_GENERATIONS, budget // optimizer.population_size)
         optimizer.cfg = replace(optimizer.cfg, max_iteration=min(optimizer.cfg.max_iteration, generations))
         self.progress.say("far above the noise: searching (Ctrl-C keeps what is found)")
-        return self._without_effects_too(self._search(optimizer))
+        starts = self._without_effects_too(self._search(optimizer))
+        self.progress.say("fitting from the best of the search")
+        return starts
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(

@@ -169,8 +169,8 @@ def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     unit = units_for("mrad", problem.joint_types)
     return [
         *said,
-        f"The run's own validation error is {1e3 * own:.3g} {unit}, here it is {1e3 * here:.3g} {unit}: "
-        f"{', and '.join(ways)}.",
+        f"The run's validation error is {1e3 * own:.3g} {unit}, that of the joints simulated alone {1e3 * here:.3g} "
+        f"{unit}: {', and '.join(ways)}.",
     ]
 
 

@@ -74,7 +74,7 @@ def fit_curves(
         joints &= ~(has & effect.shared)
     if not bool(joints.any()) or not outcome.cfg.has("curves"):
         return None
-    say("fitting curves of any form in place of effects")
+    say("fitting curves of any form instead of effects")
     ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
     every = (get_effect(name) for name in available_effects())
     effects = [each for each in every if issubclass(each, FreeForm) and each.variable in ranges]

@@ -220,7 +220,7 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
     if not places:
         return []
     found = [
-        f"{name.replace('_', ' ')}{_of(keys)} ({side}, {bound:g} {space.unit_of(name, keys[0])})"
+        f"{name.replace('_', ' ')} ({side}, {bound:g} {space.unit_of(name, keys[0])}){_of(keys)}"
         for (name, side, bound), keys in places.items()
     ]
     return [
