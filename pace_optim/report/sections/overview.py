@@ -128,9 +128,12 @@ def _figures(result: FitResult) -> Markup:
         ("Score", f"{result.score:.2e}", units_for("rad², sum over the joints", result.joint_types)),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
+    if result.times_noise and train:
+        times = "0.1 times or less" if result.times_noise < 0.1 else f"{result.times_noise:.3g} times"
+        figures.insert(2, ("Noise", said(train / result.times_noise), f"the training error is {times} that"))
     if result.objective:
         own, kept = ("–" if part is None else f"{part:.2e}" for part in map(result.objective.get, _PARTS))
-        figures.insert(5, ("Objective", own, f"in training, {kept} in validation"))
+        figures.insert(-1, ("Objective", own, f"in training, {kept} in validation"))
     return html(
         '<dl class="figures">{% for name, value, about in figures %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd>'
         "<dd class='small'>{{ about }}</dd></div>{% endfor %}</dl>",
