@@ -1,7 +1,7 @@
 """Pages, messages and docstrings read once: short sentences, none of the old habits, codes with a cure.
 
 A failure names the sentence or phrase and what to write. The limits are those that the texts reach; lower them when the
-texts get better. ``python tests/docs/test_words.py`` prints the counts.
+texts get better. ``PYTHONPATH=tests/support python tests/docs/test_words.py`` prints the counts.
 """
 
 import ast
