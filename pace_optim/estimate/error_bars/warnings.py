@@ -177,7 +177,7 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
 
 def rough_motion(noise: float, score: float) -> list[str]:
     """Whether the simulation's own noise [rad] is a notable part of the error (score [rad²])."""
-    if noise < ROUGH * score**0.5:
+    if noise < max(ROUGH * score**0.5, _NOTHING):
         return []
     return [
         "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
