@@ -30,8 +30,8 @@ a motion in which a drive is at its torque limit for more than {MAX_SHARE_AT_LIM
 a drive's no-load speed, and torques that touch their limit, are warnings: the drive limits them itself. Steps have no
 commanded speed, so theirs is not checked. Torques are those of the simulation, so --command_only does not check them.
 
-The encoder reads noise and quantisation: they are recorded, and the position loop sees them. The derivative gain acts on
-the true speed of the joint. dof_vel is that speed, without noise."""
+The encoder reads noise and quantisation: they are recorded, and the position loop sees them. The derivative gain acts
+on the true speed of the joint. dof_vel is that speed, without noise."""
 
 
 def make_collection_parser() -> Parser:
