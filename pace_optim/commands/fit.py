@@ -133,6 +133,7 @@ def main() -> None:
     asked = args.pop("device")
     processes, device = join(asked or "cpu")
     if not processes.writes:
+        progress.close()
         help_fit(processes, device, args["resume"], args["task"])
         return
     if run := args.pop("resume"):
@@ -140,22 +141,23 @@ def main() -> None:
             print(f"note: --resume goes on with the run's own settings; ignored: {', '.join(ignored)}", file=sys.stderr)
         own = asked and device
         result, folder = resume(
-            run, args["max_iteration"], progress, task=args["task"], device=own, processes=processes
+            run, args["max_iteration"], progress=progress, task=args["task"], device=own, processes=processes
         )
     else:
         if args["task"] is None:
             raise ValueError(missing_task())
-        result, folder = fit_with_torques(FitSettings(**args, device=device), progress, processes)
+        result, folder = fit_with_torques(FitSettings(**args, device=device), progress=progress, processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
-    if then_diagnose and not any("interrupted" in reason for reason in result.stop_reasons):
+    interrupted = any("interrupted" in reason for reason in result.stop_reasons)
+    if then_diagnose and not interrupted:
         from pace_optim.commands.diagnose import run_and_tell
         from pace_optim.diagnosis import DiagnosisSettings
 
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
-        print(*next_line(result, folder), f"run: {folder}", sep="\n")
+        print(*([] if interrupted else next_line(result, folder)), f"run: {folder}", sep="\n")
 
 
 def missing_task() -> str:
