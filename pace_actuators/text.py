@@ -37,8 +37,8 @@ def shortened(sentences: Sequence[str], kind: str) -> list[str]:
         kind: What one of them is: "warning".
     """
     shown, rest = list(sentences[:SHOWN]), sentences[SHOWN:]
-    if len(rest) < 2:  # its line is as short as the one that would count it
-        return [*shown, *rest]
+    if not rest:
+        return shown
     codes = dict.fromkeys(code for sentence in rest for code in _CODE.findall(sentence))
     which = f" ({', '.join(codes)})" if codes else ""
     return [*shown, f"{plural(len(rest), f'more {kind}')}{which} in report.html"]
