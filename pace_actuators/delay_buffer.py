@@ -179,7 +179,7 @@ class DelayBuffer:
         """The samples, (length, num_envs, num_joints): the newest, then those before it from the oldest on.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If nothing was appended yet.
         """
         if self._storage is None:
             raise ValueError("The delay has no sample yet: call compute first.")

@@ -54,9 +54,9 @@ class DriveResult:
     """Value by parameter and joint (or ``"all"``)."""
     delay_s: float
     std: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """Standard deviations of the same shape; ``None`` where there is none."""
+    """Standard deviations of the same shape; ``None`` without an error bar."""
     correlation: dict[str, Any] = field(default_factory=dict)
-    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
+    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where it is unknown; may be empty."""
     drive: dict[str, dict[str, float]] = field(default_factory=dict)
     """Gains and limits per joint that were in force in every recording, as far as known."""
     links: dict[str, LinkInertia] = field(default_factory=dict)
@@ -149,7 +149,7 @@ def result_path(path: str | Path) -> Path:
     """Where the result of a run lies: the file itself, or that of the run's folder.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     path = Path(path)
     with contextlib.suppress(OSError, ValueError):  # file_at says what is wrong

@@ -72,10 +72,10 @@ class IdentifiedDrives:
     """Value by parameter and joint (or ``"all"``), in the units of ``units``."""
 
     std: Mapping[str, Mapping[str, float | None]]
-    """Standard deviations of the same shape; ``None`` where there is none."""
+    """Standard deviations of the same shape; ``None`` without an error bar."""
 
     correlation: Mapping[str, Any]
-    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where there is none; may be empty."""
+    """``labels`` (``parameter/joint``) and ``matrix``, entries ``None`` where it is unknown; may be empty."""
 
     effects: tuple[EffectCfg, ...]
     """The effects, without values."""
@@ -288,8 +288,8 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
     if ratio > _FARTHEST * (1 + 1e-6):
         notes.append(
             f"The drive was identified with physics steps of {1e3 * at.physics_dt:g} ms, which are "
-            f"{1e3 * physics_dt:g} ms here. The errors of the step went into its values: identify again with steps "
-            "nearer to these, or replay the recording here to see what it costs (pace play --replay)."
+            f"{1e3 * physics_dt:g} ms here. Its values include the error of that step. Identify again with steps "
+            "nearer to these, or replay the recording here to see the difference (pace play --replay)."
         )
     return notes
 

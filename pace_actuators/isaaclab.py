@@ -10,12 +10,12 @@ What differs there, and is converted here:
   commands or torque, by any time.
 - **Friction.** Since Isaac Sim 5 PhysX takes Coulomb friction in N m, static and dynamic (alike here), and viscous
   friction. Before, friction is a coefficient that scales with the joint's load: it cannot hold what was identified.
-  Newton's MuJoCo solver (3.0) takes it as MuJoCo's frictionloss, with a time constant of its own.
+  Newton's MuJoCo solver (3.0) takes it as MuJoCo's frictionloss, with a separate time constant.
 - **Joint parameters.** 2.3 reads armature and friction from the actuator. 3.0 reads them from its configuration before
   the actuator exists: the configuration takes them over from the drive.
 - **Limits of the solver.** 3.0 leaves the asset's own effort limit in force after the actuator, 2.3 lifts it. It is
   lifted in both (``joint_effort_limit``): the drive has limited its torque.
-- **Newton's actuators.** 3.0 with ``use_newton_actuators`` runs none but those that USD can hold, and refuses this one:
+- **Newton's actuators.** 3.0 with ``use_newton_actuators`` only runs actuators that USD can hold, and refuses this one:
   leave it off, or take what ``export --format newton`` writes.
 - **Effects that change friction at every step** need :class:`DriveFrictionMixin`.
 """
@@ -132,7 +132,7 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
     class_type: type = PaceDCMotorActuator
     """The actuator."""
 
-    joint_names_expr: list[str] = []  # noqa: RUF012  # configclass makes it a field of its own
+    joint_names_expr: list[str] = []  # noqa: RUF012  # configclass makes it a separate field
     """Expressions of the joints; empty means those of ``motor``."""
 
     stiffness: dict[str, float] | float | None = None
@@ -148,7 +148,7 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
         """Take over the joints; and their parameters, where Isaac Lab looks for them here.
 
         Raises:
-            ValueError: If joint parameters are set beside the drive's, or cannot be told before the joints are known.
+            ValueError: If joint parameters are set beside the drive's, or are unknown before the joints are.
         """
         expr = self.motor.joint_names_expr
         self.joint_names_expr = self.joint_names_expr or ([expr] if isinstance(expr, str) else list(expr))

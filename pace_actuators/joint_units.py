@@ -48,7 +48,7 @@ def joint_label(joint: str, own: JointType, joint_types: Iterable[JointType], un
 
 
 def all_hinges(count: int) -> tuple[JointType, ...]:
-    """The types of so many joints where nothing else is said: they turn."""
+    """The types of so many joints by default: they turn."""
     return tuple("hinge" for _ in range(count))
 
 

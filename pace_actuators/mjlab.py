@@ -222,7 +222,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
 
 @requires_model_fields("dof_frictionloss", "dof_damping")
 def expand_drive_friction(env: Any, env_ids: torch.Tensor | None) -> None:
-    """Does nothing itself: that it is there gives every environment friction of its own."""
+    """Does nothing itself; its presence gives every environment a separate friction."""
 
 
 def drive_friction_event() -> EventTermCfg:

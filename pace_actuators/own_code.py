@@ -1,10 +1,9 @@
-"""Code of a user's own, found by name: a module is imported because the user names it, or because a record fits it.
+"""The user's code, found by name: a module is imported if the user names it, or if it fits a record.
 
-What a file names is never imported by itself. A record, as it stands in a run's ``settings.json`` and ``result.json``,
-holds where each file of the code lies and its SHA-256; the code is run from the very bytes that were compared, so that
-neither another file of that name in the present folder nor a stale byte code can take its place. It must have been
-named on this machine before (:mod:`pace_actuators.trusted_code`): a folder from elsewhere can bring both code and its
-digest along.
+A name in a file alone imports nothing. A record, in a run's ``settings.json`` and ``result.json``, has the path and the
+SHA-256 of each file of the code. The bytes that were compared are the ones that run: neither another file of that name
+nor a stale byte code can take their place. The code must also have been named on this machine before
+(:mod:`pace_actuators.trusted_code`), because a foreign folder can bring both code and its digest.
 """
 
 from __future__ import annotations
@@ -135,7 +134,7 @@ def checked_record(content: Mapping[str, Any]) -> CodeRecord:
     """The record of the code in a file's ``environment``.
 
     Raises:
-        TypeError: If it is none.
+        TypeError: If it is another type.
     """
     code = content.get("code", {})
     if not isinstance(code, Mapping) or not all(
@@ -260,7 +259,7 @@ class _RecordedCode(MetaPathFinder):
             spec = ModuleSpec(name, _Compiled(code), origin=str(file), is_package=package)
             spec.has_location = True
             return spec
-        if any(each.startswith(f"{name}.") for each in self._code):  # a package without a file of its own
+        if any(each.startswith(f"{name}.") for each in self._code):  # a package without a file
             return ModuleSpec(name, None, is_package=True)
         return None
 

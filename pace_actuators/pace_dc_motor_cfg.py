@@ -100,7 +100,7 @@ class PaceDCMotorCfg(Config):
 
     drive_dt: float | None = None
     """Time between two runs of the drive's own controller [s], at least a physics step: commands come once per control
-    step and are held. Where it does not divide the control step, the controller runs on a clock of its own. ``None``
+    step and are held. Where it does not divide the control step, the controller runs on a separate clock. ``None``
     runs it once per control step."""
 
     implicit: bool = False

@@ -1,4 +1,4 @@
-"""What of an identified drive another world can hold."""
+"""The parts of an identified drive that another simulator can hold."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class World:
     """Whether a drive can change the joint's friction at every physics step."""
 
     inertia_per_step: bool = True
-    """Whether a drive is told the joint's inertia at every physics step, and can change it."""
+    """Whether a drive gets the joint's inertia at every physics step, and can change it."""
 
     friction_hook: str = ""
     """What the user must add for that, in words; empty if nothing."""
@@ -98,7 +98,7 @@ def link_notes(drives: IdentifiedDrives) -> list[str]:
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
-    """Refuse a drive that depends on the joint's inertia at every step where that cannot be told.
+    """Refuse a drive that needs the joint's inertia at every step, where the simulator does not give it.
 
     Raises:
         ValueError: If it does.

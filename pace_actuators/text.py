@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from pace_actuators.joint_units import JointType, units_for
 
 _POSITIONS = ((1e-4, 1e3, "mrad"), (1e-7, 1e6, "µrad"), (0.0, 1e9, "nrad"))
 _MOST_DECIMALS = 6
+SHOWN = 3
+"""Sentences of a kind that are shown in full; the others are folded."""
+_CODE = re.compile(r"\[(W\d+)\]")
 
 
 def listed(names: Iterable[object], most: int = 40) -> str:
@@ -23,6 +27,21 @@ def conjoined(names: Iterable[object]) -> str:
     """Names in a sentence: "a, b and c"."""
     *first, last = [str(name) for name in names]
     return f"{', '.join(first)} and {last}" if first else last
+
+
+def shortened(sentences: Sequence[str], kind: str) -> list[str]:
+    """The first three sentences, then one line with the number of the others and their codes.
+
+    Args:
+        sentences: The most important first.
+        kind: What one of them is: "warning".
+    """
+    shown, rest = list(sentences[:SHOWN]), sentences[SHOWN:]
+    if not rest:
+        return shown
+    codes = dict.fromkeys(code for sentence in rest for code in _CODE.findall(sentence))
+    which = f" ({', '.join(codes)})" if codes else ""
+    return [*shown, f"{plural(len(rest), f'more {kind}')}{which} in report.html"]
 
 
 def plural(count: int, noun: str) -> str:
@@ -51,7 +70,7 @@ def three_figures(value: float) -> str:
 
 
 def value_and_error(value: float, std: float | None) -> tuple[str, str]:
-    """A value to the digits that its standard deviation leaves, and the standard deviation to two of its own."""
+    """A value to the digits that its standard deviation leaves, and the standard deviation to two digits."""
     if std is None or std <= 0:
         return f"{value:.4g}", "–"
     decimals = 1 - math.floor(math.log10(std))
@@ -91,6 +110,14 @@ def size_text(size: dict[str, Any]) -> str:
     elif size["unit"] != "1":
         text += f" {size['unit']}"
     return text + (", at its bound" if size["at_bound"] else "")
+
+
+def sizes_by_joints(sizes: Sequence[dict[str, Any]]) -> dict[tuple[str, str, str], list[str]]:
+    """Effect, parameter and value of ``diagnosis.json``'s sizes, with the joints that have this value."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for size in sizes:
+        found.setdefault((size["effect"], size["parameter"], size_text(size)), []).append(size["joint"])
+    return found
 
 
 def count_in_short(count: float) -> str:

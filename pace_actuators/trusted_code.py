@@ -1,6 +1,6 @@
 """Which code may be imported because a file names it: that which has been named on this machine before.
 
-A record of digests protects from code that has changed, not from a folder of somebody else's that brings its module and
+A record of digests protects from code that has changed, not from a foreign folder that brings its module and
 the module's digest along. So the digest of every file of code that a user names, or runs a fit from, is kept under
 ``$XDG_STATE_HOME/pace`` (``~/.local/state/pace``), where no downloaded folder writes; a record counts for those alone.
 Where that is no absolute path, or not the user's alone (:class:`pace_actuators.files.OwnFolder`), nothing is kept.

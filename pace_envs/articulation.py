@@ -322,7 +322,7 @@ class Articulation(RobotState):
                     self._write_model(actuator, effect)
 
     def _write_carried(self, name: str, value: torch.Tensor | float, joint_ids: JointIds, env_ids: EnvIds) -> None:
-        """Write a parameter that the model's joints carry, and tell drives whose torque law depends on it."""
+        """Write a parameter that the model's joints carry, and pass it to drives whose torque law depends on it."""
         field = _field(name)
         value = value if isinstance(value, torch.Tensor) else checked_values(value, self._shape, name)
         tensor = self._sim.tensor(value)

@@ -23,7 +23,7 @@ class ArticulationData:
     default_joint_vel: torch.Tensor
     """[rad/s], (num_envs, num_joints)."""
     joint_pos_limits: torch.Tensor
-    """Lower and upper [rad], (num_joints, 2); infinite where there is none."""
+    """Lower and upper [rad], (num_joints, 2); infinite without a limit."""
     soft_joint_pos_limits: torch.Tensor
     """Lower and upper [rad], (num_joints, 2)."""
     joint_pos_target: torch.Tensor

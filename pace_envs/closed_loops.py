@@ -31,9 +31,9 @@ class ClosedLoops:
     Joints that lean on a stop stay there where the loops can be closed so: a spring holds them.
 
     With r(q) the constraints' residual and J_p its derivative with respect to the passive degrees of freedom,
-    Newton's method takes q_p ← q_p - J_p⁺ r until r = 0, from the passive joints' present positions; where that does
-    not lead there, the joints are taken there step by step from the model's own closed posture, so that a loop keeps
-    the assembly that it has in the model.
+    Newton's method takes q_p ← q_p - J_p⁺ r until r = 0, from the passive joints' present positions. If that does not
+    converge, the joints move there step by step from the model's closed posture. A loop then keeps the assembly that
+    it has in the model.
     """
 
     model: mujoco.MjModel
@@ -153,7 +153,7 @@ class ClosedLoops:
         return gap <= _CLOSED and bool((np.abs(off) <= slack).all())
 
     def _newton(self, qpos: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, float]:
-        """A posture on the constraints, moving some degrees of freedom, and what of them is left."""
+        """A posture on the constraints, moving some degrees of freedom, and the remaining error."""
         best, least = qpos, np.inf
         for _ in range(_STEPS):
             jacobian, residual = self._constraints(qpos)

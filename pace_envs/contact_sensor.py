@@ -69,7 +69,7 @@ class ContactSensor:
         """Velocities of the geoms' centres in the world [m/s], (num_envs, num_geoms, 3).
 
         Raises:
-            ValueError: If the sensor was not told to track velocities.
+            ValueError: If the sensor does not track velocities.
         """
         if self._velocity is None:
             raise ValueError("This contact sensor has no velocities. Set track_velocity=True in its configuration.")

@@ -115,7 +115,7 @@ def _dotted(text: str) -> str:
 
 
 def _words(value: Any) -> Iterator[str]:
-    """What of a value is an expression or the name of a call, and not a literal."""
+    """The parts of a value that are expressions or names of calls, not literals."""
     if isinstance(value, Word):
         yield value.text
     elif isinstance(value, Call):

@@ -25,7 +25,7 @@ from pace_envs.task_source import EnvironmentRecord
 _FAR_ABOVE_NOISE = 10.0
 """An error of this many times the noise is no residual of noise."""
 _SAME = 0.01
-"""Relative difference of gains and limits that is none."""
+"""Relative difference of gains and limits that does not count."""
 _MOST = 4
 """Labels that a sentence names, at most."""
 _DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

@@ -1,4 +1,4 @@
-"""Jobs that several processes share: the loss of one is told in a line, and ends the others."""
+"""Jobs that several processes share: the loss of one prints a line and ends the others."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class ManagerBasedEnv(gym.Env):
         "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
     }
 
-    @torch.inference_mode(False)  # whoever builds it, it can be stepped in and out of inference mode
+    @torch.inference_mode(False)  # it can then be stepped in and out of inference mode
     def __init__(self, cfg: ManagerBasedEnvCfg, render_mode: str | None = None):
         """Build the scene and the managers.
 
@@ -102,7 +102,7 @@ class ManagerBasedEnv(gym.Env):
         self._constants: dict[tuple[float, ...], torch.Tensor] = {}
         self.extras: dict[str, Any] = {}
         self.masks_resets = False
-        """Whether environments are reset where a mask says so, without anybody waiting for the GPU to count them."""
+        """Whether environments are reset where a mask says so, without waiting for the GPU to count them."""
         self.common_step_counter = 0
         self._renderer: Any = None
         self._graphs: dict[str, StepGraph] = {}

@@ -76,7 +76,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
 
     @property
     def takes_masks(self) -> bool:
-        """Whether all terms can be reset without being told which environments: those of this package can."""
+        """Whether all terms can be reset by a mask instead of indices: those of this package can."""
         loops = any(robot.closed_loops is not None for robot in self.scene.articulations.values())
         managers = (
             self.action_manager,
@@ -140,7 +140,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     def _step_where(
         self, action: torch.Tensor
     ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """A step without anybody waiting for a GPU; from a CUDA graph where all terms allow it."""
+        """A step without waiting for the GPU; from a CUDA graph where all terms allow it."""
         if self.can_be_captured:
             self.action_manager.take_action(action)
             results = self._replayed(
@@ -159,7 +159,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         return obs, results["reward"], results["terminated"], results["time_outs"], self.extras
 
     def _after_physics(self) -> dict[str, torch.Tensor]:
-        """Steps (2) to (7), with environments that are done told by a mask."""
+        """Steps (2) to (7), with a mask of the environments that are done."""
         self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()

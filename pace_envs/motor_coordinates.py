@@ -55,7 +55,7 @@ class DrivenJoints:
             names: Joints, and motors by the names of their tendons.
 
         Raises:
-            ValueError: If a name is none of these, or the motors of a group do not determine its joints.
+            ValueError: If a name is not one of these, or the motors of a group do not determine its joints.
         """
         single = [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in _SINGLE]
         rows = {name: fixed_tendon(model, name) for name in names if name not in single}
@@ -140,7 +140,7 @@ class DrivenJoints:
         """How far all coordinates may move at once with all joints within their limits, (n, 2).
 
         Args:
-            limits: Of the joints, (n, 2); infinite where there are none.
+            limits: Of the joints, (n, 2); infinite without limits.
             home: A posture of the joints, (n,): motors that move several have their range around it.
         """
         coupled = np.array([name != joint or (row != 0).sum() > 1 for name, joint, row in self._each()])
@@ -168,7 +168,7 @@ _SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:
-    """Limits of joints, (n, 2) [rad, of slides m]; infinite where there are none."""
+    """Limits of joints, (n, 2) [rad, of slides m]; infinite without limits."""
     every = [model.joint(joint) for joint in joints]
     return np.array([each.range if each.limited[0] else (-np.inf, np.inf) for each in every])
 
@@ -309,7 +309,7 @@ class MotorCoordinates:
             of_tendons[:, carried.tendons] = 0.0
 
     def of_driven(self, values: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """Positions (..., nq) or speeds (..., nv) of driven joints, whatever the joints that follow them do.
+        """Positions (..., nq) or speeds (..., nv) of driven joints; those that follow do not count.
 
         Args:
             values: As the simulation shows them.

@@ -69,7 +69,7 @@ def registered_tasks() -> list[str]:
 
 
 def registered_by(task: str) -> str | None:
-    """The module that registered a task, by the task's name; ``None`` if this package did, or nobody."""
+    """The module that registered a task, by the task's name; ``None`` if this package did, or no module."""
     module = _REGISTERED_BY.get(task, {}).get("__name__", __name__)
     return None if module.partition(".")[0] == "pace_envs" else module
 
@@ -124,7 +124,7 @@ def make_env(
 
     Args:
         env_cfg_entry_point: Where its configuration comes from.
-        cfg: A configuration of your own instead.
+        cfg: Your configuration instead.
         num_envs: Number of environments.
         physics_dt: A finer physics time step under the same control rate [s].
         delay_mode: ``"command"`` or ``"effort"``, for all drives.

@@ -6,7 +6,7 @@ import numpy as np
 from pace_envs.simulation import Simulation
 
 _DRAWN = 2
-"""Last group of geoms that MuJoCo draws unless it is told otherwise."""
+"""Last group of geoms that MuJoCo draws by default."""
 
 
 def drawn(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -29,7 +29,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
     file = read_model_file(cfg.mjcf_path, touches=touches)
     spec = file.spec
     add_motors(spec, cfg.couplings, cfg.mjcf_path)
-    model = compile_model(spec, cfg.mjcf_path)  # a fault of the file is told with its name
+    model = compile_model(spec, cfg.mjcf_path)  # an error names the file
     if touches:
         for note in file.notes:
             warnings.warn(f"{cfg.mjcf_path}: {note}", stacklevel=2)

@@ -267,8 +267,8 @@ class Simulation:
             columns: Their degrees of freedom.
 
         Returns:
-            Inertia without armature [kg m²], how fast gravity pulls back with the angle [N m/rad], and what of the
-            inertia does not couple to other joints [kg m²].
+            Inertia without armature [kg m²], how fast gravity pulls back with the angle [N m/rad], and the part of
+            the inertia that does not couple to other joints [kg m²].
         """
         if not self._link_fields:  # they hold what is computed after they were bound
             self._link_fields = {name: self.bind(name) for name in ("M", "xaxis", "xanchor", "subtree_com")}

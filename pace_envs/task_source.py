@@ -1,4 +1,4 @@
-"""Where a task comes from: a name, a module of one's own, a model file; and how it is found again in a run's record."""
+"""Where a task comes from: a name, your module or a model file; and how a run's record finds it again."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class EnvironmentRecord:
 
     @classmethod
     def read(cls, content: Mapping[str, Any] | None, task: str) -> EnvironmentRecord:
-        """The ``environment`` of a file; that of a registered task where there is none.
+        """The ``environment`` of a file; that of a registered task without such a file.
 
         Raises:
             TypeError: If it is damaged.
@@ -179,7 +179,7 @@ def model_files(path: Path, *, touches: bool = False) -> list[Path]:
 
 
 def file_digest(path: str | Path) -> str:
-    """SHA-256 of a file, or of all files of a folder, to tell whether they have changed."""
+    """SHA-256 of a file, or of all files of a folder, to see whether they have changed."""
     path, digest = Path(path), hashlib.sha256()
     if not path.is_dir():
         with path.open("rb") as content:

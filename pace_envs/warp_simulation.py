@@ -22,7 +22,7 @@ _INSTALL = 'pip install "pace-mujoco[gpu]"'
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
 """Constants that MuJoCo computes of masses and armatures: one per environment where those are."""
 _AFTER_RESETS = frozenset({"sensordata", "qacc"})
-"""Derived fields that nobody reads of an environment between its reset and its first step."""
+"""Derived fields that nothing reads between an environment's reset and its first step."""
 _STATE = ("qpos", "qvel", "qacc_warmstart", "qfrc_applied", "time")
 
 
@@ -86,7 +86,7 @@ class WarpSimulation(Simulation):
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time.
 
-        For some environments, only where somebody reads it before the next step; then for all of them.
+        For some environments, only where it is read before the next step; then for all of them.
         """
         self.update_constants()
         if env_ids is None or not self._bound <= _AFTER_RESETS.union(_STATE):
@@ -105,7 +105,7 @@ class WarpSimulation(Simulation):
         return [self.qpos, self.qvel, self.qfrc_applied, *self._cleared]
 
     def rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
-        """What selects environments; indices that are on the device already are trusted, so that nobody waits."""
+        """What selects environments; indices that are on the device already are trusted, so that nothing waits."""
         if env_ids is None or isinstance(env_ids, slice):
             return slice(None) if env_ids is None else env_ids
         if isinstance(env_ids, torch.Tensor) and env_ids.device == self.device and env_ids.dtype != torch.bool:

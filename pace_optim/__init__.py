@@ -1,4 +1,4 @@
-"""PACE on MuJoCo: identify actuator parameters from recordings, and find the effect that is missing."""
+"""PACE on MuJoCo: identify drives from recordings, and find the missing effect."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Reading files so that what is wrong with them is said by file and key, and writing them whole or not at all."""
+"""Read files, with errors that name file and key; write them completely or not at all."""
 
 from pace_actuators.files.keeping import refuse_place, refuse_taken
 from pace_actuators.files.own_folder import OwnFolder

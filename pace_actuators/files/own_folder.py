@@ -12,10 +12,10 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 class OwnFolder:
-    """An open folder that belongs to the user, with mode 0700, reached through no link of its own.
+    """An open folder that belongs to the user, with mode 0700, that is not itself a link.
 
-    Its files are opened, checked and replaced relative to the open folder, so that nobody can put another one in its
-    place. A file that belongs to someone else, that others may write to, or that is a link, counts as missing.
+    Its files are opened, checked and replaced relative to the open folder, so that no one else can replace one. A
+    file of another user, a file that others may write to, and a link count as missing.
     """
 
     def __init__(self, path: Path, descriptor: int):
@@ -37,8 +37,8 @@ class OwnFolder:
             names: Folders below the base directory; each must be the user's alone.
 
         Returns:
-            The folder; ``None`` where it cannot be the user's alone: the base directory is no absolute path or cannot
-            be written to, a folder is a link or belongs to someone else, or the system knows no owners.
+            The folder. ``None`` where it cannot be private: the base directory is not an absolute path or is not
+            writable, a folder is a link or belongs to another user, or the system has no owners.
         """
         home = os.environ.get("HOME", "")
         base = os.environ.get(variable) or (os.path.join(home, under_home) if home else "")

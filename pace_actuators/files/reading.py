@@ -1,4 +1,4 @@
-"""Reading JSON and tensors of a run's folder: whatever is wrong with the file is one sentence that names it."""
+"""Read JSON and tensors of a run's folder; every fault of a file is one sentence that names it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def file_at(path: str | Path, cure: str) -> Path:
         cure: What to do if it is not, a sentence.
 
     Raises:
-        ValueError: If there is none, or something else in its place: a folder, a pipe, a loop of links.
+        ValueError: If it does not exist, or is a folder, a pipe or a loop of links.
     """
     path = Path(path)
     try:
@@ -80,7 +80,7 @@ def read_tensors(path: str | Path, cure: str) -> Any:
     path = file_at(path, cure)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of foreign pickles: what is wrong is said below
+            warnings.simplefilter("ignore")  # of foreign pickles: the error below names the fault
             content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         if "Unsupported" in str(error) or "weights_only" in str(error).lower():

@@ -96,7 +96,7 @@ def _plain(hint: Any, value: Any, where: str, cure: str) -> Any:
 
 
 def _finite(value: Any, where: str, cure: str) -> None:
-    """Look for numbers that no computation can go on with, in whatever there is."""
+    """Look for unusable numbers at every depth."""
     if isinstance(value, int | float) and not abs(value) <= sys.float_info.max:  # NaN, infinite, or too many digits
         _wrong(where, f"is {_shown(value)}, expected a finite number", cure)
     if isinstance(value, Mapping):

@@ -98,7 +98,7 @@ def writing(files: Mapping[Path, Writer]) -> Iterator[None]:
 
 
 def _refuse_other(path: Path) -> None:
-    """Let a file take the place of nothing but a file: a device, such as /dev/null, would be gone for all."""
+    """Replace only files: a device, such as /dev/null, would be gone for every program."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():

@@ -138,7 +138,7 @@ def _transmission(model: mujoco.MjModel, i: int, name: str) -> tuple[str, float,
 
 
 def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str, float, float, dict[str, float]]:
-    """A tendon as a gear on the first of its joints, where the others follow that one, else as a motor of its own."""
+    """A tendon as a gear on the first of its joints, where the others follow that one, else as a separate motor."""
     label = model.tendon(tendon).name or f"number {tendon}"
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
     wraps = range(first, first + count)

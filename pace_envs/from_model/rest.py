@@ -70,5 +70,5 @@ def _places(model: mujoco.MjModel, joint: int) -> range:
 
 
 def _is_free(model: mujoco.MjModel, joint: int, driven: Sequence[str]) -> bool:
-    """Whether a joint has no drive; a floating base is none."""
+    """Whether a joint has no drive; a floating base does not count."""
     return int(model.jnt_type[joint]) != mujoco.mjtJoint.mjJNT_FREE and model.joint(joint).name not in driven

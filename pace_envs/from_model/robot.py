@@ -103,7 +103,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
 
     Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
     bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
-    (:mod:`pace_envs.from_model.defaults`) and told in ``sim2real.notes``.
+    (:mod:`pace_envs.from_model.defaults`) and listed in ``sim2real.notes``.
 
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).
@@ -191,7 +191,7 @@ def robot_cfg_from_model(
 def _on_ground(robot: ArticulationCfg, stance: Mapping[str, float]) -> InitialStateCfg:
     """A stance whose lowest colliding geom touches the ground; the base's origin is on it if nothing collides."""
     at_origin = replace(robot, fix_base=True, init_state=InitialStateCfg(rot=robot.init_state.rot))
-    with warnings.catch_warnings(action="ignore"):  # those who build the environment are told
+    with warnings.catch_warnings(action="ignore"):  # shown when the environment is built
         spec = load_robot_spec(at_origin, touches=True)
     depth = 1e3
     ground = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, -depth])

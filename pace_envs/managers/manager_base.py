@@ -82,7 +82,7 @@ class ManagerTermBase:
 
 
 Number = float | torch.Tensor
-"""A number to log; on a GPU a tensor without dimensions: nobody waits for it before it is written."""
+"""A number to log; on a GPU a tensor without dimensions, so that nothing waits for it before it is written."""
 
 
 def as_number(value: torch.Tensor) -> Number:
@@ -93,7 +93,7 @@ def as_number(value: torch.Tensor) -> Number:
 def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
     """Marks an event that changes positions, speeds and targets alone, and treats every environment by itself.
 
-    On a GPU it may be run on all environments; those that are not meant get theirs back, and nobody has to wait for
+    On a GPU it may be run on all environments; the others get their values back, and nothing has to wait for
     the GPU to count them (:meth:`pace_envs.scene.InteractiveScene.only_where`).
     """
     func.changes_state_only = True  # type: ignore[attr-defined]

@@ -75,7 +75,7 @@ class RewardManager:
         return self._reward.clone()
 
     def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
-        """:meth:`reset` of environments that are not counted, (num_envs,) bool; not a number where there is none."""
+        """:meth:`reset` of environments that are not counted, (num_envs,) bool; NaN if none is masked."""
         if not self._terms:
             return {}
         mean = torch.where(done, self._totals, 0.0).sum(dim=1) / (done.sum() * self._max_episode_length_s)

@@ -50,7 +50,7 @@ class UniformVelocityCommand(CommandTerm):
 
     @property
     def scale_tensor(self) -> torch.Tensor:
-        """:attr:`scale` where the tensors are, without dimensions: nobody waits for it."""
+        """:attr:`scale` where the tensors are, without dimensions, so that nothing waits for it."""
         return self._scale
 
     @property
@@ -102,4 +102,4 @@ class UniformVelocityCommandCfg(CommandTermCfg):
     """Yaw rate [rad/s]."""
 
     rel_standing_envs: float = 0.02
-    """Part of the environments that are told to stand still, 0 to 1."""
+    """Part of the environments whose command is to stand still, 0 to 1."""

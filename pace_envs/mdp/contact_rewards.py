@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def feet_air_time(
     env: ManagerBasedRLEnv, sensor_name: str, command_name: str, threshold: float, min_command: float = 0.1
 ) -> torch.Tensor:
-    """Long steps: at each landing, the time in the air beyond ``threshold`` [s]; 0 when told to stand still.
+    """Long steps: at each landing, the time in the air beyond ``threshold`` [s]; 0 when the command is to stand still.
 
     Standing still is a planar velocity command below ``min_command`` [m/s]. As in Isaac Lab.
     """

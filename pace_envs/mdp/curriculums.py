@@ -65,7 +65,7 @@ class command_range_by_tracking(ManagerTermBase):
         growth: float = 0.1,
         threshold: float = 0.7,
     ) -> torch.Tensor:
-        """The same of environments that are not counted, (num_envs,) bool: nobody waits for the GPU."""
+        """The same of environments that are not counted, (num_envs,) bool, without waiting for the GPU."""
         full = env.reward_manager.get_term_cfg(reward_name).weight * env.max_episode_length_s
         scale = self._command.scale_tensor
         self._earned += torch.where(done, env.reward_manager.episode_sums[reward_name], 0.0).sum() / full

@@ -28,12 +28,12 @@ def check_limits(path: Path, read: Callable[[], object], key: str = "") -> None:
     """Refuse a model file that takes too long, or too much memory, such as one that repeats a body 1e8 times.
 
     MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once; other faults of
-    the file are left to whoever reads it next. Systems that cannot fork have no such limits.
+    the file are left to the next reader. Systems that cannot fork have no such limits.
 
     Args:
         path: The file.
         read: Reads, compiles and allocates it.
-        key: What tells this way of reading it from others.
+        key: Identifies this way of reading it.
 
     Raises:
         ValueError: If it is beyond a limit, or ends the process that reads it.
@@ -80,7 +80,7 @@ def _read_in_fork(read: Callable[[], object], memory: int) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(_LONGEST_S), resource.getrlimit(resource.RLIMIT_CPU)[1]))
         signal.signal(signal.SIGXCPU, signal.SIG_DFL)
         read()
-    except ValueError as error:  # whoever reads it next says what is wrong
+    except ValueError as error:  # the next reader names the fault
         status = _REFUSED if re.search("memory|allocate", str(error), re.IGNORECASE) else 0
     except BaseException:
         status = _REFUSED

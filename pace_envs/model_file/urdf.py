@@ -28,7 +28,7 @@ _ZERO = 1e-15
 _READABLE = (".stl", ".obj", ".msh")
 """Files of meshes that MuJoCo reads."""
 _TOLD = 1e-3
-"""A change of an inertia by a smaller part is not told: a flat plate's moments are rounded."""
+"""A smaller relative change of an inertia gets no note: a flat plate's moments are rounded."""
 _NUMBERS = {
     "limit": ("lower", "upper", "effort", "velocity"),
     "dynamics": ("damping", "friction"),
@@ -77,7 +77,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
         touches: Whether the meshes of collisions stay, under the absolute paths of their files.
 
     Raises:
-        ValueError: If it is no URDF, still a xacro, or a number in it is none.
+        ValueError: If it is not a URDF, still a xacro, or a number in it is invalid.
     """
     try:
         root = ElementTree.fromstring(_with_declared_prefixes(text.strip().strip("\0")))
@@ -235,7 +235,7 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 
 
 def _number_of(element: ElementTree.Element | None, key: str) -> float:
-    """A number of an element; 0 where there is none."""
+    """A number of an element; 0 if missing."""
     return 0.0 if element is None else float(element.get(key, 0.0))
 
 

@@ -31,7 +31,7 @@ def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
 
     log = logging.getLogger("torch.onnx")
     level = log.level
-    log.setLevel(logging.ERROR)  # it misses torchvision, which nobody needs here
+    log.setLevel(logging.ERROR)  # it misses torchvision, which is not needed here
     with tempfile.TemporaryDirectory() as made:
         try:
             with warnings.catch_warnings():

@@ -20,7 +20,7 @@ IDENTIFIED_FILE = "identified.json"
 
 @dataclass(kw_only=True)
 class RunSettings:
-    """What a training was told; enough to go on with it and to play its policies."""
+    """The settings of a training: enough to go on with it and to play its policies."""
 
     task: str
     """Registered environment."""
@@ -50,7 +50,7 @@ class RunSettings:
     """Time step of physics and drives [s]; ``None`` means the identification's, or the task's."""
 
     start_from: str | None = None
-    """Checkpoint, or a run's folder for its last one, that the training goes on from in a folder of its own; its
+    """Checkpoint, or a run's folder for its last one, that the training goes on from, in a new folder; its
     iterations count. ``None`` starts with new networks."""
 
     device: str = "cpu"
@@ -74,7 +74,7 @@ class RunSettings:
 
         Args:
             folder: The training's.
-            task: Another task in place of its own.
+            task: Another task instead of the run's.
 
         Raises:
             ValueError: If the folder has none, it cannot be read, or the code of its task has changed or gone.
@@ -114,7 +114,7 @@ def find_checkpoint(path: str | Path) -> Path:
     """A checkpoint, or the last one of a run's folder.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     path = Path(path)
     if path.is_dir():
@@ -128,7 +128,7 @@ def latest_checkpoint(folder: Path) -> Path:
     """The checkpoint of the last iteration.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     found = {int(m[1]): p for p in folder.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", p.name))}
     if not found:

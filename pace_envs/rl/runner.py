@@ -46,7 +46,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
         super().__init__(env, train_cfg, log_dir, device=str(env.device))
         if on_gpu:
             DeferredEpisodes(self.logger)
-        self.logger.git_status_repos.clear()  # no copy of somebody's uncommitted work in every run
+        self.logger.git_status_repos.clear()  # no copy of uncommitted work in every run
         self.learning_threads = learning_threads or min(available_processors(), _MOST_THREADS)
         self.alg.update = _with_threads(self.alg.update, self.learning_threads)
 

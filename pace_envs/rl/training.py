@@ -54,7 +54,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvC
         edit: Changes it further, such as by :func:`pace_envs.tasks.velocity.set_drives`.
 
     Raises:
-        ValueError: If the task is none that can be trained, or a setting is unusable.
+        ValueError: If the task cannot be trained, or a setting is unusable.
     """
     cfg = load_env_cfg(settings.task)
     if not isinstance(cfg, TrainingEnvCfg):
@@ -72,7 +72,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvC
     _use_drives(cfg, settings)
     if settings.num_envs is not None:
         cfg.scene.num_envs = settings.num_envs
-    cfg.seed = cfg.runner.seed = settings.seed + process_number()  # each process has environments of its own
+    cfg.seed = cfg.runner.seed = settings.seed + process_number()  # each process has separate environments
     if settings.max_iterations is not None:
         if settings.max_iterations < 1:
             raise ValueError(f"max_iterations is {settings.max_iterations}, expected at least 1.")

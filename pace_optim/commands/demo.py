@@ -50,7 +50,7 @@ def record(effect: str, joints: str, duration: float, seed: int, folder: Path, o
 
 
 def main() -> None:
-    """Tell the story step by step."""
+    """Run and print the five steps."""
     parser = make_parser(__doc__, example="scripts/demo.py --effect backlash --effect_joints '.*KFE'")
     parser.add_argument("--effect", default="stribeck_friction", help="what is hidden (default stribeck_friction)")
     parser.add_argument("--effect_joints", default=".*KFE", metavar="REGEX", help="where (default: the knees)")

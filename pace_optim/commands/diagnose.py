@@ -16,8 +16,8 @@ from pace_optim.terminal.options import add_common_options, add_device_option, n
 def main() -> None:
     """Parse the command line, diagnose, print the verdict and what to do next."""
     parser = make_parser(
-        "Find out which physical effect a run's model lacks: try all known ones, judge them on recordings that were "
-        "not fitted, and fit the robot with those that pay.",
+        "Find out which physical effect a run's model lacks. It tries all known ones, judges them on recordings that "
+        "were not fitted, and fits the robot with those that pay.",
         example="scripts/diagnose.py logs/pace/anymal_d/26_11_21_12-00-00",
     )
     parser.add_argument("run", metavar="RUN", help="folder of a fit")

@@ -11,8 +11,9 @@ from pace_optim.terminal.options import add_common_options, add_overwrite_option
 def main() -> None:
     """Parse the command line, write, say what the format cannot hold."""
     parser = make_parser(
-        "Write an identified robot for other programs: an MJCF with its drives as actuators, configurations of its "
-        "drives for this project (cfg), mjlab (mjlab_native: its own classes alone), Isaac Lab and Newton, or JSON.",
+        "Write an identified robot for other programs: an MJCF with its drives as actuators, JSON, or configurations "
+        "of its drives. These are for this project (cfg), mjlab (mjlab_native needs no code of ours), Isaac Lab and "
+        "Newton.",
         example="scripts/export.py logs/pace/anymal_d/<run>/result.json --format mjcf --output anymal_d.xml",
     )
     parser.add_argument("result", metavar="FILE", help="result.json of a fit, or its run's folder")

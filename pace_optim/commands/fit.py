@@ -3,6 +3,7 @@
 import os
 import sys
 
+from pace_actuators.text import listed
 from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import (
@@ -14,11 +15,10 @@ from pace_optim.terminal.options import (
     number,
     take_common_options,
 )
+from pace_optim.terminal.progress import ProgressLine
 
 _WITH_RESUME = ("--resume", "--max_iteration", "--task", "--import", "--diagnose", "--headless", "--device")
 """Options that a resumed run takes; it has the others from its start."""
-_LARGE = 50e6
-"""Files that take a while to read [bytes]."""
 
 
 def main() -> None:
@@ -118,13 +118,14 @@ def main() -> None:
     del args["headless"]
     then_diagnose = args.pop("diagnose")
 
-    if large := [path for path in (*args["data"], *args["validation"]) if _is_large(path)]:
-        print(f"reading {', '.join(large)}", file=sys.stderr, flush=True)  # it takes a while, and so do the imports
+    files = [os.path.basename(path) for path in (*args["data"], *args["validation"])]
+    progress = ProgressLine()
+    progress.wait_for(f"reading {listed(files, 6) if files else 'the recording'}")  # the imports take a while too
     import torch
 
     from pace_optim.identification.fit import fit_with_torques, help_fit, resume
     from pace_optim.run.settings import FitSettings
-    from pace_optim.run.summary import summary
+    from pace_optim.run.summary import next_line, summary
     from pace_optim.terminal.processes import join
 
     args = take_common_options(args)
@@ -132,27 +133,31 @@ def main() -> None:
     asked = args.pop("device")
     processes, device = join(asked or "cpu")
     if not processes.writes:
+        progress.close()
         help_fit(processes, device, args["resume"], args["task"])
         return
     if run := args.pop("resume"):
         if ignored := [option for option in given_options(parser) if option not in _WITH_RESUME]:
             print(f"note: --resume goes on with the run's own settings; ignored: {', '.join(ignored)}", file=sys.stderr)
         own = asked and device
-        result, folder = resume(run, args["max_iteration"], task=args["task"], device=own, processes=processes)
+        result, folder = resume(
+            run, args["max_iteration"], progress=progress, task=args["task"], device=own, processes=processes
+        )
     else:
         if args["task"] is None:
             raise ValueError(missing_task())
-        result, folder = fit_with_torques(FitSettings(**args, device=device), processes=processes)
+        result, folder = fit_with_torques(FitSettings(**args, device=device), progress=progress, processes=processes)
     print(*summary(result), sep="\n")
     print(f"report: {folder / 'report.html'}")
-    if then_diagnose and not any("interrupted" in reason for reason in result.stop_reasons):
+    interrupted = any("interrupted" in reason for reason in result.stop_reasons)
+    if then_diagnose and not interrupted:
         from pace_optim.commands.diagnose import run_and_tell
         from pace_optim.diagnosis import DiagnosisSettings
 
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
-        print(f"run: {folder}")
+        print(*([] if interrupted else next_line(result, folder)), f"run: {folder}", sep="\n")
 
 
 def missing_task() -> str:
@@ -164,7 +169,3 @@ def missing_task() -> str:
         f"--task is missing. It takes a registered name ({', '.join(known)}), my_module:Name, my_file.py:Name, or a "
         "model file (robot.xml, robot.urdf). PACE's example is --task Pace-AnymalD-v0."
     )
-
-
-def _is_large(path: str) -> bool:
-    return os.path.isfile(path) and os.path.getsize(path) > _LARGE

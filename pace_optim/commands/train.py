@@ -55,7 +55,7 @@ def _task_for(identified: str | None) -> str:
     """The task in which the robot of a fit walks.
 
     Raises:
-        ValueError: If there is none, or no fit is given.
+        ValueError: If it does not exist, or no fit is given.
     """
     walking = [task for task in registered_tasks() if "-Velocity-" in task]
     if identified is None:

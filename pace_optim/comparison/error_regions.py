@@ -15,9 +15,9 @@ from .regions import Layout, Region, best_region, evidence, inside, refine
 from .words import band_text, percent, place_text
 
 AT_THE_FLOOR = 1.1
-"""An error up to this many times its floor is not told from noise."""
+"""An error up to this many times its floor counts as noise."""
 NEGLIGIBLE = 1e-6
-"""Below this an error is nobody's concern [rad]."""
+"""Errors below this are negligible [rad]."""
 MOST_PLACES = 3
 _OVERLAP = 0.5
 _COARSE = ("recording", "time")

@@ -31,9 +31,9 @@ def whiteness(error: np.ndarray, dt: float) -> dict[str, Any]:
         ρ_l = Σ e_k e_{k+l} / Σ e_k²
         Q = K (K + 2) Σ_l ρ_l² / (K − l), l = 1 … 20   (Ljung and Box 1978)
 
-    With tens of thousands of samples Q refuses even what is white for every purpose, so that sizes are given beside it:
-    ``predictable`` is ρ₁², the share of the variance that the sample before explains, and ``correlation_time`` is
-    dt (1 + 2 Σ ρ_l), up to the first ρ_l below zero: dt for white noise.
+    With tens of thousands of samples Q rejects even nearly white errors, so two sizes stand beside it. ``predictable``
+    is ρ₁², the share of the variance that the sample before explains. ``correlation_time`` is dt (1 + 2 Σ ρ_l), up to
+    the first ρ_l below zero: dt for white noise.
 
     Args:
         error: (K,) [rad].

@@ -102,7 +102,7 @@ def _floor(j: int, tracks: Sequence[Track]) -> float:
 
 
 def _names(runs: Sequence[RunTracks]) -> list[str]:
-    """Each run's effects, and whatever else it has to itself."""
+    """Each run's effects, and what else differs between the runs."""
     names = [" + ".join(run.result.effects) or "base model" for run in runs]
     for part in ([f"{run.result.delay_mode} delay" for run in runs], [f"{1e3 * run.physics_dt:g} ms" for run in runs]):
         if len(set(part)) > 1:

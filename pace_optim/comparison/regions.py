@@ -22,7 +22,7 @@ class Layout:
     time: np.ndarray
     """Share of the time, (B,); sums to 1."""
     error: np.ndarray
-    """Share of the squared error above the floor, (B,); sums to 1, or is all zero where there is none."""
+    """Share of the squared error above the floor, (B,); sums to 1, or is all zero without such error."""
     rms: np.ndarray
     """Root mean square of the error, floor included, (B,) [rad]."""
     mean: np.ndarray

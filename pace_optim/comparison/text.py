@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import joint_label, units_for
-from pace_actuators.text import position_unit
+from pace_actuators.text import position_unit, shortened
 
 from .ladder import ladder_table
 
@@ -37,7 +37,7 @@ def comparison_lines(content: dict[str, Any]) -> list[str]:
     lines += [f"  {place['sentence']}" for place in content["worst_places"]]
     if "ladder" in content:
         lines += ["", *ladder_table(content["ladder"], types)]
-    return lines + [f"note: {note}" for note in content["notes"]]
+    return lines + [f"note: {note}" for note in shortened(content["notes"], "note")]
 
 
 def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[str]) -> list[str]:

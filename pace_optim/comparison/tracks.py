@@ -179,7 +179,7 @@ def _enabled(entry: dict[str, Any]) -> np.ndarray:
 
 
 def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
-    """For files named anew, which samples the run was trained on: those of its own recordings, by their digests."""
+    """For files named anew, which samples the run was trained on: those of the run's recordings, by their digests."""
     if not data or not (folder / "best_trajectory.pt").is_file():
         return []
     digests = FitSettings.load(folder / "settings.json")[1].digests  # in the order of the recordings

@@ -56,7 +56,7 @@ class Collection:
     truth: Path | None = None
     """JSON file that says so."""
     design: Design | None = None
-    """What the chosen motion is expected to tell; None if none was asked for."""
+    """The error bars expected of the chosen motion; None if none was asked for."""
 
 
 def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: None) -> Collection:

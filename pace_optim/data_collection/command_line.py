@@ -30,8 +30,8 @@ a motion in which a drive is at its torque limit for more than {MAX_SHARE_AT_LIM
 a drive's no-load speed, and torques that touch their limit, are warnings: the drive limits them itself. Steps have no
 commanded speed, so theirs is not checked. Torques are those of the simulation, so --command_only does not check them.
 
-Noise and quantisation are what the encoder reads: recorded, and seen by the position loop (the derivative gain acts on
-the joint's own speed). dof_vel is the joint's own speed, without noise."""
+The encoder reads noise and quantisation: they are recorded, and the position loop sees them. The derivative gain acts
+on the true speed of the joint. dof_vel is that speed, without noise."""
 
 
 def make_collection_parser() -> Parser:
@@ -54,8 +54,8 @@ def make_collection_parser() -> Parser:
     motion.add_argument(
         "--optimize",
         action="store_true",
-        help="choose each joint's amplitude, centre, band and phases within the joint, speed and effort limits so that "
-        "the expected error bars for --noise (1e-4 if not given) are smallest; prints them before and after",
+        help="choose each joint's amplitude, centre, band and phases, within its limits, for the smallest error bars "
+        "expected with --noise (default here 1e-4); prints them before and after",
     )
     motion.add_argument(
         "--reach",

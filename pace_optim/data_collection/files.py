@@ -15,7 +15,7 @@ from .cfg import CollectionCfg
 
 @dataclass(frozen=True, kw_only=True)
 class Files:
-    """Where one trajectory's files go; None where there is none."""
+    """Where one trajectory's files go; None for a file that is not written."""
 
     recording: Path | None
     """The recording."""
@@ -63,7 +63,7 @@ def plan_files(cfg: CollectionCfg, sim2real: PaceCfg, names: Sequence[str]) -> l
 
 
 def truth_file(cfg: CollectionCfg, sim2real: PaceCfg) -> Path:
-    """Where it is said what was hidden: the recording's stem (of several, what theirs have in common)."""
+    """Where the truth is written: by the recording's stem (of several, their common part)."""
     recording = _recording(cfg, sim2real)
     return recording.with_name(f"{recording.stem}.truth.json")
 

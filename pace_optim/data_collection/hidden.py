@@ -58,7 +58,7 @@ def simulate_hidden(
 ) -> Hidden:
     """Draw the effects by the request's seed and let the plant follow the trajectories, one after another.
 
-    Sizes are drawn so that the robot's own chirp shows them, whatever motion is recorded: recordings that are made one
+    Sizes are drawn so that the robot's own chirp shows them, for every recorded motion: recordings that are made one
     by one with the same seed are of one robot.
 
     Args:

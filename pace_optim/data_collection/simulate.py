@@ -55,7 +55,7 @@ def simulate(
         space: The parameters.
         truth: Their true values, (size,).
         encoder: Reads the positions, bias taken off.
-        drive: Gains and limits in place of the robot's; fields that are None keep them.
+        drive: Gains and limits instead of the robot's; a field of ``None`` keeps the robot's.
         load: What the robot carries.
 
     Raises:

@@ -53,7 +53,7 @@ def told_speeds(trajectory: Trajectory, by_speed: tuple[str, ...], cfg: Collecti
     """The trajectory, with speeds for these joints.
 
     Raises:
-        ValueError: If it cannot be told in speeds, or what is asked for takes positions.
+        ValueError: If speeds cannot express it, or what is asked for takes positions.
     """
     if not by_speed:
         return trajectory

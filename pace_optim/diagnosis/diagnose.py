@@ -11,7 +11,7 @@ from pathlib import Path
 from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
-from pace_optim.diagnosis.findings.findings import Findings, told, with_links
+from pace_optim.diagnosis.findings.findings import Findings, told, with_links, with_refit
 from pace_optim.diagnosis.findings.result import FILE, Diagnosis
 from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.selection.decisions import FILE as DECISIONS
@@ -90,13 +90,14 @@ def diagnose(
     refit = refit or (bool(wrong.wrong) and settings.refit is None)
     pays = bool(found.paying or wrong.wrong)
     if refit and pays and (path := _refit(found, wrong, problem, run, diagnosis, progress)) is not None:
-        diagnosis = replace(diagnosis, runs=[str(folder), str(path)], wall_time_s=time.monotonic() - begin)
+        diagnosis = with_refit(diagnosis, result, FitResult.load(path), path)
+        diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
         _save(diagnosis, decisions)
     return diagnosis
 
 
 def _as_found(problem: Problem, result: FitResult) -> Problem:
-    """The problem with gains and limits that nobody knew as the run found them."""
+    """The problem with unknown gains and limits as the run found them."""
     told = with_identified(
         problem.plain_cfg, problem.dataset.recordings, problem.unknown, result.parameters, result.undetermined
     )

@@ -49,12 +49,12 @@ class JudgingCfg:
     level: float = 0.02
     """Chance of a false alarm over all that was tried."""
     alike: float = 1.10
-    """Models up to this ratio apart are alike: the first effect must bring more, effects within it are told together,
-    and an error within it of the floor is at the floor."""
+    """Models up to this ratio apart are alike: the first effect must bring more, and effects within it are
+    reported together. An error within it of the floor is at the floor."""
     next_effect: float = 1.25
     """What each further effect must bring: nearer to the floor than this none could."""
     clear: float = 1.5
-    """A fall that is this large needs no more than t > ``clear_t``."""
+    """A fall that is this large only needs t > ``clear_t``."""
     clear_t: float = 2.0
     """See ``clear``."""
     as_good: float = 1.025
@@ -62,7 +62,7 @@ class JudgingCfg:
     value, and a way with fewer parameters is taken."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
-    to this ratio apart. A joint is held at the robot's delay where one of its own leaves an error this many times
+    to this ratio apart. A joint is held at the robot's delay where a separate delay leaves an error this many times
     lower."""
     in_place: int = 3
     """So many of those that came near are tried in place of a joint's effects."""
@@ -77,7 +77,7 @@ class VerdictCfg:
     than this part of what effects leave, and an effect dominates above this share."""
     least: float = 0.01
     """An effect that does not lead near the floor must explain this part of what a larger one explains on joints of
-    its tree: a tenth of its error may be an error of its own model."""
+    its tree: a tenth of its error may be an error of that joint's model."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15

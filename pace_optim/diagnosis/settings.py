@@ -23,7 +23,7 @@ class DiagnosisSettings:
     """More candidates (``module:Class``), beside all registered ones; or, with ``only``, the only ones."""
 
     only: bool = False
-    """Whether nothing but ``effects`` is tried."""
+    """Whether only ``effects`` are tried."""
 
     measured: list[str] = field(default_factory=list)
     """Facts that were measured, of ``MEASURED_FACTS``: effects that would contradict them are not tried."""
@@ -39,7 +39,7 @@ class DiagnosisSettings:
     """Physics step of the diagnosis [s]; ``None``: half a control step, or the run's if that is finer."""
 
     refit: bool | None = None
-    """Whether the model with the effects found is fitted to the whole robot, as a run of its own; ``None``: where they
+    """Whether the model with the effects found is fitted to the whole robot, as a new run; ``None``: where they
     are what is missing, or a curve explains it in their place."""
 
     device: str = "cpu"

@@ -1,9 +1,9 @@
 """Which link of the model file is wrong, and what is wrong with it: mass, centre of mass or inertia.
 
-A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`), so one look covers all
-of them along the measured motion: the derivatives of the whole robot's residuals r by the base parameters and by the
-ten parameters of each link, and, as look-alikes, by a torque gain, a spring and an offset of each joint. With H = JᵀJ
-and g = Jᵀr of the base parameters and of what is tried, a part of a link would lower the score by
+A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`). So one set of
+derivatives along the measured motion covers all links: those of the whole robot's residuals r by the base parameters
+and by the ten parameters of each link. Look-alikes have theirs too: a torque gain, a spring and an offset of each
+joint. With H = JᵀJ and g = Jᵀr of the base parameters and of what is tried, a part of a link would lower the score by
 
     Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
 
@@ -129,7 +129,7 @@ def find_wrong_links(
     now = _fit(now.problem, _values_of(now), cfg, whole=True)
     if now.rmse > cfg.near * noise:
         return LinkFindings()
-    say("fitting what looks like a wrong link")
+    say("fitting the links that may be wrong")
     likes = _look_alikes(base, joint_of, cfg)
     left = max(now.rmse, noise)
     if any(rmse * cfg.alike < left for rmse in likes.values()):
@@ -187,7 +187,7 @@ def _best_addition(
         if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
-        say(f"fitting {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
+        say(f"fitting the links {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
         fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg)))
     if not fitted:
         return None

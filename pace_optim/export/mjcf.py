@@ -120,8 +120,8 @@ def _in_plain_steps(
     notes = []
     if any(drive.second_order for drive in actuators.values()):
         notes.append(
-            "kd, delay and armature are not the identified ones: they make up for MuJoCo's steps of first order, in "
-            "which a speed is half a step older than its position, and for torques that the drive holds."
+            "kd, delay and armature differ from the identified ones: they compensate for MuJoCo's steps of first order "
+            "and for torques that the drive holds. In such a step the speed is half a step older than the position."
         )
     if least:
         notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")

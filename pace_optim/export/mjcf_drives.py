@@ -2,10 +2,10 @@
 
     τ = clip(kp (ctrl - q_enc) - kd q̇, ± limit, torque-speed line),    ctrl delayed
 
-A drive with a torque-speed line is a ``dcmotor`` with its on-board controller, whose terminal voltage, back-EMF and
-current limit make the four-quadrant clip of ``PaceDCMotor`` exactly; one without is a ``position`` servo (``velocity``
-where kp is 0, ``motor`` where kd is 0 too). The encoder's bias is in the joint's ``ref``: positions, targets and
-sensors of the model are what the encoder shows.
+A drive with a torque-speed line is a ``dcmotor`` with its on-board controller. Its terminal voltage, back-EMF and
+current limit are exactly the four-quadrant clip of ``PaceDCMotor``. A drive without that line is a ``position`` servo
+(``velocity`` if kp is 0, ``motor`` if kd is 0 too). The encoder's bias is in the joint's ``ref``: positions, targets
+and sensors of the model are what the encoder shows.
 """
 
 from __future__ import annotations

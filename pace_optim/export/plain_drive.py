@@ -1,4 +1,4 @@
-"""What of an identified drive a simulator's own PD actuator can hold, joint by joint."""
+"""The part of an identified drive that a simulator's PD actuator can hold, joint by joint."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _what(kind: type[Effect]) -> str:
 
 
 def whole_steps_note(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
-    """What becomes of the delay in a simulator that delays by whole steps; nothing where there is none."""
+    """What becomes of the delay in a simulator that delays by whole steps; empty without a delay."""
     dt, delay = drives.at.physics_dt, max((drive.delay_s for drive in plain.values()), default=0.0)
     if not delay:
         return []

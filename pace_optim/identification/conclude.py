@@ -21,16 +21,16 @@ from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used
 from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import DELAY, held_at_prior, undetermined, without_delay
-from pace_optim.estimate.error_bars.warnings import fit_warnings, rough_motion
+from pace_optim.estimate.error_bars.warnings import by_effect, fit_warnings, rough_motion
 from pace_optim.estimate.least_squares import LeastSquaresCfg
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
-from pace_optim.run.summary import summary
+from pace_optim.run.summary import error_line
 
 _LONG = 60.0
-"""A fit that took longer tells its result before it is checked [s]."""
+"""A fit that took longer prints its error before it is checked [s]."""
 CHECKS_INTERRUPTED = "checks interrupted"
 """Stop reason of a result that was not checked to the end."""
 
@@ -40,7 +40,7 @@ class _End:
     """The vector that is kept, and what is known of it."""
 
     problem: Problem
-    """What was fitted; where the recordings tell the rate of the drives' loops, with that."""
+    """What was fitted; with the rate of the drives' loops where the recordings show it."""
     at: Assessment
     """The vector, and what noise alone leaves open."""
     train_rmse: float
@@ -119,8 +119,8 @@ def conclude(
                 continue
             end = check(run, end)
             if check is _with_step and run.progress.elapsed > _LONG:
-                text = summary(_result(run, record, end))
-                run.progress.tell(*text, "That was the fit; checks follow (Ctrl-C keeps the fit).")
+                error = error_line(_result(run, record, end, checked=False))
+                run.progress.tell(f"{error}. That was the fit; checks follow (Ctrl-C keeps the fit).")
     except KeyboardInterrupt:
         if not keep_interrupted:
             raise
@@ -132,7 +132,7 @@ def conclude(
 
 
 def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = False) -> FitResult:
-    """Write what is known so far; what takes simulations to tell only where all has been checked."""
+    """Write what is known so far; warnings that need simulations only where all has been checked."""
     run.folder.write_tensors("best_trajectory.pt", trajectories(end.problem, end.at.residuals))
     result = _result(run, record, end, checked)
     result.save(run.folder.path / "result.json")
@@ -169,13 +169,15 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         std_means_nothing=end.is_far,
         assumes_loop_rate=run.problem.assumes_loop_rate,
         loop_rate=_loop_rate(end),
-        warnings=[
-            *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
-            *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
-            *([] if rates is None else rates.sentences(problem.space, end.known)),
-            *(fit_warnings(problem, physical, told, rmse, end.left_open, unsure) if checked else []),
-            *end.consistency.sentences,
-        ],
+        warnings=by_effect(
+            [
+                *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
+                *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
+                *([] if rates is None else rates.sentences(problem.space, end.known)),
+                *(fit_warnings(problem, physical, told, rmse, end.left_open, unsure) if checked else []),
+                *end.consistency.sentences,
+            ]
+        ),
     )
 
 

@@ -32,6 +32,7 @@ from pace_optim.run.tensors import read_bounds
 from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
+_NOTE = "note: "
 _NOISY = 1.5
 """Times the noise above which a fit leaves something that other facts may explain."""
 _BETTER = 0.9
@@ -45,7 +46,7 @@ def fit(
     on_start: Callable[[Path], None] = lambda _: None,
     assess_interrupted: bool = True,
     processes: Processes | None = None,
-    told: bool = False,
+    tell: Callable[[str], None] = tell_on_stderr,
 ) -> tuple[FitResult, Path]:
     """Identify a robot.
 
@@ -57,7 +58,7 @@ def fit(
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
             interruption is passed on at once, and the folder has what ``resume`` needs.
         processes: Who shares the search's candidates; this one writes, the others call :func:`help_fit`.
-        told: Whether it has been told what is assumed, and how the recordings are understood.
+        tell: Gets what is assumed and how the recordings are understood, each sentence once; not those of ``before``.
 
     Returns:
         The result and the run's folder.
@@ -65,29 +66,25 @@ def fit(
     Raises:
         ValueError: If anything does not fit; nothing has been written then.
     """
-    said: list[str] = []
+    tell, shown = tell if before is None else tell_nobody, set[str]()
 
-    def tell(text: str) -> None:
-        said.append(text.strip())
-        tell_on_stderr(text)
+    def tell_while_reading(text: str) -> None:
+        shown.add(text.strip().removeprefix(_NOTE))
+        tell(text)
 
-    if before is None:
-        problem, place = load_for_fit(settings, tell=tell_nobody if told else tell), None
-        if problem.logged_rate:
-            settings = replace(settings, control_dt=problem.control_dt)
-    else:
-        problem, place = load_for_fit(settings, before.load_cfg(), tell_nobody), before.record.folder
+    problem = load_for_fit(settings, None if before is None else before.load_cfg(), tell_while_reading)
+    for note in assumptions(problem, shown):
+        tell(f"{_NOTE}{note}")
+    if before is None and problem.logged_rate:
+        settings = replace(settings, control_dt=problem.control_dt)
     settings = with_absolute_paths(settings, problem.plain_cfg)
     own_code = [*effect_modules(problem.effects), *optimizer_modules(settings.optimizer)]
+    place = None if before is None else before.record.folder
     record = EnvironmentRecord.of(settings.task, problem.env_cfg, own_code, place)
     digests, inputs = recording_digests(settings), input_digests(settings, record)
     folder = RunFolder.create(settings.log_dir, problem.env_cfg.sim2real.robot_name)
     folder.write_start(settings.to_dict(), digests, problem, inputs=inputs, environment=record.to_dict())
     on_start(folder.path)
-    if before is None and not told:
-        for note in assumptions(problem):
-            if not {note, f"note: {note}", note.partition(": ")[2]} & set(said):
-                tell_on_stderr(f"note: {note}")
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     return _finished(run, record, assess_interrupted)
 
@@ -105,22 +102,20 @@ def fit_with_torques(
         progress: Shows how far it is.
         processes: Who shares the search's candidates; where there are several, only the first fit is made.
     """
-    result, folder = fit(settings, progress, processes=processes)
+    progress = progress or ProgressLine()
+    result, folder = fit(settings, progress, processes=processes, tell=progress.tell)
     alone = processes is None or processes.count == 1
     if not result.contested or not alone or "interrupted" in result.stop_reasons or (result.times_noise or 0) < _NOISY:
         return result, folder
     facts = ", ".join(result.contested)
-    told = progress or ProgressLine()
-    told.tell(f"The torques in the recordings contradict what is stated ({facts}): fitting with what they say too.")
+    progress.tell(f"The torques in the recordings contradict stated facts ({facts}): fitting with the torques' values.")
     unknown = [*settings.unknown, *(fact for fact in result.contested if fact not in settings.unknown)]
-    other, other_folder = fit(replace(settings, unknown=unknown), progress, told=True)
+    other, other_folder = fit(replace(settings, unknown=unknown), progress, tell=tell_nobody)
     before, after = (1e3 * each.rmse["train"]["all"] for each in (result, other))
     if after < _BETTER * before:
-        told.tell(
-            f"With {facts} from the torques the error is {after:.4g} mrad instead of {before:.4g}: they are used."
-        )
+        progress.tell(f"With {facts} from the torques the error is {after:.4g}, not {before:.4g} mrad: they are used.")
         return other, other_folder
-    told.tell(f"With {facts} from the torques the error is {after:.4g} mrad, not {before:.4g}: what is stated is used.")
+    progress.tell(f"With {facts} from the torques the error is {after:.4g}, not {before:.4g} mrad: they are not used.")
     return result, folder
 
 

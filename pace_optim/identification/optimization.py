@@ -45,7 +45,7 @@ _OF_THE_STEP = 0.25
 _HALVINGS = 2
 """... so many times."""
 _FEWEST_GENERATIONS = 5
-"""Of a search, whatever its budget."""
+"""Generations of a search, at least."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -274,7 +274,9 @@ class Optimization:
         generations = max(_FEWEST_GENERATIONS, budget // optimizer.population_size)
         optimizer.cfg = replace(optimizer.cfg, max_iteration=min(optimizer.cfg.max_iteration, generations))
         self.progress.say("far above the noise: searching (Ctrl-C keeps what is found)")
-        return self._without_effects_too(self._search(optimizer))
+        starts = self._without_effects_too(self._search(optimizer))
+        self.progress.say("fitting from the best of the search")
+        return starts
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(
@@ -340,7 +342,7 @@ class Optimization:
             self.history.refine_steps.append(self.steps)
             self.history.refine_time_s.append(self.progress.elapsed)
             self.log.log_refinement(now.iteration, best)
-        name = "begin" if on_pieces else "refine"
+        name = "fit on pieces" if on_pieces else "fit on whole recordings"
         self.progress.show(name, now.iteration, cfg.max_iteration, best, None, self.steps)
         self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()

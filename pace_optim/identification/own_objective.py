@@ -15,7 +15,7 @@ from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND, Uncertainty, uncertainty_of
 from pace_optim.estimate.error_bars.undetermined import undetermined
-from pace_optim.estimate.error_bars.warnings import fit_warnings
+from pace_optim.estimate.error_bars.warnings import by_effect, fit_warnings
 from pace_optim.estimate.own_objective import Objective, optimizer_class
 from pace_optim.identification.optimization import Optimization, Outcome
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
@@ -80,10 +80,12 @@ def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome)
         wall_time_s=run.progress.elapsed,
         stop_reasons=outcome.stop_reasons,
         times_noise=times,
-        warnings=[
-            *_far(times if far else None),
-            *fit_warnings(problem, physical, uncertainty, rmse, (), open_),
-        ],
+        warnings=by_effect(
+            [
+                *_far(times if far else None),
+                *fit_warnings(problem, physical, uncertainty, rmse, (), open_),
+            ]
+        ),
     )
     result.save(run.folder.path / "result.json")
     return result

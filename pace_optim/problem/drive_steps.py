@@ -52,7 +52,7 @@ def set_control_step(cfg: PaceSim2realEnvCfg) -> None:
 def set_drive_rate(cfg: PaceSim2realEnvCfg, physics_dt: float | None = None) -> None:
     """Make the longest physics step as fine as the drives' own rates, such that their periods are whole numbers of it.
 
-    Where a period fits no step, its drive runs on a clock of its own, which is right to 2.5 % from run to run.
+    Where a period fits no step, its drive runs on a separate clock, which is right to 2.5 % from run to run.
 
     Args:
         cfg: The environment; it is changed.

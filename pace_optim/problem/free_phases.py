@@ -1,7 +1,7 @@
-"""What nobody knows of a free phase, taken out of its errors: where it begins, and what the accelerometer misses.
+"""The unknowns of a free phase, taken out of its errors: where it begins, and what the accelerometer misses.
 
-A foot leaves the ground. From there on its leg moves freely, from a position and a speed that encoders tell with an
-error, under a specific force that an accelerometer tells with another. Errors e of the right model then have the
+A foot leaves the ground. From there on its leg moves freely, from a position and a speed that encoders measure with an
+error, under a specific force that an accelerometer measures with another. Errors e of the right model then have the
 covariance
 
     C = σ² + A Aᵀ + B Bᵀ
@@ -92,7 +92,7 @@ class FreePhases:
     """Steps, a mask, and L⁻¹ there, of the last few."""
 
     def of_single_joints(self) -> FreePhases:
-        """The same of each joint by itself: whatever its neighbours show."""
+        """The same of each joint by itself, without its neighbours."""
         blocks, covariances = [], []
         for block, covariance in zip(self.blocks, self.covariances, strict=True):
             for i, joint in enumerate(block.joints):

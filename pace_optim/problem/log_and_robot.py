@@ -30,7 +30,7 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     A damping that the recording states stays: it acts on the measured speed.
 
     Raises:
-        ValueError: If a joint is told nothing but positions, and its drive has no position loop.
+        ValueError: If a joint gets only positions, and its drive has no position loop.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
     stiffness, damping = (
@@ -131,8 +131,8 @@ def contradicted_limits(
 
     Args:
         recording: The recording; its own facts come before what is configured.
-        velocity_limit: No-load speed as configured, (n,) [rad/s]; NaN or infinite where there is none.
-        effort_limit: Torque limit as configured, (n,) [N m]; NaN or infinite where there is none.
+        velocity_limit: No-load speed as configured, (n,) [rad/s]; NaN or infinite without a limit.
+        effort_limit: Torque limit as configured, (n,) [N m]; NaN or infinite without a limit.
         joint_types: Whether each joint turns or slides; none: all turn.
     """
     n = recording.num_joints
@@ -146,13 +146,13 @@ def contradicted_limits(
     notes = []
     for field, words, unit, measured, own, configured in found:
         stated = np.broadcast_to(np.asarray(configured if own is None else own, dtype=float), (n,))
+        beyond = []
         for j, name in enumerate(recording.joint_names):
             values = measured[np.isfinite(measured[:, j]), j]
             largest = float(np.quantile(values, 0.999)) if values.size else 0.0
             if np.isfinite(stated[j]) and largest > _BEYOND * stated[j]:
                 own_unit = units_for(unit, joint_types[j : j + 1])
-                notes.append(
-                    f"the recording contradicts the stated {words}: {name} reaches {largest:.3g} {own_unit}, {field} "
-                    f"is {stated[j]:.3g} {own_unit}. Correct {field}. [W2]"
-                )
+                beyond.append(f"{name} reaches {largest:.3g} {own_unit}, {field} is {stated[j]:.3g} {own_unit}")
+        if beyond:
+            notes.append(f"the recording contradicts the stated {words}: {'; '.join(beyond)}. Correct {field}. [W2]")
     return notes

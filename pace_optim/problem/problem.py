@@ -76,7 +76,7 @@ class Problem:
     measured: MeasuredDrives = field(default_factory=MeasuredDrives)
     """What the recordings' torques say of the drives."""
     unknown: tuple[str, ...] = ()
-    """Facts of the drives that are identified because nobody knows them."""
+    """Unknown facts of the drives, which are identified."""
     passive_joints: bool = False
     """Whether joints without drives move too."""
     logged_rate: bool = False
@@ -135,7 +135,7 @@ class Problem:
         return ManagerBasedRLEnv(cfg)
 
     def with_effects(self, effects: Sequence[EffectCfg | str]) -> Problem:
-        """The same recordings with these effects instead of its own."""
+        """The same recordings with other effects."""
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
@@ -340,7 +340,7 @@ def load_problem(
             keeps the configuration's.
         links: Links whose inertial parameters are identified, regular expressions of their names: ``"name"`` or
             ``"name@mass,com,inertia"`` with some of these.
-        unknown: Facts of the drives that nobody knows (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
+        unknown: Unknown facts of the drives (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
             they have them, else identified.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         joints: Regular expression of the joints to identify; the others are held. ``None``: those of the recordings.
@@ -464,7 +464,7 @@ def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
 def _read_torques(
     env: ManagerBasedRLEnv, recordings: Sequence[Recording], control_dt: float, unknown: Sequence[str]
 ) -> tuple[MeasuredDrives, tuple[str, ...]]:
-    """What the recordings' torques say of the drives, and what nobody knows even so.
+    """What the recordings' torques show of the drives, and what stays unknown.
 
     A fact is read if every recording has it of every joint; else it is identified, and all recordings keep what they
     state. Gains that are read are refined.
@@ -520,7 +520,7 @@ def _configured(
 
 
 def _with_notes(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings with what is to be told of their drives' loops."""
+    """The recordings with notes on their drives' loops."""
     loops = check_loops(env, recordings)
     return [replace(r, notes=(*r.notes, loop)) if loop else r for r, loop in zip(recordings, loops, strict=True)]
 

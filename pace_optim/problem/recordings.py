@@ -32,12 +32,12 @@ _STILL = 0.02
 
 
 def tell_on_stderr(text: str) -> None:
-    """Tell a user something beside a command's results."""
+    """Print something beside a command's results."""
     print(text, file=sys.stderr)
 
 
 def tell_nobody(text: str) -> None:
-    """Told before, by the fit whose recordings are read again."""
+    """Print nothing, where recordings are read again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +186,7 @@ def known_joints(env: ManagerBasedEnv) -> Robot:
 def _each(
     items: Sequence[_T], read: Callable[[_T], list[Recording]], strict: bool, tell: Callable[[str], None]
 ) -> list[Recording]:
-    """What is read of each item; those that cannot be used are set aside, and told."""
+    """What is read of each item; those that cannot be used are set aside with a warning."""
     result: list[Recording] = []
     faults: list[str] = []
     for item in items:

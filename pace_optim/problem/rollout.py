@@ -204,7 +204,7 @@ class Rollout:
     def positions(self, at: torch.Tensor) -> torch.Tensor:
         """Simulated positions at samples, as when iterating, (len(at), num_envs, n) [rad]; the numbers are the same.
 
-        Where drives can be compiled the robot's own state stays where it is: whoever needs more of it iterates.
+        Where drives can be compiled the robot's own state stays where it is; iterate to read more of it.
 
         Args:
             at: Control steps of the samples, ascending, the last one that counts among them.

@@ -203,7 +203,7 @@ def _reached(
 
 
 def _stated(cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], fact: str, joints: Sequence[str]) -> np.ndarray:
-    """A limit as recordings state it, else the configuration, (n,); infinite where nobody does."""
+    """A limit as recordings state it, else the configuration, (n,); infinite where neither does."""
     result = np.full(len(joints), np.inf)
     for drive in cfg.scene.robot.actuators.values():
         own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]

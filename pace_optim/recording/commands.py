@@ -66,7 +66,7 @@ def acting_loops(recording: Recording, stiffness: np.ndarray) -> tuple[np.ndarra
 
 
 def command_interval(recording: Recording) -> float:
-    """Time from one command to the next, as they were logged [s]: a command that is repeated is none.
+    """Time from one command to the next, as they were logged [s]: repeated commands do not count.
 
     Args:
         recording: As `load_recording` gives it.

@@ -38,7 +38,7 @@ def conform_recording(
     3. Compare the time stamps with the grid of spacing `sample_stride * control_dt`: keep the samples bit for
        bit when they lie on it, or beside it where an even timer is slower than the control; else resample them.
     4. Fill `command`, `command_vel`, `command_effort` and `command_torque_enable` on the control grid. Commands with
-       a clock of their own are held at their true instants; samples before the first of them are left out.
+       a separate clock are held at their true instants; samples before the first of them are left out.
 
     A recording that is already conformed to `control_dt` keeps its samples and commands.
 

@@ -1,6 +1,6 @@
 """The CSV form of a recording: columns `time`, `torque_enable`, `<series>/<joint>`, and `real_ee_pose/x` to `/qz`.
 
-Commands with a clock of their own have a column `des_time`; whichever clock has fewer rows leaves the last cells empty.
+Commands with a separate clock have a column `des_time`; the clock with fewer rows leaves the last cells empty.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def write_csv(
 
 
 def _read_numbers(path: Path) -> tuple[list[str], np.ndarray] | None:
-    """Column names and all cells, (rows, columns), where every cell is a number; else nothing is said of the file.
+    """Column names and all cells, (rows, columns), where every cell is a number; else ``None``.
 
     It is read many times faster so than cell by cell, and takes as much memory as its numbers.
     """
@@ -134,7 +134,7 @@ def _read_numbers(path: Path) -> tuple[list[str], np.ndarray] | None:
             if len(header) < 2 or any(_WHOLE.match(cell.strip()) for cell in first):  # stamps that floats would round
                 return None
             rest = np.loadtxt(itertools.chain([",".join(first)], file), delimiter=",", comments=None, ndmin=2)
-    except (ValueError, csv.Error):  # told below, with the place
+    except (ValueError, csv.Error):  # refused below, with the place
         return None
     return (header, rest) if rest.shape[1] == len(header) else None
 
@@ -194,7 +194,7 @@ def _stamps(path: Path, column: str, rows: Rows, index: int) -> np.ndarray:
     if cells and (_DATE.match(cells[0]) or _WHOLE.match(cells[0])):
         try:
             return np.array(cells) if _DATE.match(cells[0]) else np.array([int(cell) for cell in cells])
-        except (ValueError, OverflowError):  # told below
+        except (ValueError, OverflowError):  # refused below
             pass
     return _numbers(path, column, rows, index)
 

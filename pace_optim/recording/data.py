@@ -132,7 +132,7 @@ class Recording:
     source: str = ""
     """Path of the file."""
     logged: Recording | None = None
-    """The same as it was logged, where it was resampled or its commands have a clock of their own."""
+    """The same as it was logged, where it was resampled or its commands have a separate clock."""
     command_dt: float | None = None
     """Time between two commands as they were logged [s]; None until conformed."""
     part_of: str = ""
@@ -143,7 +143,7 @@ class Recording:
     frame_point: np.ndarray | None = None
     """Where that force acts, (3,) [m], in the model's world."""
     free: np.ndarray | None = None
-    """Where nothing but its drive and the base acts on a joint, (steps, n) bool; None: everywhere."""
+    """Where only its drive and the base act on a joint, (steps, n) bool; None: everywhere."""
 
     @property
     def control_dt(self) -> float:

@@ -64,9 +64,9 @@ class Dataset:
     command: torch.Tensor
     """Position targets, (T, R, n) [rad]; for joints without, their first position (they have no position loop)."""
     command_vel: torch.Tensor | None
-    """Velocity targets, (T, R, n) [rad/s], zero for joints without; ``None`` where there are none at all."""
+    """Velocity targets, (T, R, n) [rad/s], zero for joints without; ``None`` if no joint has any."""
     command_effort: torch.Tensor | None
-    """Torques commanded, (T, R, n) [N m], zero for joints without; ``None`` where there are none at all."""
+    """Torques commanded, (T, R, n) [N m], zero for joints without; ``None`` if no joint has any."""
     measured: torch.Tensor
     """Encoder positions, (T, R, n) [rad]; zero where there is no sample."""
     measured_vel: torch.Tensor
@@ -94,7 +94,7 @@ class Dataset:
     """How hard the drives worked in the session; ``None`` where that is not known."""
     settling: torch.Tensor | None = None
     """Samples that are neither trained on nor validated on, (T, R) bool: a recording begins in motion, and its speed
-    is not known; ``None`` where there are none."""
+    is not known; ``None`` without any."""
     carried: Carried | None = None
     """How bases move, and where joints are held; ``None`` where all bases rest."""
 
@@ -208,7 +208,7 @@ def make_dataset(
 
     Args:
         recordings: To train on, conformed to the same joints and control step.
-        validation: Never trained on. If there are none, the last part in time of each recording is kept for it.
+        validation: Never trained on. Without any, the last part in time of each recording is kept for it.
         train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
             a base that moves, it is that part of every 4 s or so.
 

@@ -69,7 +69,7 @@ def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], commanded:
 
     Args:
         fields: The file's keys and values.
-        joint_names: Names of the columns, () where there are none.
+        joint_names: Names of the columns, () without names.
         commanded: Which columns have commands, (n,) bool: the others may be left out of {joint: value}.
         source: Path, for messages.
     """

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pace_actuators.identified import DRIVE_FIELDS
 
 COMMAND_SERIES = ("des_dof_pos", "des_dof_vel", "des_dof_effort")
-"""What a drive may be told; at least one of them is in every recording."""
+"""Commands of a drive; at least one of them is in every recording."""
 MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
 JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort")
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")

@@ -39,11 +39,11 @@ class Carried:
     measured: torch.Tensor
     """Position [rad] and speed [rad/s] as the encoders have them, (T, R, n, 2)."""
     free: torch.Tensor
-    """Where nothing but the drive and the base acts on a joint, (T, R, n) bool; elsewhere it is held as measured."""
+    """Where only the drive and the base act on a joint, (T, R, n) bool; elsewhere it is held as measured."""
     start_std: torch.Tensor
-    """How well encoders tell where a free phase begins, (R, n, 2) [rad, rad/s]; 0 where the base rests."""
+    """How well encoders show where a free phase begins, (R, n, 2) [rad, rad/s]; 0 where the base rests."""
     force_std: torch.Tensor
-    """How well the accelerometer tells the specific force at each control step, (T, R, 3) [m/s²]."""
+    """How well the accelerometer measures the specific force at each control step, (T, R, 3) [m/s²]."""
 
     @property
     def moves(self) -> torch.Tensor:
@@ -109,7 +109,7 @@ class Carried:
 
 
 def force_noise(force: np.ndarray, dt: float) -> np.ndarray:
-    """How well samples of a specific force tell it, (T, 3) [m/s²].
+    """How well samples determine a specific force, (T, 3) [m/s²].
 
     White noise of standard deviation σ leaves second differences of √6 σ. So does what happens between samples: feet
     that hit the ground shake the base faster than an IMU is read. Their mean square over 20 ms to either side is taken.

@@ -86,7 +86,7 @@ def with_repetitions(floors: Sequence[NoiseFloor], positions: Sequence[np.ndarra
 
 
 def lattice_step(position: np.ndarray) -> float | None:
-    """The step δ of which all differences between positions are multiples; ``None`` if there is none.
+    """The step δ of which all differences between positions are multiples; ``None`` without one.
 
     Args:
         position: (K,) [rad].

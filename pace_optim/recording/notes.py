@@ -13,10 +13,10 @@ _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
-    """Notes with the recordings that have them; those that differ in numbers alone are told once, of the first.
+    """Notes with the recordings that have them; those that differ in numbers alone come once, of the first.
 
     Args:
-        recordings: In the order in which they are told.
+        recordings: In the order of the notes.
     """
     kinds: dict[str, list[tuple[str, str]]] = {}
     for recording in recordings:

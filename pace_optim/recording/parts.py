@@ -1,4 +1,4 @@
-"""Recordings too long to fit: the parts of them that move the joints most, each a recording of its own.
+"""Recordings too long to fit: the parts of them that move the joints most, each a separate recording.
 
 A refinement keeps the derivative of every sample by every parameter, and simulates every step for each of them: with 30
 joints, ten minutes at 400 Hz are 3 GB and hours. A motion says nearly all that it has to say in its best minute. A part
@@ -19,13 +19,13 @@ from .data import Recording
 from .keys import SAMPLED_SERIES
 
 _NUMBERS = 20_000_000
-"""Derivatives that a fit keeps unless it is told otherwise: 0.16 GB."""
+"""Derivatives that a fit keeps by default: 0.16 GB."""
 _EVALUATIONS = 200_000_000
 """Times that a joint's acceleration is computed for them: half a minute of two cores."""
 _COPIES = 4
 """Arrays of that size that there are at once."""
 _WALKING = 40.0
-"""Of a robot that walks, so much is used unless it is told otherwise [s]: it does the same again and again."""
+"""Of a robot that walks, so much is used by default [s]: a walk repeats itself."""
 _LENGTH = 5.0
 """Of a part [s]."""
 _SLOPE = 3

@@ -12,8 +12,8 @@ def interpolate_smooth(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> 
 
     Slopes come from the parabola through three neighbours, and from the outer two alone where one step is
     much shorter than the other, which bounds the amplification of noise. Straight lines, and cubics that
-    flatten at extrema (PCHIP), leave an error at each turn of the motion that looks like missing physics
-    (1.5 mrad for 0.5 rad at 5 Hz sampled at 187 Hz, where these cubics leave 0.1 mrad).
+    flatten at extrema (PCHIP), leave an error at each turn of the motion. It looks like missing physics:
+    1.5 mrad for 0.5 rad at 5 Hz sampled at 187 Hz, where these cubics leave 0.1 mrad.
 
     Args:
         time: Instants of the samples, (T,) [s].
@@ -45,9 +45,9 @@ def interpolate_linear(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> 
 def hold_on_grid(time: np.ndarray, values: np.ndarray, step: float, count: int) -> np.ndarray:
     """Return the zero-order hold of `values`, averaged over each of `count` steps of a grid that starts at 0.
 
-    A step within which no new value is issued gets the held value itself. Where one is issued, the average
-    keeps the instant of the change to a fraction of a step; taking the value at the step's start would delay
-    commands by half a step on average, which a fit would take for the drive's delay.
+    A step without a new value gets the held value. With a new value, the average keeps the instant of the
+    change to a fraction of a step. The value at the step's start would delay commands by half a step on
+    average, and a fit would add that to the drive's delay.
 
     Args:
         time: Instants at which values are issued, (T,) [s], from 0.

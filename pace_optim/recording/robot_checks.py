@@ -145,7 +145,7 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
 
 
 def _still_commanded(recording: Recording) -> np.ndarray:
-    """Which joints are told the same all the time, (n,) bool."""
+    """Which joints get a constant command, (n,) bool."""
     still = np.ones(recording.num_joints, dtype=bool)
     for key in COMMAND_SERIES:
         if (values := getattr(recording, key)) is not None:

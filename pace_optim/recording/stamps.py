@@ -42,7 +42,7 @@ def seconds_of(values: np.ndarray) -> tuple[np.ndarray, float, str]:
 
 
 def unix_unit(values: np.ndarray) -> str | None:
-    """The unit in which stamps are Unix time, or None where they are none."""
+    """The unit in which stamps are Unix time; None if they are not."""
     if values.ndim != 1 or len(values) < 2 or values.dtype.kind not in "iuf":
         return None
     at = float(np.median(values))
@@ -83,7 +83,7 @@ def unrounded(time: np.ndarray) -> tuple[np.ndarray, str]:
 def set_back(time: np.ndarray) -> np.ndarray:
     """Rows at which the clock was set back, (K,): those before and after show the same time twice.
 
-    Single late rows, and rows in no order, are none.
+    Single late rows, and rows in no order, do not count.
 
     Args:
         time: Stamps in the order of the rows, (T,) [s].

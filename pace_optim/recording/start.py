@@ -37,7 +37,7 @@ def start_speed(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         v = c₁ of Σ c_i tⁱ,   σ_v² = σ² [(AᵀA)⁻¹]₁₁,   A_ki = t_kⁱ
 
     Its standard deviation is σ_v and c₂ Δt together, Δt the time between samples: where a held command arrives, the
-    acceleration 2 c₂ begins within them. A speed below 4 of them is none: what begins at rest keeps exactly 0.
+    acceleration 2 c₂ begins within them. A speed below 4 of them counts as zero: what begins at rest keeps exactly 0.
 
     Args:
         recording: Conformed or not.

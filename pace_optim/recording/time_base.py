@@ -1,9 +1,10 @@
 """The time base of a recording against the simulation's control grid: keep the samples, place them, or resample them.
 
-Samples are kept exactly when their time stamps are those of the grid, up to what a clock or a file format
-adds: jitter below 1 % of a step, rounding of the stamps (decimals, float32), drift below a tenth of a sample.
-Those of a timer that is slower than the grid, at a rate of its own, are placed beside the grid's nearest steps, and
-what is simulated is interpolated to their instants: between slow samples only the simulation knows the motion.
+Samples are kept exactly if their time stamps are those of the grid. A clock or a file format may add jitter
+below 1 % of a step, rounding of the stamps (decimals, float32), and drift below a tenth of a sample.
+
+Samples of a slower timer, at another rate, are placed beside the grid's nearest steps. The simulation is
+interpolated to their instants: between slow samples only the simulation knows the motion.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 _JITTER = 0.01  # of a step: moves a joint at 10 rad/s by 0.25 mrad at 400 Hz, below any encoder's noise
 _DRIFT = 0.1  # of a sample, over the whole recording
 _RATE = 1e-3  # relative error of the mean step
-_EVEN = 0.05  # of a step: a timer that runs at a rate of its own
+_EVEN = 0.05  # of a step: a timer that runs at another rate
 _MAX_STEP = 0.05  # [s]
 _LATE = 1.1  # a timer of that step may run late by so much
 _MAX_GAP = 0.5  # [s]

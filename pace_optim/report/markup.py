@@ -1,4 +1,4 @@
-"""Small pieces of HTML. Whatever comes from a run is escaped by the templates, or goes through :func:`json_script`."""
+"""Small pieces of HTML. Templates escape all that comes from a run, or it goes through :func:`json_script`."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from .run_data import RunData
 from .sections import SECTIONS
 
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-"""Makes the browser refuse whatever is not in the page itself."""
+"""Makes the browser refuse all that is not in the page itself."""
 
 
 def write_report(folder: str | Path) -> Path:
@@ -42,7 +42,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
 
     Args:
         folder: The run's folder.
-        new: Content of JSON files that are about to be written, by name, in place of what is there.
+        new: Content of JSON files that are about to be written, by name, instead of the present one.
 
     Raises:
         ValueError: If there is no result, or a file is damaged; the message names it.
@@ -52,7 +52,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
 
 
 def check_folder(folder: str | Path, *, anew: str = "") -> None:
-    """Read all that the report of a run is made of, so that what is damaged is told before the work.
+    """Read all that the report of a run is made of, so that damage is reported before the work.
 
     Args:
         folder: The run's folder.

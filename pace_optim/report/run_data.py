@@ -64,7 +64,7 @@ class RunData:
 
         Args:
             folder: The folder.
-            new: Content of JSON files that are about to be written, by name, in place of what is there.
+            new: Content of JSON files that are about to be written, by name, instead of the present one.
 
         Raises:
             ValueError: If it has no result, or a file is damaged.
@@ -125,7 +125,7 @@ class RunData:
 
     @contextlib.contextmanager
     def blaming(self, name: str | None) -> Iterator[None]:
-        """Let what fails in the block be told as damage of a file; ``None``: of none.
+        """Report what fails in the block as damage of a file; ``None``: of no file.
 
         Raises:
             ValueError: What failed; the message names the file.

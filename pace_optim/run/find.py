@@ -21,7 +21,7 @@ def find_run(log_dir: str | Path, robot_name: str | None = None, folder_name: st
         folder_name: The run's folder in that; ``None`` means the newest.
 
     Raises:
-        ValueError: If there is none; it says what there is.
+        ValueError: If it does not exist; the message lists those that do.
     """
     log_dir = Path(log_dir)
     robots = sorted(path.name for path in log_dir.iterdir() if _runs(path)) if log_dir.is_dir() else []
@@ -51,7 +51,7 @@ def find_mean(run: Path, mean_name: str) -> Path:
     """A saved mean of a run's search, by the name of its file.
 
     Raises:
-        ValueError: If there is none; it says what there is.
+        ValueError: If it does not exist; the message lists those that do.
     """
     path = run / (mean_name if mean_name.endswith(".pt") else f"{mean_name}.pt")
     means = sorted(file.name for file in run.glob("mean_*.pt"))

@@ -92,7 +92,7 @@ class RunFolder:
         """Everything that is known before the first simulation.
 
         Args:
-            settings: What the fit was told.
+            settings: Of the fit.
             digests: SHA-256 of each recording.
             problem: What is fitted.
             inputs: SHA-256 of each other file that was read; ``None`` where there was none.
@@ -161,7 +161,7 @@ class RunFolder:
         """What :meth:`write_checkpoint` wrote.
 
         Raises:
-            ValueError: If there is none, or it is damaged.
+            ValueError: If it does not exist, or is damaged.
         """
         path = self.path / "checkpoint.npz"
         if not path.exists():

@@ -21,13 +21,13 @@ from pace_optim.run.tensors import read_bounds
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run's folder with what it was told, its environment made known again."""
+    """A run's folder with its settings; its environment is registered again."""
 
     folder: Path
     """Where it lies."""
 
     settings: FitSettings
-    """What the fit was told, paths absolute; the task is one that is known."""
+    """Settings of the fit, paths absolute; the task is a known one."""
 
     record: EnvironmentRecord
     """Where its environment comes from."""
@@ -50,7 +50,7 @@ class Run:
 
         Args:
             run: The run's folder, or its ``result.json``.
-            task: Another environment instead of its own, as :func:`pace_envs.task_source.use_task` returns it.
+            task: Another environment, as :func:`pace_envs.task_source.use_task` returns it.
 
         Raises:
             ValueError: If it is no run, or the code of its environment has changed or gone.
@@ -83,7 +83,7 @@ class Run:
         """The problem that the run solves, on its own recordings or on others.
 
         Args:
-            data: Recordings in place of its own.
+            data: Recordings instead of the run's.
             physics_dt: Another physics step [s]; ``None``: that of its result.
             effects: Other effects; ``None`` keeps its own.
             columns: Column map of logs among ``data``; ``None``: guessed.
@@ -110,7 +110,7 @@ class Run:
 
     @property
     def told_drive_dt(self) -> float | None:
-        """Period of the drives' loops [s] that its recordings told where none was stated; ``None``: as assumed."""
+        """Period of the drives' loops [s] that its recordings showed where none was stated; ``None``: as assumed."""
         path = self.folder / "result.json"
         rate = FitResult.load(path).loop_rate if path.is_file() else {}
         return rate["used_s"] if rate and rate["used_s"] != rate["assumed_s"] else None
@@ -178,7 +178,7 @@ def run_folder(run: str | Path) -> Path:
     """The folder of a run, named by itself or by its ``result.json``.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     path = Path(run)
     if path.name == "result.json" and path.is_file():

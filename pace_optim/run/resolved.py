@@ -1,4 +1,4 @@
-"""The whole configuration of a run as data: what was in force, whatever becomes of the code that said so."""
+"""The whole configuration of a run as data, independent of the code that made it."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _short(value: Any) -> str:
 
 
 def _commit() -> str | None:
-    """The commit that is checked out, where this file lies in a repository of its own and not in an installation."""
+    """The commit that is checked out, where this file lies in a checkout and not in an installation."""
     root = Path(__file__).parents[2]
     if not (root / ".git").exists():
         return None

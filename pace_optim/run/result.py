@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ class FitResult(DriveResult):
     objective: dict[str, float | None] = field(default_factory=dict)
     """What an objective of the user's own is at the result, in ``train`` and ``validation``; empty: it is ``score``."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """What of each value comes from the physics step, shaped as ``std``, which knows of it; empty: it is not known."""
+    """The part of each value that comes from the physics step, shaped as ``std``, which includes it; empty: unknown."""
     assumes_loop_rate: bool = False
     """Whether the rate of the drives' loops is assumed. What depends on it is in ``step_error`` and ``std``."""
     loop_rate: dict[str, Any] = field(default_factory=dict)
@@ -143,13 +144,13 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
-    """Standard deviations, or other errors, shaped as the parameters; ``None`` where there is none."""
+    """Standard deviations, or other errors, shaped as the parameters; ``None`` without an error bar."""
     values = space.to_dict(torch.as_tensor(errors))
     return {name: {key: None if math.isnan(v) else v for key, v in entries.items()} for name, entries in values.items()}
 
 
 def correlation_matrix(space: ParameterSpace, uncertainty: Uncertainty) -> dict[str, Any]:
-    """The correlation matrix with its labels; ``None`` where there is none."""
+    """The correlation matrix with its labels; ``None`` where it is unknown."""
     rows = [[None if math.isnan(v) else round(v, 6) for v in row] for row in uncertainty.correlation.tolist()]
     return {"labels": list(space.labels), "matrix": rows}
 
@@ -269,7 +270,13 @@ def make_result(
     return replace(result, findings=[*gains, *result.findings])
 
 
-def assumptions(problem: Problem) -> list[str]:
-    """What a fit assumes of the robot, and how its recordings were read, in sentences."""
+def assumptions(problem: Problem, shown: Container[str] = ()) -> list[str]:
+    """What a fit assumes of the robot, and how its recordings were read, in sentences.
+
+    Args:
+        problem: What is fitted.
+        shown: Notes that were printed already: they are omitted.
+    """
     of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes]
-    return [*of_robot, *notes_by_kind(problem.dataset.recordings)]
+    recordings = [replace(r, notes=tuple(n for n in r.notes if n not in shown)) for r in problem.dataset.recordings]
+    return [*(note for note in of_robot if note not in shown), *notes_by_kind(recordings)]

@@ -37,7 +37,7 @@ class FitSettings:
     ``name@mass,com,inertia`` with some of these."""
 
     unknown: list[str] = field(default_factory=list)
-    """Facts of the drives that nobody knows (``stiffness``, ``damping``, ``effort_limit``, ``saturation_effort``,
+    """Unknown facts of the drives (``stiffness``, ``damping``, ``effort_limit``, ``saturation_effort``,
     ``velocity_limit``): read from the recordings' torques where they have them, else identified."""
 
     num_envs: int = 512
@@ -180,7 +180,7 @@ class SettingsFile:
     """What ``settings.json`` holds."""
 
     settings: dict[str, Any]
-    """What the fit was told."""
+    """Settings of the fit."""
 
     digests: dict[str, str]
     """SHA-256 of each recording, by its path, in the order of training and validation."""

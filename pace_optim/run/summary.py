@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
+from pace_actuators.text import shortened
 from pace_optim.run.result import FitResult
+from pace_optim.terminal.cli import command
+
+_ABOVE_NOISE = 1.5
+"""Times the noise above which an error has causes beside it."""
 
 
 def summary(result: FitResult) -> list[str]:
-    """The table of parameters with error bars, the errors and the warnings, a line each."""
+    """The table of parameters with error bars, the errors and the three first warnings, a line each."""
     width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
@@ -26,8 +34,7 @@ def summary(result: FitResult) -> list[str]:
         if result.assumes_loop_rate:
             of += " and of the assumed loop rate"
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
-    error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
-    lines.append(units_for(error, result.joint_types))
+    lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
     if result.objective:
         parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
         lines.append(f"objective {result.optimizer}: {parts} (train / validation)")
@@ -36,7 +43,21 @@ def summary(result: FitResult) -> list[str]:
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
     lines += [f"note: {finding}" for finding in result.findings]
-    return lines + [f"warning: {warning}" for warning in result.warnings]
+    return lines + [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
+
+
+def error_line(result: FitResult) -> str:
+    """RMSE of all joints in training and validation."""
+    return units_for(f"error, all joints: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
+
+
+def next_line(result: FitResult, folder: Path) -> list[str]:
+    """The command that comes after a fit, where its error is above the noise."""
+    times = result.times_noise or 0.0
+    if times < _ABOVE_NOISE:
+        return []
+    verb = "diagnose" if result.std_means_nothing else "compare"
+    return [f"next: {command(verb)} {shlex.quote(str(folder))}"]
 
 
 def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:

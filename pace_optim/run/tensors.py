@@ -63,7 +63,7 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
 
 
 def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
-    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty where there is none.
+    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty without that file.
 
     Raises:
         ValueError: If it is damaged.

@@ -47,10 +47,9 @@ def one_line(text: str) -> str:
 def safe_streams() -> Iterator[None]:
     r"""Let everything in the block print through :func:`readable`, to streams that take any character.
 
-    What is written at once is one line, which may end: the end of a line within it came with a name or a text of
-    somebody else's, and is written out. So nothing foreign can begin a line of its own, such as ``run: …``. Print
-    several lines with ``print(*lines, sep="\n")``. A stream that is closed swallows what it gets: ``2>&-`` must not
-    let messages run into the output.
+    Each write is one line. A line break inside it came with a foreign name or text and is written as an escape. So
+    foreign text cannot begin a new line, such as ``run: …``. Print several lines with ``print(*lines, sep="\n")``. A
+    closed stream swallows its input: ``2>&-`` must not let messages run into the output.
     """
     before = sys.stdout, sys.stderr, warnings.formatwarning
     sys.stdout, sys.stderr = (_Screen(_open(stream)) for stream in before[:2])  # type: ignore[assignment]
@@ -197,8 +196,8 @@ _CONSOLE = "pace "
 def run_cli(main: Callable[[], int | None]) -> int:
     """Run a command; return its exit code.
 
-    What a user can mend (ValueError, KeyError, OSError, too little memory, code of the user's own) is printed to
-    stderr as one line, ``error: ...``, and exits with 2; a fault of the program exits with 1, an interruption with 130.
+    An error that the user can correct (ValueError, KeyError, OSError, too little memory, custom code) is printed to
+    stderr as one line, ``error: ...``, with exit code 2. A fault of the program exits with 1, an interruption with 130.
     With ``PACE_TRACEBACK=1`` in the environment errors keep their traceback.
     """
     with safe_streams():

@@ -13,7 +13,7 @@ def number(text: str) -> float:
     """Type of options that hold a number.
 
     Raises:
-        argparse.ArgumentTypeError: If it is none, or not finite.
+        argparse.ArgumentTypeError: If it is not a number, or not finite.
     """
     try:
         value = float(text)
@@ -101,7 +101,7 @@ def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def add_overwrite_option(parser: argparse._ActionsContainer) -> None:
-    """Of every command that writes where the user says; ``refuse_taken`` is what asks."""
+    """Of every command that writes where the user says; ``refuse_taken`` checks it."""
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
 
 

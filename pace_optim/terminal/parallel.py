@@ -111,7 +111,7 @@ def _no_collection() -> Iterator[None]:
 
 
 class _Other:
-    """A share of the work in a process of its own."""
+    """A share of the work in a separate process."""
 
     def __init__(self, work: Callable[[list[Item]], list[Result]], share: list[Item], processors: set[int]):
         context = multiprocessing.get_context("fork")

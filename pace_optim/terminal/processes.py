@@ -82,7 +82,7 @@ def join(device: str = "cpu") -> tuple[Processes, str]:
     """Find the other processes of a ``torchrun``, and this one's device.
 
     Args:
-        device: ``"cpu"``, or ``"cuda"`` with any number: each process takes the GPU of its own number on its host.
+        device: ``"cpu"``, or ``"cuda"`` with any number: each process takes the GPU of its local rank.
 
     Raises:
         ValueError: If the others cannot be reached.
@@ -91,14 +91,14 @@ def join(device: str = "cpu") -> tuple[Processes, str]:
     if count == 1:
         return Processes(), device
     own = own_device(device)
-    if not dist.is_initialized():  # scores are few numbers: by gloo, which tells of a lost process at once
+    if not dist.is_initialized():  # scores are few numbers: by gloo, which reports a lost process at once
         _together(lambda: dist.init_process_group("gloo", timeout=_LOST_AFTER))
         atexit.register(_leave)
     return Processes(rank=dist.get_rank(), count=dist.get_world_size()), own
 
 
 def own_device(device: str) -> str:
-    """This process's device: of several that torchrun started on a host, each takes the GPU of its own number."""
+    """This process's device: of several that torchrun started on a host, each takes the GPU of its local rank."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not device.startswith("cuda"):
         return device
     return f"cuda:{os.environ.get('LOCAL_RANK', '0')}"

@@ -1,10 +1,12 @@
-"""Pages and messages read once: short sentences, none of the habits of this project's old prose, codes with a cure.
+"""Pages, messages and docstrings read once: short sentences, none of the old habits, codes with a cure.
 
-A failure names the sentence or phrase and what to write. The limits are those that the pages reach; lower them when the
-pages get better.
+A failure names the sentence or phrase and what to write. The limits are those that the texts reach; lower them when the
+texts get better. ``PYTHONPATH=tests/support python tests/docs/test_words.py`` prints the counts.
 """
 
 import ast
+import inspect
+import random
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -17,12 +19,14 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "ben
 PACKAGES = ("pace_actuators", "pace_envs", "pace_optim")
 MEAN, LONG, LONG_SHARE = 16.0, 30, 0.05
 """Words per sentence on average; words of a long sentence; share of long sentences."""
+DOCSTRING_MEAN, DOCSTRING_LONG_SHARE = 13.0, 0.03
+"""The same of the docstrings of a room."""
 CHANGELOG_WORDS = 25
 """Words of a changelog entry, at most."""
 HABITS = {
     r"(?<![.])\b(?:told|tells?|telling)\b(?!\()": "'the file states', 'the fit finds', 'separate', 'print'",
     r"\bof (?:one's|its|your|their|our|his|my) own\b": "'your', 'custom', 'separate'",
-    r"\b(?:whoever|nobody)\b": "make 'you', 'the fit' or 'the file' the subject",
+    r"\b(?:whoever|whichever|nobody|somebody|anybody)\b": "make 'you', 'the fit' or 'the file' the subject",
     r"\bwhat of\b": "name the part",
     r"\b(?:is|are) none\b": "say what is true in its place",
     r"\b(?:is|are) said\b": "'the message states'",
@@ -30,7 +34,11 @@ HABITS = {
 }
 _FENCE = re.compile(r"^ *```.*?^ *```\s*$", re.DOTALL | re.MULTILINE)
 _CODE = re.compile(r"`[^`]+`")
-_DOCSTRING = re.compile(r"^ *\"\"\".*?\"\"\"", re.DOTALL | re.MULTILINE)
+_DOCSTRING = re.compile(r"^ *r?\"\"\"(.*?)\"\"\"", re.DOTALL | re.MULTILINE)
+_COMMENT = re.compile(r"(?:^ *|  )# (?!noqa|type:|fmt:)(.+)$", re.MULTILINE)
+_NAME_IN_CODE = re.compile(r"``.+?``|:\w+:`[^`]+`|`[^`]+`", re.DOTALL)
+_SECTION = re.compile(r"(?:Args|Returns|Raises|Attributes|Yields):")
+_ARGUMENT = re.compile(r"    (?=\S)[^:]*: ")
 _LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 _ITEM = re.compile(r"(?:[-*]|\d+\.)\s+")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[A-Z*\"'(“\[−\d])|(?<=:)\s+(?=[A-Z][a-z])")
@@ -64,15 +72,34 @@ def sentences(text: str) -> list[str]:
     return [each for part in plain for each in _END.split(part) if words_of(each) > 1]
 
 
+def prose_of(docstring: str) -> str:
+    """A docstring without its code; each argument is a list item."""
+    lines, in_section = [], False
+    for line in _NAME_IN_CODE.sub("CODE", inspect.cleandoc(docstring)).splitlines():
+        in_section = bool(_SECTION.fullmatch(line)) or (in_section and (not line or line.startswith(" ")))
+        if not in_section:
+            lines.append(line)
+        elif not _SECTION.fullmatch(line):
+            lines.append(_ARGUMENT.sub("- ", line, count=1).strip())
+        else:
+            lines.append("")
+    return "\n".join(lines)
+
+
 def words_of(sentence: str) -> int:
     return len(re.findall(r"\S*\w\S*", sentence))
+
+
+def mean_and_long(found: list[str]) -> tuple[float, list[str]]:
+    """Words per sentence, and the sentences over the limit, the longest first."""
+    long = sorted((each for each in found if words_of(each) > LONG), key=words_of, reverse=True)
+    return sum(map(words_of, found)) / max(len(found), 1), long
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_sentences_are_short(page):
     found = sentences(text_of(page))
-    long = sorted((each for each in found if words_of(each) > LONG), key=words_of, reverse=True)
-    mean = sum(map(words_of, found)) / max(len(found), 1)
+    mean, long = mean_and_long(found)
     assert mean <= MEAN, f"{name_of(page)}: {mean:.1f} words a sentence, at most {MEAN:g}. Make two sentences of one."
     assert len(long) <= max(LONG_SHARE * len(found), 1), (
         f"{name_of(page)}: {len(long)} of {len(found)} sentences have more than {LONG} words. Cut the first of them in "
@@ -139,3 +166,75 @@ def test_each_code_of_a_warning_has_a_section_with_its_cure():
     )
     for code, text in sections.items():
         assert "**Meaning.**" in text and "**Cure.**" in text, f"{code} needs a meaning and a cure"
+
+
+BEING_EDITED = (
+    "pace_actuators/drive.py",
+    "pace_actuators/pace_dc_motor.py",
+    "pace_actuators/effects/",
+    "pace_envs/compiled_drive/",
+    "pace_envs/fused/",
+    "pace_envs/kernels/",
+    "pace_envs/step_graph.py",
+    "pace_optim/estimate/",
+    "pace_optim/recording/torque/",
+)
+"""Places whose docstrings still have old habits. Shorten this list."""
+
+
+@cache
+def docstrings(path: Path) -> list[str]:
+    """Docstrings of modules, classes, functions and fields, without their code."""
+    return [prose_of(text) for text in _DOCSTRING.findall(modules()[path])]
+
+
+def rooms() -> dict[str, list[Path]]:
+    """Modules by package and first folder."""
+    found: dict[str, list[Path]] = {}
+    for path in modules():
+        found.setdefault("/".join(path.relative_to(ROOT).parent.parts[:2]), []).append(path)
+    return found
+
+
+def test_docstrings_and_comments_have_none_of_the_habits():
+    found = [
+        f"{name_of(path)}: {each}"
+        for path, source in modules().items()
+        if not name_of(path).startswith(BEING_EDITED)
+        for text in [*docstrings(path), *(_NAME_IN_CODE.sub("CODE", each) for each in _COMMENT.findall(source))]
+        for each in habits(text)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_sentences_of_docstrings_are_short():
+    for room, paths in rooms().items():
+        found = [each for path in paths for text in docstrings(path) for each in sentences(text)]
+        if name_of(paths[0]).startswith(BEING_EDITED):
+            continue
+        mean, long = mean_and_long(found)
+        assert mean <= DOCSTRING_MEAN, f"{room}: {mean:.1f} words a sentence, at most {DOCSTRING_MEAN:g}"
+        assert len(long) <= max(DOCSTRING_LONG_SHARE * len(found), 1), (
+            f"{room}: {len(long)} of {len(found)} sentences have more than {LONG} words. Cut this one in two: {long[0]}"
+        )
+
+
+def main() -> None:
+    """Print words per sentence, the share of long sentences and the habits of everything that is read."""
+    chosen = random.Random(11).sample(sorted(modules()), 20)
+    texts = {name_of(page): [text_of(page)] for page in PAGES}
+    texts["messages"] = [text for source in modules().values() for text in literals(ast.parse(source))]
+    texts["docstrings of 20 modules"] = [text for path in chosen for text in docstrings(path)]
+    texts |= {
+        f"docstrings of {room}": [t for path in paths for t in docstrings(path)] for room, paths in rooms().items()
+    }
+    print(f"{'':40s} sentences  words  over {LONG}  habits")
+    for name, parts in texts.items():
+        found = [each for part in parts for each in sentences(part) if name != "messages" or words_of(each) > 3]
+        mean, long = mean_and_long(found)
+        share = 100 * len(long) / max(len(found), 1)
+        print(f"{name:40s} {len(found):9d} {mean:6.1f} {share:6.1f} % {sum(len(habits(p)) for p in parts):7d}")
+
+
+if __name__ == "__main__":
+    main()

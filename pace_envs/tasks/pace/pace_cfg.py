@@ -85,14 +85,14 @@ class PaceCfg(Config):
     finds them)."""
 
     extra_parameters: tuple[Any, ...] = ()
-    """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
+    """Custom parameters (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 
     apply_load: Callable[[Any, Any, Mapping[str, float]], None] | None = None
     """Writes a recording's ``load_mass`` [kg], ``load_length`` [m] and ``arm_mass`` [kg] to environments,
     as ``(env, env_ids, load)``; ``None`` if the robot carries no such load."""
 
     ee_site: str | None = None
-    """The site or body of the model whose pose objectives of your own compare with the series ``real_ee_pose``."""
+    """The site or body of the model whose pose custom objectives compare with the series ``real_ee_pose``."""
 
     slide_joints: tuple[str, ...] = ()
     """Those of the joints that slide: their units are m, kg, N and N s/m. An environment finds them in its model."""
@@ -104,13 +104,13 @@ class PaceCfg(Config):
     """The largest torque of each joint's drive [N m, of slides N]: its limit, else by what recordings ask of it."""
 
     assumed_gains: tuple[str, ...] = ()
-    """Joints whose gains nobody has stated: those of their drives are assumed."""
+    """Joints whose gains are not stated: the gains of their drives are assumed."""
 
     physics_steps: int = 1
-    """Physics steps in a control step that a fit takes unless it is told a ``physics_dt``; a search takes one."""
+    """Physics steps in a control step that a fit takes without a ``physics_dt``; a search takes one."""
 
     notes: tuple[str, ...] = ()
-    """What was assumed when this was made from a model file, in plain sentences; told once when it is used."""
+    """What was assumed when this was made from a model file, in plain sentences; a fit prints them once."""
 
     @property
     def recording(self) -> Path:

@@ -158,7 +158,7 @@ class PaceSim2realEnvCfg(ManagerBasedRLEnvCfg):
         )
 
     def on_joints(self, joint_names: Sequence[str]) -> PaceSim2realEnvCfg:
-        """The same for some of the joints: the drives of the others, effects and terms of one's own are left out."""
+        """The same for some of the joints: the drives of the others, effects and custom terms are left out."""
         robot, names = self.scene.robot, self.sim2real.joint_order
         drives = {group: cfg.on_joints(names, joint_names) for group, cfg in robot.actuators.items()}
         state = robot.init_state

@@ -39,7 +39,7 @@ class Case:
     background: float = 0.0
     """RMS change of the motion by about twenty other small effects, as a share of the effect's own; 0 for none."""
     part: Literal["both", "effects", "background"] = "both"
-    """What of a case with a background the recordings have: one part alone shows how much error that part makes."""
+    """Which part of a case with a background the recordings have: one alone shows the error that this part makes."""
     harmonic_drive: bool = False
     """A 20:1 harmonic drive with a resonance above 0 dB at 4 to 8 Hz, in place of a drawn elasticity."""
     noise: float = 1e-4

@@ -69,7 +69,7 @@ def joints_of(robot: PlantRobot, pattern: str) -> tuple[str, ...]:
     """The joints that a regular expression names.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: If there is no such joint.
     """
     try:
         names = tuple(name for name in robot.joint_names if re.fullmatch(pattern, name))

@@ -22,8 +22,8 @@ class Dynamics:
         q'  = q_m + h/2 v'
 
     with armature J and viscous friction D. Torques that depend on speed take it at mid-step, extrapolated as
-    1.5 v - 0.5 v_before. Where the transmission gives, J, D and friction are the motor's, which has a position and
-    speed of its own; a mount that gives adds coordinates of its own to M.
+    1.5 v - 0.5 v_before. If the transmission is compliant, J, D and friction are the motor's, with a separate
+    position and speed. A compliant mount adds its coordinates to M.
     """
 
     def __init__(self, drives: Drives, body: RigidBody, effects: Sequence[HiddenEffect], position: np.ndarray):

@@ -151,7 +151,7 @@ class RigidBody:
                 if name not in names:
                     raise ValueError(f"added_mass names {name!r}, which is no body. Available: {', '.join(names[1:])}.")
                 body = names.index(name)
-                # without a place it is at the centre of mass of the model file, whatever turned the body's own mass
+                # without a place it is at the centre of mass of the model file, however the body's mass was turned
                 place = load.added_mass_at.get(name, _from_parent(pos[row, body], quat[row, body], unturned[body]))
                 if kg > 0 and not np.allclose(place, ipos[row, body], rtol=0, atol=1e-9):
                     _bolt_on(body, kg, np.array(place), row, mass, inertia, ipos, iquat)

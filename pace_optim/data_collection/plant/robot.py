@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from pace_envs import load_env_cfg
-from pace_envs.mujoco_warnings import keep_quiet
+from pace_envs.model_file import read_model_file
 from pace_envs.tasks.pace import PaceCfg
 
 _REFERENCE_EFFORT = 89.0  # effort limit of the drive that the effects' sizes were chosen for [N m]
@@ -53,8 +53,7 @@ class PlantRobot:
 
     def spec(self) -> mujoco.MjSpec:
         """The model with its base fixed, without joint friction, damping, armature, contacts or actuators."""
-        keep_quiet()
-        spec = mujoco.MjSpec.from_file(str(self.mjcf_path))
+        spec = read_model_file(self.mjcf_path).spec
         for joint in list(spec.joints):
             if joint.type == mujoco.mjtJoint.mjJNT_FREE:
                 joint.parent.pos = self.base_pos

@@ -255,7 +255,7 @@ class _Session:
         return position
 
     def _noise(self, steps: int, n: int) -> np.ndarray:
-        """The same for every truth; each run has its own, whatever the others are."""
+        """The same for every truth; the runs are independent."""
         streams = [
             np.random.default_rng([self.cfg.seed, 1, r]).normal(0.0, self.cfg.noise, (steps, n))
             if self.cfg.noise

@@ -20,9 +20,9 @@ def multistart(
 ) -> list[Fitted]:
     """For each effect the best of many points, joint by joint: its probes, with other base parameters too.
 
-    Of a stiff one, the best point of each probe: the error at a point says little of where it leads, as another
-    stiffness has its resonance elsewhere, and no descent goes from one to the other. Each point is simulated once, on
-    the beginning of each window of the training recordings.
+    Of a stiff effect, the best point of each probe is kept. There the error at a point says little about where a
+    descent from it ends: another stiffness has another resonance, and no descent leads from one to the other. Each
+    point is simulated once, on the beginning of each window of the training recordings.
 
     Args:
         fits: Fits models.

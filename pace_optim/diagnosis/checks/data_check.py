@@ -54,7 +54,7 @@ def check_data(
     """Noise, encoder steps and the numerical floor of each joint; how many loads and gains there are.
 
     Args:
-        fits: Tells errors.
+        fits: Computes errors.
         problem: The whole robot with the base model.
         twins: Its joints simulated alone.
         base: The base model, fitted to them.

@@ -1,6 +1,6 @@
 """A robot has one delay: joints that follow later than it are held at it, so that what makes them late is sought.
 
-Simulated alone, each joint has a delay of its own, which would take up what the whole robot's model cannot.
+Simulated alone, each joint has a separate delay, which would take up what the whole robot's model cannot.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What is told of it: result, advice, next experiment."""
+"""The report of a diagnosis: result, advice, next experiment."""

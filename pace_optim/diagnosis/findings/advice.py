@@ -51,7 +51,7 @@ def advise(
 
 
 def rivals(joint_names: Sequence[str], outcome: Outcome) -> list[Rivals]:
-    """Effects that the recordings cannot tell apart, as models of the whole robot."""
+    """Effects that the recordings cannot separate, as models of the whole robot."""
 
     @cache
     def with_it(fitted: Fitted) -> RobotModel:

@@ -11,9 +11,11 @@ from typing import Any
 
 import torch
 
+from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
+from pace_actuators.text import conjoined
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.result import Diagnosis
@@ -28,7 +30,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 
 _LEAST_TOLD = 0.1
-"""Smaller shares are said to be below this [%]."""
+"""Smaller shares are printed as below this [%]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,18 +116,46 @@ def with_links(diagnosis: Diagnosis, wrong: LinkFindings, problem: Problem) -> D
         return replace(diagnosis, data=[*wrong.sentences, *diagnosis.data])
     unit = units_for("mrad", problem.joint_types)
     said = [each.sentence for each in wrong.wrong]
-    fall = f"With that the validation error falls from {1e3 * wrong.before:.3g} to {1e3 * wrong.after:.3g} {unit}."
+    fall = (
+        f"With {conjoined(each.label for each in wrong.wrong)} the validation error falls from "
+        f"{1e3 * wrong.before:.3g} to {1e3 * wrong.after:.3g} {unit} at the diagnosis' physics step."
+    )
     rest = [] if diagnosis.verdict == "nothing_missing" else [diagnosis.summary]
     return replace(
         diagnosis,
         verdict="link" if diagnosis.verdict == "nothing_missing" else diagnosis.verdict,
-        summary=" ".join([*said, fall, *rest]),
+        summary=" ".join([*said, *rest]),
+        data=[fall, *diagnosis.data],
         links=[asdict(each) | {"label": each.label} for each in wrong.wrong],
     )
 
 
+def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: Path) -> Diagnosis:
+    """The same with the whole robot's errors, before and with what was found.
+
+    Args:
+        diagnosis: Of the run.
+        run: What was diagnosed.
+        refit: The whole robot with what was found.
+        folder: Of the refit.
+    """
+    names = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
+    before, after = (each.rmse["validation"][ALL] for each in (run, refit))
+    unit = units_for("mrad", run.joint_types)
+    fall = f"With it the whole robot's validation error falls from {1e3 * before:.3g} to {1e3 * after:.3g} {unit}."
+    return replace(
+        diagnosis,
+        summary=f"{diagnosis.summary} {fall}",
+        runs=[diagnosis.run, str(folder)],
+        ladder=[
+            {"model": "base model", "validation_rmse": before, "run": diagnosis.run},
+            {"model": " + ".join(names), "validation_rmse": after, "run": str(folder)},
+        ],
+    )
+
+
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
-    """What the run has, and why it tells another error of the same model, where it does."""
+    """The run's effects, and why its error of the same model differs, if it does."""
     said = []
     if run.effects:
         said.append(f"The search began with what the run has: {', '.join(run.effects)}.")
@@ -139,8 +169,8 @@ def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     unit = units_for("mrad", problem.joint_types)
     return [
         *said,
-        f"The run's own validation error is {1e3 * own:.3g} {unit}, here it is {1e3 * here:.3g} {unit}: "
-        f"{', and '.join(ways)}.",
+        f"The run's validation error is {1e3 * own:.3g} {unit}, that of the joints simulated alone {1e3 * here:.3g} "
+        f"{unit}: {', and '.join(ways)}.",
     ]
 
 
@@ -149,26 +179,27 @@ def summary_of(found: Findings, problem: Problem) -> str:
     unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
     after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
+    alone = "" if len(problem.joint_names) == 1 else ", with each joint simulated alone"
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
     if found.verdict == "nothing_missing":
         return (
             f"Nothing is missing that these recordings could show: the validation error is {before:.3g} {unit}, the "
-            f"floor of noise and numerics {floor:.3g} {unit}."
+            f"floor of noise and numerics {floor:.3g} {unit}{alone}."
         )
     if found.verdict == "unknown":
         text = (
             f"Something is missing, and no known effect has earned its name: the validation error is {before:.3g} "
-            f"{unit}, the floor {floor:.3g} {unit}."
+            f"{unit}, the floor {floor:.3g} {unit}{alone}."
         )
         if found.paying:
             what = "A curve" if len(found.free_form) == len(found.paying) else "What lowers it"
             part = 100 * max(0.0, found.explained)
             text += f" {what}, {', '.join(found.paying)}, explains {part:.0f} % of what lies between."
         return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
-    all_of_it = "all of it" if found.free_form else "it"
+    what = "all of it" if found.free_form else "it"
     summary = (
-        f"{_missing(found)} With {all_of_it} the validation error falls from {before:.3g} to {after:.3g} {unit} "
-        f"(floor {floor:.3g} {unit}); it explains {100 * found.explained:.0f} % of what lies above the floor."
+        f"{_missing(found)} On held-out recordings {what} explains {100 * found.explained:.0f} % of what lies above "
+        f"the floor ({floor:.3g} {unit})."
     )
     if after > found.outcome.cfg.judging.far * floor and not found.free_form:
         summary += " Something else is missing too, which no known effect explains."

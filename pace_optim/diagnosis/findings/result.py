@@ -48,7 +48,7 @@ class Diagnosis:
     """Every parameter of the effects found, on each joint: value, standard deviation, unit, the factor of what was
     stated where it is one, and whether it is at a bound."""
     likes: dict[str, list[str]] = field(default_factory=dict)
-    """Effects that these recordings cannot tell from one found, by its name."""
+    """Effects that these recordings cannot separate from one found, by its name."""
     joints: dict[str, dict[str, Any]]
     """For each joint its errors, floor and effects."""
     data: list[str]

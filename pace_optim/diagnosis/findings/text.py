@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import conjoined, size_text
+from pace_actuators.text import conjoined, shortened, sizes_by_joints
 from pace_optim.diagnosis.findings.result import Diagnosis
 
 _EFFECTS = 8
@@ -21,17 +21,22 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
     if stuck:
         lines.append(f"At its bound: {', '.join(stuck)}.")
     lines += [f"{effect} cannot be separated from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
-    lines += [f"- {sentence}" for sentence in diagnosis.advice]
+    lines += [f"- {sentence}" for sentence in shortened(diagnosis.advice, "proposal")]
     names = list(diagnosis.joints)
+    if diagnosis.ranking:
+        lines.append("Effects tried, with the validation error of their joints before and after (each joint alone):")
     for entry in diagnosis.ranking[:_EFFECTS]:
         before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
         mark = "added" if entry["added"] else ("pays" if entry["significant"] else "does not pay")
         unit = units_for("mrad", diagnosis.joint_types(entry["joints"]))
         where = f"on {len(entry['joints'])} of {len(names)} joints" if len(names) > 1 else ""
         lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} {unit}  {mark:13s}  {where}".rstrip())
-    return lines + [f"- {sentence}" for sentence in diagnosis.data]
+    return lines + [f"- {sentence}" for sentence in shortened(diagnosis.data, "note")]
 
 
 def size_lines(sizes: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each size: "torque_gain.gain of servo: 0.450 ± 0.002, 0.45 times what was stated"."""
-    return [f"{size['effect']}.{size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes]
+    """A line for each value: "torque_gain.gain of servo: 0.45 ± 0.002 times what was stated"."""
+    return [
+        f"{effect}.{parameter} of {conjoined(joints)}: {text}"
+        for (effect, parameter, text), joints in sizes_by_joints(sizes).items()
+    ]

@@ -17,10 +17,10 @@ from pace_optim.joints.fits.block_errors import BlockErrors
 def judged_over_trees(search: Search, end: Branch, choosing: Callable[[Round], Branch]) -> Branch:
     """The branch with what joints take when what it does to the other joints of their trees counts too.
 
-    A link is carried by other joints than its own, which a joint simulated alone does not feel. Where an effect on a
-    joint's link is its best, or a rival of that, it and the best that is not on the link are judged again, each along
-    the motion that the robot has with it, against the robot without. The joint's squared error is multiplied by what
-    those of the other joints are multiplied by.
+    Other joints carry a joint's link too, and a joint simulated alone does not show that. So an effect on the link that
+    is the best, or a rival of the best, is judged again, and so is the best effect that is not on the link. Each is
+    judged along the robot's motion with it, against the robot without. The joint's squared error is multiplied by the
+    factor of the other joints' squared errors.
 
     Args:
         search: What is looked for.
@@ -93,7 +93,7 @@ def _options(found: Round, joint: int) -> list[Trial]:
 def _other_rivals(found: Round, again: Round, joint: int) -> list[type[Effect]]:
     """Rivals of an effect that is not on the link: those not judged again, and those on the link that pay there too.
 
-    What a mass does to other joints depends on where it sits, which its own joint does not tell.
+    What a mass does to other joints depends on where it sits, which its own joint does not show.
     """
     chosen, trials = again.chosen[joint], again.trials[joint]
     if again is found or chosen is None or _on_link(chosen):
@@ -105,7 +105,7 @@ def _other_rivals(found: Round, again: Round, joint: int) -> list[type[Effect]]:
 def _over_tree(search: Search, errors: BlockErrors, without: BlockErrors, joint: int) -> BlockErrors:
     """Errors in which those of a joint count what an effect of its does to the others of its tree.
 
-    Near the floor there is nothing to tell.
+    Near the floor nothing can be compared.
     """
     others = [j for tree in search.trees for j in tree if joint in tree and j != joint]
     least = search.at_floor[others] ** 2

@@ -29,9 +29,8 @@ def further_with_next_best(
 ) -> tuple[Branch, Round | None] | None:
     """The branch with the effects that lead furthest, and what could come next; ``None`` if the best ones do.
 
-    Where the best effect leaves much unexplained, the next one of each joint leads on for a round too, and is taken if
-    it ends lower, or as low with fewer parameters: the others that are missing give much to whatever has parameters to
-    spare.
+    If the best effect leaves much unexplained, the next best of each joint is followed for a round too. It is taken if
+    it ends lower, or as low with fewer parameters. Effects with many parameters absorb other missing effects.
 
     Args:
         search: What is looked for.

@@ -33,7 +33,7 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
         return None
     fits, problem, now, errors = search.fits, branch.problem, branch.now, branch.errors
     cfg, first = search.cfg, search.own.issuperset(now.model.effects)
-    search.say(f"refitting with {_names(list(begun))}")
+    search.say(f"fitting {_names(list(begun))} on whole recordings")
     fitted = fits.coarse_to_fine(problem, list(begun.values()), rough)
     if cfg.has("widen_bounds"):
         fitted = beyond_bounds(fitted, lambda starts: fits.coarse_to_fine(problem, starts, rough), search.say)
@@ -99,7 +99,7 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
     begin = list(dict.fromkeys([*listed, *always, *(effects if wide else ())]))
     if not begin:
         return {}, probes
-    search.say(f"beginning with {len(begin)} of them" if wide else f"beginning with {_names(begin)}")
+    search.say(f"fitting {f'{len(begin)} effects' if wide else _names(begin)} on windows")
     begun = _begun(search, branch, probes, begin, far and search.cfg.has("multistart"))
     if wide:
         listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)

@@ -63,7 +63,7 @@ def replace_effects(search: Search, branch: Branch) -> Branch:
 def _exchanges(
     now: Fitted, rounds: Sequence[Round], unexplained: torch.Tensor, cfg: JudgingCfg
 ) -> dict[type[Effect], _Exchange]:
-    """What is tried in place of what, joint by joint."""
+    """Which effect is tried instead of which, joint by joint."""
     model = now.model
     in_use = {effect for effect, has in zip(model.effects, model.has, strict=True) if bool(has.any())}
     result: dict[type[Effect], _Exchange] = {}

@@ -46,7 +46,7 @@ def _simplest(trials: Sequence[Trial], ratio: float) -> Trial:
 
 
 def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]:
-    """Effects that all joints share by their nature, and that leave more over all joints than effects of their own."""
+    """Effects that all joints share by nature, and that leave more error than separate effects."""
     good = [[trial for trial in own if trial.significant] for own in trials if own]
     before = [own[0].mse_before for own in trials if own]
 

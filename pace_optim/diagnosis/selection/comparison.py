@@ -24,7 +24,7 @@ class Judgement:
 
 
 def within(mse: float, best: float, ratio: float) -> bool:
-    """Whether an RMSE is no more than so many times another; both are given squared [rad²]."""
+    """Whether an RMSE is at most so many times another; both are given squared [rad²]."""
     return mse <= ratio**2 * best
 
 

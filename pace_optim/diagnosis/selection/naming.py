@@ -43,10 +43,10 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
     An effect is named where it explains most of what lies above the floor without it, and leads near the floor. Where
-    it does not lead near the floor, its size must be far from none in its own error bars, alike in every recording,
-    away from its bounds, and one that drives have; and it must explain a part of what a larger effect beside it does.
-    Beside a larger effect it counts only on what that leaves far from the floor. For effects beside a larger one, also
-    on other joints of its tree, take up what the model of the larger one gets wrong.
+    it does not lead near the floor, its size must be several error bars from zero, the same in every recording, away
+    from its bounds, and typical of drives. It must also explain a part of what a larger effect beside it does. Beside a
+    larger effect it counts only on what that leaves far from the floor. For effects beside a larger one, also on other
+    joints of its tree, take up what the model of the larger one gets wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:

@@ -54,7 +54,7 @@ def fit_curves(
     say: Callable[[str], None] = lambda _: None,
     log: Log = unlogged,
 ) -> Curves | None:
-    """Fit every curve on the joints that are far from the floor in the end; ``None`` if there are none.
+    """Fit every curve on the joints that are far from the floor in the end; ``None`` without such joints.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
     one variable that leaves less than half of what named effects leave says that those are not it. Where no effect is
@@ -74,7 +74,7 @@ def fit_curves(
         joints &= ~(has & effect.shared)
     if not bool(joints.any()) or not outcome.cfg.has("curves"):
         return None
-    say("fitting curves of any form in place of effects")
+    say("fitting curves of any form instead of effects")
     ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
     every = (get_effect(name) for name in available_effects())
     effects = [each for each in every if issubclass(each, FreeForm) and each.variable in ranges]
@@ -125,7 +125,7 @@ def error_map(
     Args:
         curves: What was fitted.
         joint_names: The joints.
-        base_errors: Of the base model, as everything else in the diagnosis tells them.
+        base_errors: Of the base model, as in the rest of the diagnosis.
         joint_types: Whether each joint turns or slides; none: all turn.
         cfg: What fall of the error is worth a word.
     """
@@ -169,7 +169,7 @@ def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list
     names = [p.name for p in effect.parameters]
     curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
     if effect.kind == "friction" and effect.parameters[0].unit == "N m":
-        # what the base model has of it and what the curve has cannot be told apart everywhere
+        # the base model and the curve share a part that cannot be separated everywhere
         level, viscous = (float(physical[COLUMN[name]]) for name in ("friction", "viscous_friction"))
         slope = viscous if effect.variable == "speed" else 0.0
         total = (max(0.0, level + more) for more in curve["torque"])

@@ -56,7 +56,7 @@ class _LeftOut:
 
 
 def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = unlogged) -> Names:
-    """Tell effects whose names are earned from those that only lower the error.
+    """Separate effects whose names are earned from those that only lower the error.
 
     Each effect is left out in turn and the rest fitted again; what is lost is the evidence (:func:`doubts`). On a joint
     the weakest one that has not earned its name goes, until all that are left have. A joint on which none has keeps its

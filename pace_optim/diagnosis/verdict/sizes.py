@@ -88,7 +88,7 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
 
 
 def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
-    """What of each value makes up for the physics step, physical (n, P), as in a fit's error bars (``step_share``).
+    """The part of each value that makes up for the physics step, physical (n, P), as in a fit's ``step_share``.
 
     The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c.
     """
@@ -109,7 +109,7 @@ def error_bars_from_none(now: Fitted) -> torch.Tensor:
     """How many of its error bars each effect's size is away from none, (effects, n); zero without the effect.
 
     Of a parameter p with the null p₀ it is |p - p₀| / σ, on a logarithmic scale |ln p - ln p₀| p / σ, and p / σ where
-    the null is infinite; of several the largest. One at a bound has no error bar, and tells nothing.
+    the null is infinite; of several the largest. One at a bound has no error bar and does not count.
 
     Args:
         now: A model, fitted, with its Jacobian.

@@ -66,7 +66,7 @@ class Confounded:
 
 
 def confounded(outcome: Outcome) -> list[Confounded]:
-    """Pairs of effects that the recordings cannot tell apart, with the joints where that is so."""
+    """Pairs of effects that the recordings cannot separate, with the joints where that is so."""
     model, result = outcome.final.model, []
     for this in outcome.rounds:
         found: dict[tuple[type[Effect], type[Effect]], list[int]] = {}
@@ -82,7 +82,7 @@ def confounded(outcome: Outcome) -> list[Confounded]:
 
 
 def likes(outcome: Outcome) -> dict[str, list[str]]:
-    """For each effect of the final model, those that the recordings cannot tell from it; only where there are any."""
+    """For each effect of the final model, those that the recordings cannot separate from it, if any."""
     found: dict[str, list[str]] = {}
     for pair in confounded(outcome):
         own = found.setdefault(pair.chosen.name, [])
@@ -138,7 +138,7 @@ def _told(
     types: Sequence[JointType],
     least: float,
 ) -> dict[str, Any]:
-    """What a round tells of an effect: on the joints that have it in the end, or else where it counts, or anywhere."""
+    """What a round shows of an effect: on the joints that have it in the end, else where it counts, else anywhere."""
     own = [t for trials in this.trials for t in trials if t.effect is effect]
     good = [t for t in own if t.significant]
     shown = [t for t in own if t.joint in added] or good or own

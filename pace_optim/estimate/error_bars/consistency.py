@@ -132,7 +132,7 @@ def _of_recording(there: Jacobian, r: int) -> Jacobian:
 
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
-    """One sentence per parameter that a recording sees otherwise than the others do."""
+    """Parameters that differ in one recording from the others."""
     width = (space.upper - space.lower).numpy()
     found: dict[tuple[str, str, str], list[str]] = {}
     for i, label in enumerate(space.labels):
@@ -144,11 +144,12 @@ def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.nda
             found.setdefault((name, space.unit_of(name, key), names[r]), []).append(
                 text if key == GLOBAL else f"{key} {text}"
             )
-    return [
+    parts = [
         f"{name.replace('_', ' ')} [{unit}] differs between {recording} and the other recordings: "
-        f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}. [W17]"
+        f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}."
         for (name, unit, recording), places in found.items()
     ]
+    return [f"{' And '.join(parts)} [W17]"] if parts else []
 
 
 def _more(joints: int) -> str:

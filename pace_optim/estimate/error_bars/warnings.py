@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 
@@ -18,6 +18,8 @@ from pace_optim.estimate.least_squares import ROUGH
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 
+_BY_EFFECT = (1, 19, 3, 2, 4, 5, 17, 18, 8, 7, 6, 9, 10, 11, 12, 13, 15)
+"""Codes of warnings: first those of a result that is wrong, then of single values, last of a loss of accuracy."""
 _OVERFIT_RATIO = 1.5
 _NAMED = 3
 """Joints that a sentence names, at most."""
@@ -36,7 +38,7 @@ def fit_warnings(
     left_open: Sequence[str] = (),
     unsure: Sequence[str] = (),
 ) -> list[str]:
-    """Plain sentences, the most important first, one for each kind; none if all is well.
+    """Plain sentences, one for each kind; none if all is well.
 
     Args:
         problem: What was fitted.
@@ -61,35 +63,40 @@ def fit_warnings(
     ]
 
 
+def by_effect(warnings: Iterable[str]) -> list[str]:
+    """Warnings in the order of their effect on the result, each once."""
+
+    def place(warning: str) -> int:
+        return next((i for i, code in enumerate(_BY_EFFECT) if f"[W{code}]" in warning), len(_BY_EFFECT))
+
+    return sorted(dict.fromkeys(warnings), key=place)
+
+
 def _undetermined(labels: Sequence[str]) -> list[str]:
-    """One sentence for each parameter that the recordings leave open on some joints."""
+    """What the recordings leave open."""
+    if not labels:
+        return []
     return [
-        f"{_first(name)}{_of(keys)} cannot be identified from these recordings: it has no influence, or its error bar "
-        "is as large as its bounds or its value. The prior is kept, and exports omit it. [W10]"
-        for name, keys in _by_parameter(_not_of_links(labels)).items()
-    ] + [
-        f"These recordings do not show {shown}: the error bar stays at the prior's. The model file's value is kept. "
-        "[W10]"
-        for shown in _of_links(labels)
+        f"Not identified by these recordings: {_named(labels)}. They have no influence, or an error bar as large as "
+        "the value, its bounds or its prior. Each keeps its prior or the model file's value; exports omit it. [W10]"
     ]
 
 
 def _unsure(labels: Sequence[str]) -> list[str]:
     """The same for those whose error bar leaves open what the error does not, with this physics step."""
+    if not labels:
+        return []
     return [
-        f"{_first(name)}{_of(keys)} is barely identified by these recordings: its error bar is as large as its value "
-        "or its bounds, or other parameters compensate for it. The value that fits best with this physics step is "
-        "kept. [W11]"
-        for name, keys in _by_parameter(_not_of_links(labels)).items()
-    ] + [
-        f"These recordings show only a combination of {shown} with other parameters: the error bar of each stays near "
-        "the prior's. The most probable value is kept. [W11]"
-        for shown in _of_links(labels)
+        f"Barely identified by these recordings: {_named(labels)}. The error bar is as large as the value, its bounds "
+        "or its prior, or other parameters compensate. The value that fits best with this physics step is kept. [W11]"
     ]
 
 
-def _not_of_links(labels: Sequence[str]) -> list[str]:
-    return [label for label in labels if label.split("/")[0] not in NAMES]
+def _named(labels: Sequence[str]) -> str:
+    """Parameters with their joints and links, in words."""
+    of_joints = [label for label in labels if label.split("/")[0] not in NAMES]
+    named = [f"{name.replace('_', ' ')}{_of(keys)}" for name, keys in _by_parameter(of_joints).items()]
+    return "; ".join([*named, *_of_links(labels)])
 
 
 def _of_links(labels: Sequence[str]) -> list[str]:
@@ -102,25 +109,20 @@ def _of_links(labels: Sequence[str]) -> list[str]:
     return [f"{conjoined(names)} of the link {link}" for link, names in found.items()]
 
 
-def _first(name: str) -> str:
-    """A parameter's name in words, as a sentence begins with it."""
-    words = name.replace("_", " ")
-    return words[:1].upper() + words[1:]
-
-
 def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
-    """One sentence for each kind of confounded parameters, with the joints."""
+    """Confounded parameters, with the joints."""
     kinds: dict[tuple[str, ...], list[str]] = {}
     for group in groups:
         keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
-    return [
-        f"The recordings cannot separate "
-        f"{conjoined([name.replace('_', ' ') for name in kind]) + _of(keys) if keys else in_words(kind)}"
-        ": move more, or in other poses. [W12]"
+    found = [
+        conjoined([name.replace("_", " ") for name in kind]) + _of(keys) if keys else in_words(kind)
         for kind, keys in kinds.items()
     ]
+    if not found:
+        return []
+    return [f"These recordings cannot separate {'; '.join(found)}. Move more, or in other poses. [W12]"]
 
 
 def _by_parameter(labels: Sequence[str]) -> dict[str, list[str]]:
@@ -175,7 +177,7 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
 
 def rough_motion(noise: float, score: float) -> list[str]:
     """Whether the simulation's own noise [rad] is a notable part of the error (score [rad²])."""
-    if noise < ROUGH * score**0.5:
+    if noise < max(ROUGH * score**0.5, _NOTHING):
         return []
     return [
         "Contacts or sticking make the simulation rough: a tiny change of a parameter changes the motion by "
@@ -206,7 +208,7 @@ def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: fl
 
 
 def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:
-    """One sentence per parameter and side."""
+    """Parameters with the side, the bound and the joints."""
     space = problem.space
     low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
     places: dict[tuple[str, str, float], list[str]] = {}
@@ -215,11 +217,15 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
         name, key = label.split("/", 1)
         side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
         places.setdefault((name, side, bound), []).append(key)
-    return [
-        f"{name.replace('_', ' ')} is at its {side} bound ({bound:g} {space.unit_of(name, keys[0])})"
-        + _of(keys).replace(" of ", " on ", 1)
-        + ": widen the bound, or find the missing physics that this parameter stands in for. [W9]"
+    if not places:
+        return []
+    found = [
+        f"{name.replace('_', ' ')} ({side}, {bound:g} {space.unit_of(name, keys[0])}){_of(keys)}"
         for (name, side, bound), keys in places.items()
+    ]
+    return [
+        f"At a bound: {'; '.join(found)}. Widen the bound, or find the missing physics that the value stands in for. "
+        "[W9]"
     ]
 
 

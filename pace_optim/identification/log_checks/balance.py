@@ -77,7 +77,7 @@ class View:
     velocity_limit: np.ndarray
     """The drives in force, (n,) each."""
     assumed: np.ndarray
-    """Whether nobody has stated a joint's gains, (n,) bool."""
+    """Whether a joint's gains are not stated, (n,) bool."""
     most_bias: np.ndarray
     """Largest encoder bias, (n,) [rad]."""
     most_delay: int
@@ -155,7 +155,7 @@ def views_of(problem: Problem) -> list[View]:
                 own = getattr(actuator, name)
                 values[actuator.joint_indices] = own[min(r, len(own) - 1)].cpu().numpy()
         model = model_of(env, r)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # nothing but its links
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # only its links
         command = np.asarray(recording.command)
         zero = np.zeros_like(command)
         on = recording.command_torque_enable
@@ -237,7 +237,7 @@ class Balance:
 
 
 def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarray | None = None) -> dict[int, Balance]:
-    """The balance of some joints; of one that hardly moves there is none.
+    """The balance of some joints, without those that hardly move.
 
     Args:
         view: The recording.

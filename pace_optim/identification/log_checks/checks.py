@@ -19,7 +19,6 @@ from pace_actuators.text import listed
 from pace_optim.identification.log_checks.balance import Balance, Links, View, balances, views_of, without
 from pace_optim.identification.log_checks.imu import late, other_axes, other_units, stuck_contacts
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.recordings import tell_on_stderr
 
 _DOUBTED = 0.04
 """Misfit from which a joint is looked at."""
@@ -360,7 +359,7 @@ def _of_known_gains(evidence: Evidence) -> list[int]:
 
 
 def torque_limit(evidence: Evidence) -> Iterator[Change]:
-    """The drive gives no more than a torque that nobody states."""
+    """The drive's torque is limited, and the limit is not stated."""
     view = evidence.view
     for j in _of_known_gains(evidence):
         most = np.quantile(np.abs(view.asked(j)), np.linspace(0.3, 0.995, 15))
@@ -660,7 +659,7 @@ def _gain(before: Evidence, after: Evidence, change: Change) -> float:
 
 
 def check_log(problem: Problem) -> list[Finding]:
-    """What is wrong with the recordings of a problem; the same of several is said once."""
+    """What is wrong with the recordings of a problem; the same of several comes once."""
     merged: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
     views = views_of(problem)
     if all(np.ptp(view.position, axis=0).max() < _STANDS for view in views):
@@ -675,13 +674,12 @@ def check_log(problem: Problem) -> list[Finding]:
     return [replace(each[0], recordings=tuple(f.recordings[0] for f in each)) for each in merged.values()]
 
 
-def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] = tell_on_stderr) -> Problem:
+def checked(problem: Problem, trust: bool = False) -> Problem:
     """The problem with what is wrong with its log among its contradictions.
 
     Args:
         problem: What is to be fitted.
         trust: Whether a log that no fit can be right of is only warned of.
-        tell: Gets the warnings.
 
     Raises:
         ValueError: If no fit of the log can be right.
@@ -689,6 +687,4 @@ def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] =
     found = check_log(problem)
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:
         raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
-    for each in found:
-        tell(f"warning: {each.sentence} [W3]")
     return replace(problem, contradictions=(*problem.contradictions, *(f"{each.sentence} [W3]" for each in found)))

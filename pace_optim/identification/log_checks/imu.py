@@ -123,7 +123,7 @@ def stuck_contacts(view: View, is_doubted: Callable[[], list[int]]) -> Iterator[
 
     Args:
         view: The recording.
-        is_doubted: Tells the joints that do not balance.
+        is_doubted: Finds the joints that do not balance.
     """
     if view.standing is None or len(view.feet) < 2:
         return

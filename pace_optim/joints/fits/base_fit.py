@@ -80,7 +80,7 @@ def _fit_along(
     cfg = fits.cfg
     at_control_step = problem.with_physics_dt(problem.coarsest_dt)
     for i in range(cfg.rounds):
-        say(f"base model, round {i + 1}")
+        say(f"fitting the base model of each joint, round {i + 1}")
         coarse = twin_problem(at_control_step, path(at_control_step)).in_windows()
         before, fitted = fitted, fits.side_by_side(coarse, [fitted], cfg.again)[0]
         if float((fitted.x - before.x).abs().max()) < fits.cfg.moved:
@@ -90,7 +90,7 @@ def _fit_along(
 
 
 def later_than_most(delay: torch.Tensor, *, cfg: FittingCfg = DEFAULT) -> torch.Tensor:
-    """Joints that are later than the delay that most joints have, (n,) bool; nobody knows it of one joint or two.
+    """Joints that are later than the delay that most joints have, (n,) bool; of one or two joints none is.
 
     Args:
         delay: Of each joint, (n,) [control steps].

@@ -65,7 +65,7 @@ def block_errors(
 def _free_errors(error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, cfg: FittingCfg) -> BlockErrors:
     """Errors of joints that are free at times: the free time of each, in as many blocks; 1 where it has none."""
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
-    count = cfg.blocks  # whichever joints are looked at: models are compared block by block
+    count = cfg.blocks  # for all joints: models are compared block by block
     square = torch.ones(count, len(own), dtype=torch.float64)
     for j, places in enumerate(own):
         if len(places):

@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt of one model with an ask/tell interface; each joint is an independent problem."""
+"""Levenberg–Marquardt of one model with ``ask`` and ``tell``; each joint is an independent problem."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class JointDescent:
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
         better = lowest < self.score
-        # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and tells nothing of a gain
+        # a joint whose Jacobian was not known has not moved: its favoured row is x itself, and shows no gain
         fresh = ~self._known
         gain = (self.score - lowest) / self.score
         self._still = torch.where(fresh, self._still, torch.where(gain > self._cfg.enough, 0, self._still + 1))

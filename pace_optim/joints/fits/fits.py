@@ -23,7 +23,7 @@ from pace_optim.terminal.parallel import parallel_map
 
 @dataclass(frozen=True, kw_only=True)
 class Fits:
-    """Fits models of single joints and tells their errors; whoever searches is given one, and tests give others."""
+    """Fits models of single joints and computes their errors; the search gets one, and tests give others."""
 
     cfg: FittingCfg = field(default_factory=FittingCfg)
     batch: Callable[..., SideBySide] = SideBySide

@@ -45,7 +45,7 @@ class Fitted:
         """The Jacobian, zero where a parameter is held or at a bound.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If it was not kept.
         """
         if self.jacobian is None:
             raise ValueError("This needs a model that was fitted with keep_jacobian.")

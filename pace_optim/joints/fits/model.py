@@ -15,7 +15,7 @@ from pace_optim.problem.box import Box
 from pace_optim.problem.problem import Problem
 
 BASE = tuple(BASE_PARAMETERS)
-"""The base parameters of a joint, in the order of its vector; here each joint has a delay of its own."""
+"""The base parameters of a joint, in the order of its vector; here each joint has a separate delay."""
 
 COLUMN = {name: column for column, name in enumerate(BASE)}
 """The column of each base parameter in a joint's vector."""

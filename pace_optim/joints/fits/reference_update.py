@@ -41,7 +41,7 @@ class ReferenceUpdate:
             twins: The joints along the present reference.
             now: The model, fitted along it.
         """
-        self.say("motion of the robot with what was found")
+        self.say("simulating the whole robot with the found effects")
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
         # what a link's inertia changes is linear in an effect's parameters only near what they have here
         on_links = any(effect.overrides("write_model") for effect in now.model.effects)

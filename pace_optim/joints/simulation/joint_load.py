@@ -25,7 +25,7 @@ class JointLoad:
     torque: torch.Tensor
     """Torque of gravity, of springs, and of the other joints' motion [N m]."""
     load: torch.Tensor
-    """The same without what the other joints' accelerations do: what a robot's drives are told of their load [N m]."""
+    """The same without what the other joints' accelerations do: the load that a robot's drives get [N m]."""
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
         """The same change of each."""
@@ -106,7 +106,7 @@ class Links:
 
     @classmethod
     def of(cls, env: ManagerBasedEnv) -> Links:
-        """Of an environment as it is; without what drives have of their own, armature and viscous friction."""
+        """Of an environment as it is, without the drives' armature and viscous friction."""
         robot = env.scene["robot"]
         columns = robot.dof_columns.numpy()
         env.sim.forward()

@@ -1,4 +1,4 @@
-"""A rollout of single joints in a few launches: its first control step as ever, all others in kernels."""
+"""A rollout of single joints in a few launches: its first control step in torch, all others in kernels."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class ReferencePath:
         return (self.position[2 * self._span :] - self.position[: -2 * self._span]) / (2 * self._span * self.control_dt)
 
     def load(self) -> torch.Tensor:
-        """What the drives are told of their load at the same steps, (T', R, n) [N m]."""
+        """The load that the drives get at the same steps, (T', R, n) [N m]."""
         return self.feel.load[self._span : len(self.position) - self._span]
 
     @property
@@ -96,7 +96,7 @@ class ReferencePath:
         return self._part((slice(None), list(recordings)), phases=phases)
 
     def at(self, step: torch.Tensor, recording: torch.Tensor) -> ReferencePath:
-        """Parts of the recordings: of each (W,) those control steps (T', W); where there are none, the last one."""
+        """Parts of the recordings: of each (W,) those control steps (T', W); without any, the last one."""
 
         def of(values: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
             return values[steps.clamp(max=len(values) - 1), recording]

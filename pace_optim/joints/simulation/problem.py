@@ -20,7 +20,7 @@ from pace_optim.recording.windows import Windows
 
 @dataclass(kw_only=True, eq=False)
 class TwinProblem(Problem):
-    """A problem whose joints are simulated alone along a path; each is a tree of its own."""
+    """A problem whose joints are simulated alone along a path; each is a separate tree."""
 
     path: ReferencePath
     """Of the same recordings."""
@@ -44,7 +44,7 @@ class TwinProblem(Problem):
         return part.with_effects(()).with_physics_dt(self.physics_dt)
 
     def with_effects(self, effects: Sequence[EffectCfg | str]) -> TwinProblem:
-        """The same with these effects instead of its own."""
+        """The same with other effects."""
         return _with_path(super().with_effects(effects), self.path)
 
     def with_physics_dt(self, physics_dt: float) -> TwinProblem:
@@ -71,7 +71,7 @@ class TwinProblem(Problem):
 
 
 def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:
-    """The same recordings and parameters, each joint a tree of its own.
+    """The same recordings and parameters, each joint a separate tree.
 
     Args:
         problem: The problem of the whole robot.

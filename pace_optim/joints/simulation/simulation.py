@@ -109,7 +109,7 @@ class TwinSimulation(Simulation):
         """Nothing: what joints feel of it is on the path."""
 
     def bind(self, field: str) -> torch.Tensor:
-        """A field of the state, at zero, (num_envs, ...): nobody else holds it."""
+        """A field of the state, at zero, (num_envs, ...), not shared."""
         return torch.zeros(self.num_envs, self.model.nq if field == "qpos" else self.model.nv, dtype=self.dtype)
 
     def expand(self, field: str) -> torch.Tensor:

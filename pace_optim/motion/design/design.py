@@ -50,7 +50,7 @@ class DesignCfg:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Design:
-    """The motion that was chosen, and what it is expected to tell."""
+    """The motion that was chosen, and the expected error bars."""
 
     trajectory: Trajectory
     """The targets."""
@@ -96,13 +96,14 @@ def optimize_motion(
 ) -> Design:
     """Choose each joint's amplitude, centre, band and phases so that the expected error bars are smallest.
 
-    Every round simulates candidates, each joint of each drawn by itself, and exchanges, one tree after another, the
-    present motion for that of the candidate that lowers the criterion most, until none does (the exchange of Fedorov,
-    Theory of Optimal Experiments, 1972, with trees in place of measurements). So the result is never worse than the
-    unoptimised motion: the one asked for, made smaller where its targets are faster than the drives. A candidate's
-    tree in which any joint leaves a limit is not taken: targets in the joint limits and not faster than the drive's
-    no-load speed; in simulation, positions in the joint limits and torques below theirs. Error bars hold near x: they
-    are as good as the guess of the parameters.
+    Every round simulates candidates; each joint of a candidate is drawn separately. Then, one tree after another, the
+    candidate that lowers the criterion most replaces the present motion, until none lowers it. That is the exchange of
+    Fedorov (Theory of Optimal Experiments, 1972), with trees instead of measurements. So the result is never worse than
+    the unoptimised motion: the one asked for, made smaller where its targets are faster than the drives.
+
+    A candidate's tree counts only if all its joints keep their limits. Targets stay in the joint limits and below the
+    drive's no-load speed. Simulated positions stay in the joint limits, and torques below theirs. Error bars hold near
+    x: they are as good as the guess of the parameters.
 
     Args:
         problem_of: Makes the robot's problem from trajectories.

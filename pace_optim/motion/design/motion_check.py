@@ -32,7 +32,7 @@ class MotionLimits:
     joint_names: tuple[str, ...]
     """The joints."""
     position: np.ndarray
-    """Lower and upper limit, (n, 2) [rad]; infinite where there is none."""
+    """Lower and upper limit, (n, 2) [rad]; infinite without a limit."""
     velocity: np.ndarray
     """No-load speed of the drive, (n,) [rad/s]; may be infinite."""
     effort: np.ndarray

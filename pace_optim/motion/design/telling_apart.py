@@ -1,4 +1,4 @@
-"""Which further recording would tell two models of a robot apart: they are simulated on a menu of motions and loads."""
+"""Which recording would separate two models of a robot: they are simulated on a menu of motions and loads."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Rivals:
     models: tuple[RobotModel, RobotModel]
     joints: list[int]
     hint: str = ""
-    """What tells such models apart in general."""
+    """What separates such models in general."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,11 +83,11 @@ class Prediction:
 def next_experiments(
     problem: Problem, pairs: Sequence[Rivals], noise: torch.Tensor, cfg: MenuCfg | None = None
 ) -> list[str]:
-    """Which recordings would tell apart what the present ones cannot, as few of them as do, as sentences.
+    """The fewest recordings that would separate what the present ones cannot, as sentences.
 
     Args:
         problem: The whole robot with the base model.
-        pairs: What cannot be told apart.
+        pairs: Models that cannot be separated.
         noise: Of each joint, (n,) [rad].
         cfg: The menu.
     """
@@ -119,7 +119,7 @@ def next_experiments(
 
 
 def _most_telling(clear: Sequence[Prediction]) -> list[Prediction]:
-    """Predictions for the recording that tells most pairs apart; among equals, the one that does so most clearly."""
+    """Predictions for the recording that separates most pairs; among equals, the clearest."""
     by_recording: dict[str, list[Prediction]] = {}
     for each in clear:
         by_recording.setdefault(each.choice.arguments + each.choice.words, []).append(each)
@@ -148,7 +148,7 @@ def _range(values: Sequence[float], form: str) -> str:
 def menu(problem: Problem, joint: int, cfg: MenuCfg) -> Iterator[Choice]:
     """Every motion as the robot was, with a larger proportional gain, and with more load on a joint.
 
-    Drives that follow speeds are told speeds.
+    Drives that follow speeds get speeds.
     """
     like, told = _like(problem), _told(problem)
     conditions = [("", "", like), *_other_gain(like, cfg), *_other_load(problem, like, joint, cfg)]

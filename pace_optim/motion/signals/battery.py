@@ -1,4 +1,4 @@
-"""Six short motions that together tell most physical effects apart."""
+"""Six short motions that together separate most physical effects."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def staircase_signal(motion: Motion) -> np.ndarray:
     """Levels up, down and back, each approached smoothly from both sides and held, (T,).
 
     At rest, the targets' distance from the positions is gravity plus friction over stiffness: the two directions of
-    approach tell them apart.
+    approach separate them.
     """
     place = motion.time / motion.duration * len(_LEVELS)
     level = np.minimum(place.astype(int), len(_LEVELS) - 1)

@@ -15,7 +15,7 @@ _FADE = 0.5  # [s]
     "multisine", "four periods of sines at odd harmonics, random phases, a third left out", duration=40.0
 )
 def multisine(motion: Motion) -> list[Trajectory]:
-    """Equal amplitudes, each joint with phases of its own, peak 1.
+    """Equal amplitudes, each joint with separate phases, peak 1.
 
     The signal repeats four times (drop the first: it fades in over half a second, and the robot settles). Excited
     are odd multiples of 1/period in the band; of every three, a random one is left out. Then a response at left-out

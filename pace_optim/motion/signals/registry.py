@@ -63,7 +63,7 @@ def excitation_named(name: str) -> Excitation:
     """The excitation of a name.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     if name not in _EXCITATIONS:
         close = difflib.get_close_matches(name, _EXCITATIONS, n=1)

@@ -10,7 +10,7 @@ _HOLD = (0.5, 1.0)  # [s]
 
 
 def steps_signal(motion: Motion, amplitude: float = 1.0) -> np.ndarray:
-    """Levels drawn evenly from ±amplitude, each held 0.5 to 1 s, (T, n); every joint steps at times of its own.
+    """Levels drawn evenly from ±amplitude, each held 0.5 to 1 s, (T, n); every joint steps at other times.
 
     The first level is 0, so that the motion starts where it stands.
     """

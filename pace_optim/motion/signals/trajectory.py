@@ -28,11 +28,11 @@ class Trajectory:
     has_jumps: bool = False
     """Whether targets jump on purpose (steps), so that their difference says nothing about speed."""
     by_speed: tuple[str, ...] = ()
-    """Joints whose drives follow speeds: they are told the slope of their targets."""
+    """Joints whose drives follow speeds: they get the slope of their targets."""
 
     @property
     def told_pos(self) -> np.ndarray | None:
-        """Positions that drives are told, as a recording has them: (T, n) [rad], NaN for joints that follow speeds."""
+        """Positions that drives get, as a recording has them: (T, n) [rad], NaN for joints that follow speeds."""
         by_speed = self._follows_speed
         if by_speed.all():
             return None
@@ -40,7 +40,7 @@ class Trajectory:
 
     @property
     def told_vel(self) -> np.ndarray | None:
-        """Speeds that drives are told, (T, n) [rad/s], NaN for joints that follow positions; at rest in the end."""
+        """Speeds that drives get, (T, n) [rad/s], NaN for joints that follow positions; at rest in the end."""
         by_speed, target = self._follows_speed, self.des_dof_pos
         slope = np.diff(target, axis=0, append=target[-1:]) / (self.time[1] - self.time[0])
         return np.where(by_speed, slope, np.nan) if by_speed.any() else None

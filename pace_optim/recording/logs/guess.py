@@ -23,7 +23,7 @@ from .units import Known, UnitUnknown, guessed_units
 from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, meaning
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
-"""Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives are told."""
+"""Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,15 +33,15 @@ class Robot:
     joint_names: tuple[str, ...] = ()
     """In order; () where no robot is known: the log's own names are kept."""
     limits: np.ndarray | None = None
-    """Lower and upper limit of each joint, (n, 2) [rad]; infinite where there is none."""
+    """Lower and upper limit of each joint, (n, 2) [rad]; infinite without a limit."""
     wanted: tuple[str, ...] = ()
     """Those of them that a log must have; (): the ones that it names, if it names no others."""
     joint_types: tuple[JointType, ...] = ()
     """Whether each joint turns or slides; none where it is not known."""
     stiffness: np.ndarray | None = None
-    """kp of each joint's drive, (n,) [N m/rad]; NaN where nobody states it."""
+    """kp of each joint's drive, (n,) [N m/rad]; NaN where it is not stated."""
     effort_limit: np.ndarray | None = None
-    """Largest torque of each joint's drive, (n,) [N m]; infinite where nobody states it."""
+    """Largest torque of each joint's drive, (n,) [N m]; infinite where it is not stated."""
 
     def joint_type(self, joint: str) -> JointType:
         """Whether a joint turns or slides; what is not known turns."""
@@ -326,7 +326,7 @@ def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -
 def _with_units(
     picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str]
 ) -> tuple[dict[str, dict[str, Source]], list[str], list[str]]:
-    """Where each series comes from, notes, and units that nothing tells."""
+    """Where each series comes from, notes, and units that remain unknown."""
     groups: dict[tuple[str, str, JointType], dict[str, _Candidate]] = defaultdict(dict)
     stated: dict[str, dict[str, Channel]] = {name: {} for name in names}
     for name, by in picked.items():

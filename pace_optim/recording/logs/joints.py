@@ -31,5 +31,5 @@ def _likeness(label: str, name: str) -> float:
 
 
 def only_numbers(labels: Iterable[str]) -> bool:
-    """Whether labels tell joints by numbers alone."""
+    """Whether labels identify joints by numbers alone."""
     return all(all(word.isdigit() for word in joint_words(label)) for label in labels)

@@ -13,7 +13,7 @@ class Channel:
     """One number over time: a column, or one joint of a topic."""
 
     key: str
-    """Its name in a column map, of its own in the log."""
+    """Its name in a column map, unique in the log."""
     table: str
     """The topic or file that it stands in."""
     time: np.ndarray
@@ -21,9 +21,9 @@ class Channel:
     values: np.ndarray
     """(T,), as logged."""
     series: str = ""
-    """What the format says that it is (`dof_pos`, ...); "" where only its name can tell."""
+    """What it is by the format (`dof_pos`, ...); "" where only its name shows it."""
     joint: str = ""
-    """The joint as the format calls it; "" where only the channel's name can tell."""
+    """The joint as the format calls it; "" where only the channel's name shows it."""
 
     @property
     def rate(self) -> float:

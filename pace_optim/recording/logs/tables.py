@@ -268,7 +268,7 @@ def _beside(name: str, time: np.ndarray, other: str, values: np.ndarray) -> str:
 
 
 def _join_seconds(columns: dict[str, np.ndarray]) -> set[str]:
-    """Make whole seconds and their parts, in columns of their own, one column of nanoseconds; names of those."""
+    """Make separate columns of whole seconds and their parts one column of nanoseconds; names of those."""
     tokens = {name: re.split(r"[^a-z]+", name.lower()) for name in columns}
     joined = set()
     for part, own in tokens.items():

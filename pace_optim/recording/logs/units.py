@@ -38,7 +38,7 @@ class Known:
     joint_type: JointType = "hinge"
     """Whether it turns or slides."""
     limits: tuple[float, float] = (-np.inf, np.inf)
-    """Lower and upper limit [rad, of slides m]; infinite where there is none."""
+    """Lower and upper limit [rad, of slides m]; infinite without a limit."""
     stiffness: float = np.nan
     """kp [N m/rad]; NaN where it is not known."""
     effort_limit: float = np.inf
@@ -161,7 +161,7 @@ def _nearer(ratio: float, whole: str, small: str) -> str:
 def _like_others(name: str, channels: Mapping[str, Channel], units: Mapping[str, str], small: str) -> str:
     """The unit of a joint whose numbers fit both, beside joints in the smaller one: their encoders are alike.
 
-    "" where its noise does not tell.
+    "" where its noise does not show it.
     """
     own = channels[name]
     if np.ptp(own.values) < _STILL:
@@ -186,7 +186,7 @@ def _of_commands(
     of_positions: Mapping[str, str],
     joint_type: JointType,
 ) -> tuple[dict[str, str], list[str]]:
-    """A joint moves as far as its command; one that stands is told in the unit of its position."""
+    """A joint moves as far as its command; the command of one that stands has the unit of its position."""
     whole, small = _POSITIONS[joint_type]
     units = {}
     for name, channel in channels.items():

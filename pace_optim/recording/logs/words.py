@@ -64,7 +64,7 @@ _NO_QUANTITY = {
     "goal", "ref", "reference", "setpoint", "sp", "set", "actual", "act", "measured", "meas", "present", "feedback",
     "fb", "encoder", "enc",
 }  # fmt: skip
-"""Words that are said of positions where no quantity is."""
+"""Words for positions in names without a quantity."""
 _POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular"}
 _VELOCITY = {"vel", "velocity", "velocities", "dq", "qd", "qvel", "speed", "speeds", "omega", "qdot", "rate"}
 _EFFORT = {
@@ -129,7 +129,7 @@ def words(name: str) -> list[str]:
 
 
 def joint_words(name: str) -> tuple[str, ...]:
-    """The words that tell a joint from others."""
+    """The words that identify a joint."""
     found = tuple(word for word in words(name) if word not in _GENERIC)
     return found or tuple(words(name))
 
@@ -139,7 +139,7 @@ def meaning(name: str, table: str = "") -> Meaning:
 
     Args:
         name: The column's name.
-        table: What names the topic or file, in which a command may be told.
+        table: What names the topic or file, in which a command may be named.
     """
     unit, of_unit, without_unit = _unit(name)
     own, around = words(name), words(table)

@@ -50,7 +50,7 @@ def strong_pairs(labels: list[str], matrix: list[list[float | None]]) -> list[tu
 
 
 def _in_sentences(pairs: list[tuple[float, str, str]], labels: list[str]) -> list[str]:
-    """Pairs in words; the same two parameters of one joint are said once for all joints."""
+    """Pairs in words; the same two parameters of one joint come once for all joints."""
     groups: dict[tuple[str, ...], list[tuple[float, str]]] = {}
     for value, a, b in pairs:
         (name_a, key_a), (name_b, key_b) = a.split("/", 1), b.split("/", 1)

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import in_words, listed, size_text, three_figures
+from pace_actuators.text import in_words, listed, sizes_by_joints, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
@@ -57,21 +57,15 @@ def _unit(content: dict[str, Any]) -> str:
 
 def _sizes(content: dict[str, Any]) -> Markup:
     """How large what was found is."""
-    sizes = content.get("sizes")
+    sizes = sizes_by_joints(content.get("sizes", []))
     if not sizes:
         return Markup("")
     likes = content.get("likes", {})
     rows = [
-        [
-            bold(size["effect"]),
-            size["parameter"].replace("_", " "),
-            size["joint"],
-            size_text(size),
-            ", ".join(likes.get(size["effect"], [])) or "–",
-        ]
-        for size in sizes
+        [bold(effect), parameter.replace("_", " "), listed(joints), text, ", ".join(likes.get(effect, [])) or "–"]
+        for (effect, parameter, text), joints in sizes.items()
     ]
-    head = ["effect", "parameter", "joint", "size ± standard deviation", "cannot be separated from"]
+    head = ["effect", "parameter", "joints", "size ± standard deviation", "cannot be separated from"]
     return _titled("How large it is", table(head, rows))
 
 
@@ -89,7 +83,11 @@ def _ladder(content: dict[str, Any]) -> Markup:
         rows.append([model, three_figures(factor * error), gain])
         before = error
     rows.append(["floor of noise and numerics", three_figures(factor * floor), ""])
-    head = ["model, each joint simulated alone", f"validation [{unit}]", "× better than before"]
+    head = [
+        "whole robot" if "run" in steps[0] else "model, each joint simulated alone",
+        f"validation [{unit}]",
+        "× better than before",
+    ]
     return _titled("The error with it", table(head, rows, "ladder"))
 
 
@@ -102,7 +100,7 @@ def _ranking(content: dict[str, Any]) -> Markup:
         return _titled("Effects", html("<p>No effect was worth a refit.</p>") + tried)
     factor, unit = _FACTOR, _unit(content)
     chart = _chart(entries[:_SHOWN], _floor(content), factor, unit)
-    about = "refitted one at a time, judged on recordings that were not fitted"
+    about = "each joint simulated alone, refitted one effect at a time, judged on recordings that were not fitted"
     return _titled("Effects", chart + _evidence(entries, factor, unit) + tried, about)
 
 
@@ -180,7 +178,10 @@ def _joints(content: dict[str, Any]) -> Markup:
         ]
         for (name, joint), own in zip(joints.items(), types, strict=True)
     ]
-    return _titled("Joint by joint", table(["joint", f"before [{_unit(content)}]", "after", "floor", "effects"], rows))
+    about = "each joint simulated alone, validation error"
+    return _titled(
+        "Joint by joint", table(["joint", f"before [{_unit(content)}]", "after", "floor", "effects"], rows), about
+    )
 
 
 def _error_map(content: dict[str, Any]) -> Markup:

@@ -10,17 +10,15 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import capitalised, duration, position_text, position_unit, pretty_unit, three_figures
+from pace_actuators.text import SHOWN, capitalised, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
+from pace_optim.run.summary import next_line
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
-from .verdict import verdict_first
+from .verdict import headline, verdict_first
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
-
-_WARNINGS = 6
-"""Warnings that are shown at once; a click shows the others."""
 
 
 def overview(run: RunData) -> Section:
@@ -28,12 +26,13 @@ def overview(run: RunData) -> Section:
     result = run.result
     head = html(
         '<p class="eyebrow">{{ robot }} · {{ task }} · {{ folder }}</p><h1>{{ headline }}</h1>'
-        '<p class="lead">{{ verdict }}</p>',
+        '<p class="lead">{{ verdict }}</p>{% if next %}<p>Next: <code>{{ next }}</code></p>{% endif %}',
         robot=result.robot_name,
         task=result.task,
         folder=run.folder.resolve().name,
-        headline=_headline(result),
+        headline=headline(run) or _plain_headline(result),
         verdict=_verdict(run),
+        next=_next(run),
     )
     return Section(
         id="overview",
@@ -42,7 +41,14 @@ def overview(run: RunData) -> Section:
     )
 
 
-def _headline(result: FitResult) -> str:
+def _plain_headline(result: FitResult) -> str:
+    """Without a diagnosis: how far the error is above the noise, where that says that physics is missing."""
+    if result.std_means_nothing and result.times_noise:
+        return f"{result.times_noise:,.0f} times the noise: physics is missing"
+    return _follows(result)
+
+
+def _follows(result: FitResult) -> str:
     error = result.rmse.get("validation", {}).get(ALL)
     if error is not None:
         return f"The simulation follows the robot to {_of_all(result, error)} on data it was not fitted to"
@@ -60,7 +66,7 @@ def _verdict(run: RunData) -> str:
     held_out = run.result.rmse.get("validation", {}).get(ALL)
     share = _share_of_motion(run, held_out is not None)
     part = "" if share is None else f", {_percent(share)} of how far they move"
-    sentences = [f"That is the root mean square over all joints{part}."]
+    sentences = [f"{_follows(run.result)}: the root mean square over all joints{part}."]
     if held_out is None:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
     else:
@@ -72,6 +78,12 @@ def _verdict(run: RunData) -> str:
     if last.startswith(_STOPPED_EARLY):
         sentences.append(f"The fit was stopped before it had converged ({last}): going on may lower the error.")
     return " ".join(sentences)
+
+
+def _next(run: RunData) -> str:
+    """The command that comes next, where nothing was diagnosed."""
+    lines = [] if run.read_json("diagnosis.json") else next_line(run.result, run.folder.resolve())
+    return "".join(lines).removeprefix("next: ")
 
 
 def _percent(share: float) -> str:
@@ -116,9 +128,12 @@ def _figures(result: FitResult) -> Markup:
         ("Score", f"{result.score:.2e}", units_for("rad², sum over the joints", result.joint_types)),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
+    if result.times_noise and train:
+        times = "0.1 times or less" if result.times_noise < 0.1 else f"{result.times_noise:.3g} times"
+        figures.insert(2, ("Noise", said(train / result.times_noise), f"the training error is {times} that"))
     if result.objective:
         own, kept = ("–" if part is None else f"{part:.2e}" for part in map(result.objective.get, _PARTS))
-        figures.insert(5, ("Objective", own, f"in training, {kept} in validation"))
+        figures.insert(-1, ("Objective", own, f"in training, {kept} in validation"))
     return html(
         '<dl class="figures">{% for name, value, about in figures %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd>'
         "<dd class='small'>{{ about }}</dd></div>{% endfor %}</dl>",
@@ -133,7 +148,7 @@ def _warnings(result: FitResult) -> Markup:
         return html('<div class="callout good"><h3>No warnings</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
     sentences = [_sentence(text) for text in result.warnings]
-    most = _WARNINGS if count > _WARNINGS + 1 else count  # one more takes no more room than its heading would
+    most = SHOWN if count > SHOWN + 1 else count  # one more takes no more room than its heading would
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
         said += folded(len(rest), bullets(rest))

@@ -95,7 +95,7 @@ def samples_to_draw(curves: tuple[np.ndarray, ...], most: int) -> np.ndarray:
         most: About how many samples to keep.
 
     Returns:
-        Sorted indices; all of them if there are no more than ``most``.
+        Sorted indices; all of them if there are at most ``most``.
     """
     count = len(curves[0])
     if count <= most:

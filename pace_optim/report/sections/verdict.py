@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pace_actuators.text import in_words, size_text
+from pace_actuators.text import capitalised, conjoined, in_words, listed, sizes_by_joints
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
@@ -38,8 +38,11 @@ def _in_short(run: RunData) -> Markup:
     content = run.read_json("diagnosis.json")
     if not content:
         return Markup("")
-    sizes = content.get("sizes", [])
-    said = [f"{size['effect']} {size['parameter']} of {size['joint']}: {size_text(size)}" for size in sizes[:_SHOWN]]
+    sizes = [
+        f"{effect} {parameter} of {listed(joints, 6)}: {text}"
+        for (effect, parameter, text), joints in sizes_by_joints(content.get("sizes", [])).items()
+    ]
+    said = sizes[:_SHOWN]
     if len(sizes) > _SHOWN:
         said.append(f"and {len(sizes) - _SHOWN} more")
     said += [
@@ -50,12 +53,32 @@ def _in_short(run: RunData) -> Markup:
     return callout(content, run.result, joined(more))
 
 
-def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") -> Markup:
-    """What is missing, and how to add it to a run, unless that has it."""
+def headline(run: RunData) -> str:
+    """The verdict for the top of the page: "Missing: Stribeck friction at LF_KFE and RF_KFE"; else ""."""
+    with run.blaming("diagnosis.json"):
+        content = run.read_json("diagnosis.json")
+        return _headline(content, run.result) if content else ""
+
+
+def _headline(content: dict[str, Any], run: FitResult) -> str:
+    css, heading, has_it = _heading(content, run)
+    names = [f"{' and '.join(link['parts'])} of the link {link['link']}" for link in content.get("links", [])]
+    for effect in dict.fromkeys(label.partition("@")[0] for label in content["added"]):
+        joints = [name for name, joint in content["joints"].items() if effect in joint["effects"]]
+        where = listed(joints) if len(joints) <= _SHOWN else f"{len(joints)} joints"
+        names.append(f"{effect.replace('_', ' ')} at {where}" if joints else effect)
+    if css == "bad" or not names:
+        return heading
+    begin = heading if has_it else "Missing" if content["added"] else "Wrong in the model file"
+    return f"{begin}: {capitalised(conjoined(names))}"
+
+
+def _heading(content: dict[str, Any], run: FitResult) -> tuple[str, str, bool]:
+    """Class and words of a verdict's heading, and whether the run has what was missing."""
     css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
     effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
-    links = {link["label"]: link for link in content.get("links", [])}
-    found = {(value["parameter"], link["link"]) for link in links.values() for value in link["values"]}
+    links = content.get("links", [])
+    found = {(value["parameter"], link["link"]) for link in links for value in link["values"]}
     sought = {(name, key) for name, values in run.parameters.items() for key in values}
     has_it = bool(effects or links) and set(effects) <= set(run.effects) and found <= sought
     if has_it and content["verdict"] in ("effect", "link"):
@@ -65,6 +88,14 @@ def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") ->
         css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
     elif content["verdict"] not in ("nothing_missing", "link") and effects and (not content["added"] or part < _PARTLY):
         css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
+    return css, heading, has_it
+
+
+def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") -> Markup:
+    """What is missing, and how to add it to a run, unless that has it."""
+    css, heading, has_it = _heading(content, run)
+    effects = content.get("paying") or content["added"]
+    links = [link["label"] for link in content.get("links", [])]
     return html(
         '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
         "fit with it.</p>{% elif effects or links %}<p>{{ why }}: <code>{{ command }} …"

@@ -62,7 +62,7 @@ def test_what_a_run_says_is_escaped(tmp_path):
     assert "alert(1)</script>" not in write_report(folder).read_text("utf-8")
 
 
-@pytest.mark.parametrize(("count", "folded"), [(6, 0), (7, 0), (8, 2)])
+@pytest.mark.parametrize(("count", "folded"), [(3, 0), (4, 0), (5, 2)])
 def test_many_warnings_do_not_hide_the_page(tmp_path, count, folded):
     result = make_result(warnings=[f"warning {i} of many" for i in range(count)])
     html = write_report(write_run(tmp_path / "run", result)).read_text("utf-8")

@@ -121,7 +121,7 @@ class VelocityFilter(HiddenEffect):
 
 @hidden
 class IntegralGain(HiddenEffect):
-    """An integrator nobody speaks of: torque += ki ∫ error dt, the integral's torque within ± limit."""
+    """An undocumented integrator: torque += ki ∫ error dt, the integral's torque within ± limit."""
 
     name = "integral_gain"
     draws = draws_of(

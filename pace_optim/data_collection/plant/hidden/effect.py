@@ -136,7 +136,7 @@ def effect_named(name: str) -> type[HiddenEffect]:
     """The effect of a name.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If it does not exist.
     """
     if name not in EFFECTS:
         close = difflib.get_close_matches(name, EFFECTS, n=1, cutoff=0.4)

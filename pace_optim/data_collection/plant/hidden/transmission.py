@@ -97,7 +97,7 @@ class Backlash(HiddenEffect):
 
 @hidden
 class MountCompliance(HiddenEffect):
-    """The base turns on a spring and damper: k, c and an inertia of its own, about each axis of rotation."""
+    """The base turns on a spring k and a damper c, with an inertia, about each axis of rotation."""
 
     name = "mount_compliance"
     draws = draws_of(

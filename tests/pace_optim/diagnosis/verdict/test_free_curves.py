@@ -230,7 +230,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     said = summary_of(found, robot)
     assert said.startswith(
         "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
-        "friction_over_speed@b. With all of it"
+        "friction_over_speed@b. On held-out recordings all of it"
     )
     monkeypatch.setattr("pace_optim.diagnosis.findings.advice.next_experiments", lambda *_: [])
     monkeypatch.setattr("pace_optim.diagnosis.findings.advice.drive_in_force", lambda _: {})

@@ -289,7 +289,7 @@ def test_no_effect_is_put_first_where_none_dominates(bench):
     found = told_of(outcome, "effect", {QUADRATIC: 0.4, gain: 0.35, STRIBECK: 0.25})
     assert summary_of(found, bench.problem).startswith(
         "Missing: several effects, none of which dominates: quadratic_friction (40 %), torque_gain (35 %), "
-        "stribeck_friction (25 %). With"
+        "stribeck_friction (25 %). On held-out"
     )
     found = told_of(outcome, "effect", {QUADRATIC: 0.9974, gain: 0.0026, STRIBECK: 0.0})
     assert "quadratic_friction (100 %), torque_gain (0.3 %), stribeck_friction (below 0.1 %)" in summary_of(

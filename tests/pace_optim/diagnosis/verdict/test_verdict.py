@@ -81,14 +81,14 @@ def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
 
 def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
     folder, refit = write_run(tmp_path / "run"), write_run(tmp_path / "refit")
-    content = make_diagnosis() | {"sizes": [SIZE] * 6, "likes": {"torque_gain": ["payload"]}}
+    content = make_diagnosis() | {"sizes": [SIZE | {"joint": f"joint_{i}", "value": i, "factor": None} for i in range(6)], "likes": {"torque_gain": ["payload"]}}
     content["runs"] = [str(folder), str(refit)]
     for each in (folder, refit):
         write_json(each / "diagnosis.json", content)
     pages = [page_of(each) for each in (folder, refit)]
     for page in pages:
         first = page.text.split("Error of each joint")[0]
-        assert "An effect is missing, and it is known" in first and "0.45 ± 0.002 times what was stated" in first
+        assert "An effect is missing, and it is known" in first and "of joint_3: 3 ± 0.002" in first
         assert "and 2 more" in first and "torque_gain cannot be separated from payload" in first
     html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]

@@ -131,9 +131,9 @@ def test_warnings_are_one_for_each_kind_and_what_does_not_carry_over_comes_first
         indistinguishable=(("encoder_bias/servo", "friction/servo"), ("encoder_bias/servo", "friction/servo")),
     )
     told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"], ["friction/servo"])
-    assert "59.0 times" in told[0] and "at its" in told[1]
-    assert told[2].startswith("Delay cannot be identified from these recordings:")
-    assert told[3].startswith("Friction of servo is barely identified")
+    assert "59.0 times" in told[0] and told[1].startswith("At a bound: friction (")
+    assert told[2].startswith("Not identified by these recordings: delay.")
+    assert told[3].startswith("Barely identified by these recordings: friction of servo.")
     assert sum("cannot separate" in text for text in told) == 1
 
 

@@ -61,7 +61,7 @@ def test_a_frozen_encoder_is_told_with_its_time(tmp_path):
     assert f"{held[0] * inputs.CONTROL_DT:.4g} to {(held[-1] + 1) * inputs.CONTROL_DT:.4g} s" in found.text
 
 
-def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path, capsys):
+def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path):
     inputs.problem_of(inputs.make("swapped", 0), tmp_path)
     task = use_task(str(tmp_path / "robot.xml"))
     settings = FitSettings(task=task, data=[str(tmp_path / "log.npz")])
@@ -70,14 +70,11 @@ def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path
     settings.trust_log = True
     problem = load_for_fit(settings, load_env_cfg(task))
     assert "are swapped" in " ".join(problem.contradictions)
-    assert capsys.readouterr().err.count("are swapped") == 1
 
 
 def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
     problem = inputs.problem_of(inputs.make("limit", 0), tmp_path)
-    told = []
-    assert "--unknown effort_limit" in " ".join(checked(problem, tell=told.append).contradictions)
-    assert told and all(text.startswith("warning: ") for text in told)
+    assert "--unknown effort_limit" in " ".join(checked(problem).contradictions)
 
 
 def test_every_bound_is_kept_and_little_is_lost_by_it():
