@@ -34,8 +34,8 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
-"""What the stages' names begin with on the way of another loop, and at a finer step."""
+OTHER_LOOP, FINER_STEP, TORQUE_NOISE = "loop of {:g} s, ", "step of {:g} s, ", "torque noise, "
+"""What the stages' names begin with on the way of another loop, at a finer step, and by the noise that torques have."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _STEP_IN_DOUBT = 1.3
@@ -158,6 +158,20 @@ class Optimization:
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
+    def _elsewhere(self, best: Descent) -> WayDown | None:
+        """The way of other facts, begun at the best end on pieces: another loop rate, the noise that torques have."""
+        way = self._with_other_loop(best)
+        if self.problem.dataset.torques is None:
+            return way
+        if way is not None:
+            best = min(way.descents, key=lambda d: d.score)
+        pieces = self._in_use.way.pieces
+        residuals = pieces.residuals(self.problem.space.to_physical(best.x)[None])
+        course = self._course(self.problem.with_torque_noise(residuals.torque_rms(pieces.dataset)), TORQUE_NOISE)
+        course.way.begin([best.x])
+        self._use(course)
+        return course.way
+
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
         problem, noise = self.problem, noise_score(self.problem)
@@ -244,7 +258,7 @@ class Optimization:
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)
-            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._with_other_loop)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])

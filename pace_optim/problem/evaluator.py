@@ -9,20 +9,17 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_envs.tasks.pace import TORQUE_LAG, TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset
-from pace_optim.recording.noise import noise_variance
+from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
 _WIDEST = 512
-
-
-_LEAST_NOISE = 1e-7
-"""Noise that a prior is weighed by where recordings have less [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,18 +58,54 @@ class Prior:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """Errors q_sim - bias - q_measured of m candidates at K steps of R recordings and n joints."""
+    """Errors q_sim - bias - q_measured of m candidates at K steps of R recordings and n joints.
+
+    Where torques are followed too, R more columns have their errors, s τ_sim + o - τ_measured, times
+    :attr:`~pace_optim.recording.dataset.Torques.weight`: all that looks at columns weighs both by their noise.
+    """
 
     error: torch.Tensor
-    """(m, K, R, n) [rad]; zero where a recording has no sample."""
+    """(m, K, R or 2 R, n) [rad]; zero where a recording has no sample."""
     where: torch.Tensor
-    """Where there is a sample, (K, R) bool."""
+    """Where there is a sample, (K, R or 2 R) bool."""
     step: torch.Tensor
     """Control step of each of the K steps, (K,)."""
     weight: torch.Tensor | None = None
     """What errors were multiplied by, (K, R, n): see :attr:`~pace_optim.recording.dataset.Dataset.weight`."""
     prior: Prior | None = None
     """Of the candidates; ``None``: no parameter has one."""
+    with_torques: bool = False
+    """Whether the second half of the columns are torques."""
+
+    @property
+    def num_recordings(self) -> int:
+        """R."""
+        return self.where.shape[1] // (1 + self.with_torques)
+
+    @property
+    def positions(self) -> Residuals:
+        """Without torques."""
+        count = self.num_recordings
+        return replace(self, error=self.error[:, :, :count], where=self.where[:, :count], with_torques=False)
+
+    def torque_rms(self, dataset: Dataset, where: torch.Tensor | None = None) -> torch.Tensor:
+        """Root mean square error of the first candidate's torques, (n,) [N m]; 0 where none is followed.
+
+        Args:
+            dataset: Whose residuals these are.
+            where: Which of their samples count, (K, R) bool; ``None``: all.
+        """
+        torques, count = dataset.torques, self.num_recordings
+        if torques is None or not self.with_torques:
+            return torch.zeros(self.error.shape[-1], dtype=torch.float64)
+        known = torques.known[self.step] & self.where[:, count:, None]
+        known = known if where is None else known & where[..., None]
+        square = (self.error[0, :, count:].square() * known).sum(dim=(0, 1)) / known.sum(dim=(0, 1)).clamp(min=1)
+        return torch.where(torques.weight > 0, square.sqrt() / torques.weight.clamp(min=1e-300), 0.0)
+
+    def columns_of(self, recording: int) -> list[int]:
+        """Columns of a recording: its positions, and its torques."""
+        return list(range(recording, self.where.shape[1], self.num_recordings))
 
     def rows(self, begin: int, end: int) -> Residuals:
         """Those of some of the candidates."""
@@ -247,18 +280,45 @@ class Evaluator:
         rollout.start(physical, mask, initial_offset=initial_offset)
         bias = rollout.physical[:, self.space["encoder_bias"]]
         m, count, n = len(physical), data.num_recordings, bias.shape[1]
-        error = rollout.positions(step).sub_(bias)
+        sensor = self._sensor(rollout)
+        if sensor is None:
+            shown, torque = rollout.positions(step), None
+        else:
+            scale, offset, lag = sensor
+            shown, torque = rollout.positions_and_torques(step, lag)
+            torque.mul_(scale).add_(offset)
+        error = shown.sub_(bias)
         error.view(len(step), m, count, n).sub_(rollout.dataset.measured[step][:, None])
         kept = mask[step]
         error = error.to("cpu", torch.float64).view(len(step), m, count, n)
         if not bool(kept.all()):
             error.mul_(kept[:, None, :, None])
         error = error.permute(1, 0, 2, 3)
+        if torque is not None and data.torques is not None:
+            off, known = data.torques.error(torque.view(len(step), m, count, n), step)
+            known &= kept[..., None]
+            off = torch.where(known[:, None], off, 0.0).permute(1, 0, 2, 3)
+            where = torch.cat([kept, known.any(dim=2)], dim=1)
+            both = torch.cat([error, off], dim=2)
+            return Residuals(error=both, where=where, step=step, prior=self._prior(physical), with_torques=True)
         if data.weight is None or self.phases is None:
             return Residuals(error=error, where=kept, step=step, prior=self._prior(physical))
         weight = data.weight[step]
         error = self.phases.taken_out(error, step, mask).mul_(weight)
         return Residuals(error=error, where=kept, step=step, weight=weight, prior=self._prior(physical))
+
+    def _sensor(self, rollout: Rollout) -> list[torch.Tensor] | None:
+        """Scale, offset [N m] and lag [control steps] of torques that are followed, (num_envs, n) each; or none are."""
+        if self.dataset.torques is None or TORQUE_LAG not in self.space.slices:
+            return None
+        parameter = next(p for p in self.space.parameters if p.name == TORQUE_LAG)
+        names = self.dataset.recordings[0].joint_names
+        joints, result = [names.index(key) for key in parameter.keys], []
+        for name, usual in ((TORQUE_SCALE, 1.0), (TORQUE_OFFSET, 0.0), (TORQUE_LAG, 0.0)):
+            values = torch.full((len(rollout.physical), len(names)), usual, dtype=rollout.physical.dtype)
+            values[:, joints] = rollout.physical[:, self.space[name]]
+            result.append(values)
+        return result
 
     def _prior(self, physical: torch.Tensor) -> Prior | None:
         """What is known of candidates (m, size) beforehand."""
@@ -268,7 +328,7 @@ class Evaluator:
         if self._noise is None:
             recordings = self.dataset.recordings
             trained = [recordings[r] for r in self.dataset.trained()] or recordings
-            self._noise = max(noise_variance(trained), _LEAST_NOISE**2)
+            self._noise = max(noise_variance(trained), LEAST_NOISE**2)
         x = self.space.to_normalised(physical.to("cpu", torch.float64))
         return Prior(x=x, precision=std.pow(-2), noise=self._noise)
 

@@ -60,6 +60,8 @@ class FitResult(DriveResult):
     """What the torque in the recordings says of each drive, by joint and recording."""
     contested: list[str] = field(default_factory=list)
     """Facts that are stated and that the torque in a recording contradicts."""
+    torque_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]; empty: it follows none."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
@@ -135,11 +137,17 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     """Root mean square error of each joint and of all, over a (K, R) part of the samples [rad]; empty if none."""
     if not bool(where.any()):
         return {}
-    square = residuals.error[0].square()[where].mean(dim=0)
+    square = residuals.positions.error[0].square()[where].mean(dim=0)
     return {
         **{name: math.sqrt(value) for name, value in zip(joint_names, square.tolist(), strict=True)},
         ALL: math.sqrt(float(square.mean())),
     }
+
+
+def _torque_rmse(residuals: Residuals, problem: Problem, where: torch.Tensor) -> dict[str, float]:
+    """Root mean square error of each torque that is followed, over a (K, R) part of the samples [N m]."""
+    values = residuals.torque_rms(problem.dataset, where).tolist()
+    return {joint: value for joint, value in zip(problem.joint_names, values, strict=True) if value > 0}
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
@@ -229,7 +237,7 @@ def make_result(
     data, space = problem.dataset, problem.space
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
-    trained = residuals.error[0].square()[train]
+    trained = residuals.positions.error[0].square()[train]
     if facts.get("std_means_nothing"):  # then the file has none
         uncertainty = uncertainty.without_error_bars()
     values, std = space.to_dict(physical), by_parameter(space, uncertainty.std)
@@ -256,6 +264,9 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
+        torque_rmse={} if data.torques is None else {
+            "train": _torque_rmse(residuals, problem, train), "validation": _torque_rmse(residuals, problem, validation)
+        },
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
         findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),
@@ -271,5 +282,5 @@ def make_result(
 
 def assumptions(problem: Problem) -> list[str]:
     """What a fit assumes of the robot, and how its recordings were read, in sentences."""
-    of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes]
+    of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes, *problem.torque_notes]
     return [*of_robot, *notes_by_kind(problem.dataset.recordings)]

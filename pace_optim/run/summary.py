@@ -28,6 +28,11 @@ def summary(result: FitResult) -> list[str]:
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))
+    if result.torque_rmse:
+        parts = [result.torque_rmse[which] for which in ("train", "validation")]
+        each = [f"{j} {' / '.join(f'{own[j]:.2g}' if j in own else '-' for own in parts)}" for j in parts[0]]
+        units = [units_for("N m", [result.joint_type(j)]) for j in parts[0]]
+        lines.append(f"error of torques: {', '.join(f'{e} {u}' for e, u in zip(each, units, strict=True))}")
     if result.objective:
         parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
         lines.append(f"objective {result.optimizer}: {parts} (train / validation)")

@@ -25,6 +25,12 @@ if TYPE_CHECKING:
 
 GLOBAL = ALL
 """The key of a parameter that all joints share."""
+TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG = "torque_scale", "torque_offset", "torque_lag"
+"""Parameters of a sensor of torques."""
+TORQUE_SCALE_STD = 0.1
+"""Standard deviation of the scale's prior: motors' torque constants are known to a tenth."""
+_TORQUE_SCALE = 5.0
+"""How far from 1 a scale is sought, both ways."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +195,32 @@ def link_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     return tuple(result)
 
 
+def torque_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
+    """Of sensors of torques that a fit follows: scale s, offset o and lag l of what they show, s τ(t - l) + o."""
+    sensors = cfg.torque_sensors
+    joints = tuple(joint for joint in cfg.joint_order if joint in sensors)
+    if not joints:
+        return ()
+
+    def parameter(name: str, unit: str, bounds: Sequence[tuple[float, float, float]], **more: Any) -> Parameter:
+        lower, start, upper = zip(*bounds, strict=True)
+        units = _units(unit, joints, cfg)
+        return Parameter(
+            name=name, unit=unit, lower=lower, upper=upper, start=start, keys=joints, units=units, apply=_of_a_sensor,
+            **more,
+        )  # fmt: skip
+
+    prior = math.log1p(TORQUE_SCALE_STD) / math.log(_TORQUE_SCALE)
+    scale = [(1 / _TORQUE_SCALE, 1.0, _TORQUE_SCALE)] * len(joints)
+    offset = [(-sensors[j].offset_bound, sensors[j].offset, sensors[j].offset_bound) for j in joints]
+    lag = [(*sensors[j].lag_bounds[:1], sensors[j].lag, *sensors[j].lag_bounds[1:]) for j in joints]
+    return (
+        parameter(TORQUE_SCALE, "1", scale, scale="log", prior=prior),
+        parameter(TORQUE_OFFSET, "N m", offset),
+        parameter(TORQUE_LAG, "control steps", lag),
+    )
+
+
 def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[str]) -> tuple[Reference, ...]:
     """The links whose inertial parameters are to be identified.
 
@@ -233,6 +265,10 @@ def _apply_effect(
     env: ManagerBasedEnv, values: torch.Tensor, *, effect: str, parameter: str, joint_ids: list[int]
 ) -> None:
     env.scene["robot"].write_effect_parameter_to_sim(effect, parameter, values, joint_ids)
+
+
+def _of_a_sensor(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    """Nothing: what a sensor shows does not move the robot."""
 
 
 def _apply_link(env: ManagerBasedEnv, values: torch.Tensor, *, references: Sequence[Reference], name: str) -> None:

@@ -125,10 +125,10 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
 def _of_recording(there: Jacobian, r: int) -> Jacobian:
     """Residuals and derivatives of one of the recordings."""
     whole = there.residuals
-    at = whole.where[:, r]
-    error, where = whole.error[:, at, r : r + 1], whole.where[at, r : r + 1]
-    own = Residuals(error=error, where=where, step=whole.step[at], prior=whole.prior)
-    return replace(there, residuals=own, columns=there.columns[:, at, r : r + 1])
+    at, columns = whole.where[:, r], whole.columns_of(r)
+    error, where = whole.error[:, at][:, :, columns], whole.where[at][:, columns]
+    own = replace(whole, error=error, where=where, step=whole.step[at], weight=None)
+    return replace(there, residuals=own, columns=there.columns[:, at][:, :, columns])
 
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:
