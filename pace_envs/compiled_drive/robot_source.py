@@ -46,12 +46,12 @@ are those of ``Simulation._leap``, else 0; environments and recordings; the cont
 ``last`` that it takes, and the one at which joints are only shown; how many steps commands last; to which row of
 ``out`` each step is shown (-1: none); series (names, steps, recordings, joints); the drives' memory and the forces of
 gravity and motion of each environment; room for the forces applied and the damping before a step (environments, 2, nv);
-what is shown (rows, environments, joints), unless it is 0 the motors' torques there (the same), and unless it is 0 MuJoCo's positions and speeds there (rows, environments,
-nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9),
-where its specific force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with
-(environments, 12 nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints,
-2; NaN: free), and what is added to them (environments, joints, 2). Then the leaves of each drive, each with the memory
-of its delays behind it."""
+what is shown (rows, environments, joints), unless it is 0 the motors' torques there (the same), and unless it is 0
+MuJoCo's positions and speeds there (rows, environments, nq + nv). Unless it is 0, the motion of a base that moves
+(commands, physics steps of a control step, recordings, 9), where its specific force was measured (recordings, 3), what
+is added to that (environments, 3), and room to compute with (environments, 12 nbody); unless it is 0, positions and
+speeds at which joints are held (commands, recordings, joints, 2; NaN: free), and what is added to them (environments,
+joints, 2). Then the leaves of each drive, each with the memory of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <string.h>\n" + PRELUDE

@@ -72,7 +72,7 @@ def main() -> None:
         default=[],
         choices=RESIDUALS,
         metavar="NAME",
-        help="what is fitted: position, or position effort with the measured torques too (default: with them where they "
+        help="what is fitted: position, or position effort with the measured torques too (default: with them if they "
         "are good)",
     )
     parser.add_argument(

@@ -115,7 +115,7 @@ class Recording:
     sample_offset: np.ndarray | None = None
     """By how much later than that each of these samples was taken, (T,) [control steps]."""
     effort_offset: np.ndarray | None = None
-    """By how much later than its sample each `dof_effort` was measured, (T,) [control steps]; None: at the same time."""
+    """By how much later than its sample each `dof_effort` was measured, (T,) [control steps]; None: with it."""
     command: np.ndarray | None = None
     """Commanded positions on the control grid, ((T - 1) * sample_stride + 1, n) [rad]; None until conformed.
 

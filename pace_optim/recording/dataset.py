@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -12,8 +12,8 @@ import torch
 
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
-from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion
+from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
 from pace_optim.recording.torque import TorqueChannel
@@ -100,12 +100,13 @@ class Torques:
             torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64)
             for own in (channel.noise, channel.floor)
         )
+        variance = noise_variance([dataset.recordings[r] for r in dataset.trained()])
         return cls(
             measured=measured,
             known=known,
             noise=torch.zeros_like(noise),
             floor=torch.maximum(floor, _LEAST_TORQUE_NOISE * size.sqrt()),
-            position_noise=max(noise_variance([dataset.recordings[r] for r in dataset.trained()]), LEAST_NOISE**2) ** 0.5,
+            position_noise=max(variance, LEAST_NOISE**2) ** 0.5,
             after=after.floor() if held else after,
         ).with_noise(noise)
 
@@ -128,8 +129,8 @@ class Torques:
 
     def at(self, step: Any, recording: Any) -> Torques:
         """Those of some control steps and recordings, by index."""
-        parts = (each[step, recording] for each in (self.measured, self.known, self.after))
-        return replace(self, **dict(zip(("measured", "known", "after"), parts, strict=True)))
+        known, after = self.known[step, recording], self.after[step, recording]
+        return replace(self, measured=self.measured[step, recording], known=known, after=after)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

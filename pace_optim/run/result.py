@@ -264,8 +264,11 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
-        torque_rmse={} if data.torques is None else {
-            "train": _torque_rmse(residuals, problem, train), "validation": _torque_rmse(residuals, problem, validation)
+        torque_rmse={}
+        if data.torques is None
+        else {
+            "train": _torque_rmse(residuals, problem, train),
+            "validation": _torque_rmse(residuals, problem, validation),
         },
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),

@@ -29,10 +29,7 @@ def summary(result: FitResult) -> list[str]:
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))
     if result.torque_rmse:
-        parts = [result.torque_rmse[which] for which in ("train", "validation")]
-        each = [f"{j} {' / '.join(f'{own[j]:.2g}' if j in own else '-' for own in parts)}" for j in parts[0]]
-        units = [units_for("N m", [result.joint_type(j)]) for j in parts[0]]
-        lines.append(f"error of torques: {', '.join(f'{e} {u}' for e, u in zip(each, units, strict=True))}")
+        lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
         parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
         lines.append(f"objective {result.optimizer}: {parts} (train / validation)")
@@ -42,6 +39,16 @@ def summary(result: FitResult) -> list[str]:
     )
     lines += [f"note: {finding}" for finding in result.findings]
     return lines + [f"warning: {warning}" for warning in result.warnings]
+
+
+def _torque_errors(result: FitResult) -> list[str]:
+    """Errors of torques that the fit follows, joint by joint."""
+    train, validation = (result.torque_rmse[part] for part in ("train", "validation"))
+    return [
+        f"{joint} {value:.2g} / {f'{validation[joint]:.2g}' if joint in validation else '-'} "
+        f"{units_for('N m', [result.joint_type(joint)])}"
+        for joint, value in train.items()
+    ]
 
 
 def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:

@@ -16,7 +16,6 @@ from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 

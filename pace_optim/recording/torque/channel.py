@@ -56,7 +56,9 @@ def torque_channel(
         if asked:
             raise ValueError("--residual effort needs measured torques (dof_effort), and no recording has any.")
         return TorqueChannel()
-    noise, out, known = {}, {}, {}
+    noise: dict[str, float] = {}
+    known: dict[str, list[MeasuredLaw]] = {}
+    out: dict[str, list[str]] = {}
     for joint in recordings[0].joint_names:
         laws = list(measured.laws.get(joint, {}).values())
         reason = why_not or _why_not(joint, laws, measured, asked)
@@ -65,7 +67,9 @@ def torque_channel(
         else:
             noise[joint], known[joint] = max(law.residual for law in laws), laws
     if asked and not noise:
-        raise ValueError(f"--residual effort: no torque can be followed: {'; '.join(out)}. Fit with --residual position.")
+        raise ValueError(
+            f"--residual effort: no torque can be followed: {'; '.join(out)}. Fit with --residual position."
+        )
     notes = [f"dof_effort of {listed(joints, 6)} is left out of the residuals: {why}." for why, joints in out.items()]
     if noise:
         notes.insert(

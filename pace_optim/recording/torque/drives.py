@@ -201,9 +201,7 @@ def apart(value: float, std: float, stated: float) -> bool:
     return abs(value - stated) > max(SURE * std, APART * abs(stated))
 
 
-def _with_feed_forward(
-    recording: Recording, laws: Mapping[int, MeasuredLaw], sensed: Collection[str]
-) -> Recording:
+def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw], sensed: Collection[str]) -> Recording:
     """The commanded torques as the drives take them, with the constant ones that no command says."""
     shape = (recording.num_samples - 1) * recording.sample_stride + 1, recording.num_joints
     effort = np.zeros(shape) if recording.command_effort is None else recording.command_effort.copy()
