@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
+from pace_optim.run.result import torque_rmse
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
 from pace_optim.terminal.processes import Processes
@@ -165,12 +167,17 @@ class Optimization:
             return way
         if way is not None:
             best = min(way.descents, key=lambda d: d.score)
-        pieces = self._in_use.way.pieces
-        residuals = pieces.residuals(self.problem.space.to_physical(best.x)[None])
-        course = self._course(self.problem.with_torque_noise(residuals.torque_rms(pieces.dataset)), TORQUE_NOISE)
-        course.way.begin([best.x])
-        self._use(course)
-        return course.way
+        way = self._by_torque_noise(self._in_use.way.pieces, best.x)
+        way.begin([best.x])
+        return way
+
+    def _by_torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> WayDown:
+        """The way on which what torques leave at a normalised vector (size,) is their noise."""
+        with evaluator.again() if self._restored else nullcontext():
+            residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
+        noise = torque_rmse(residuals, evaluator.dataset)
+        self._use(self._course(self.problem.with_torque_noise(noise), TORQUE_NOISE))
+        return self._in_use.way
 
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
@@ -254,7 +261,10 @@ class Optimization:
             self._search(self.optimizer)
             return Outcome(x=self._best_of(self.optimizer), stop_reasons=self._search_stop)
         if self.settings.start is not None:
-            end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
+            x, way = as_vector(self.problem, self.settings.start), self.way
+            if self.problem.dataset.torques is not None:
+                way = self._by_torque_noise(self.evaluator, x)
+            end = way.near(x, NEAR)
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)

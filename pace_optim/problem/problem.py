@@ -189,11 +189,20 @@ class Problem:
             each.scene.robot.links = {**each.scene.robot.links, **links}
         return known
 
-    def with_torque_noise(self, noise: torch.Tensor) -> Problem:
-        """The same with other noise of the torques that are followed, (n,) [N m]."""
-        torques = self.dataset.torques
-        known = None if torques is None else torques.with_noise(noise)
-        return replace(self, dataset=replace(self.dataset, torques=known))
+    def on_positions(self) -> Problem:
+        """The same without the torques that are followed."""
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            each.sim2real.torque_sensors = {}
+        dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
+        return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
+
+    def with_torque_noise(self, noise: Mapping[str, float]) -> Problem:
+        """The same with other noise of the torques that are followed, by joint [N m]."""
+        if (torques := self.dataset.torques) is None:
+            return self
+        values = torch.tensor([noise.get(joint, 0.0) for joint in self.joint_names], dtype=torch.float64)
+        return replace(self, dataset=replace(self.dataset, torques=torques.with_noise(values)))
 
     @property
     def loop_dt(self) -> float:

@@ -16,12 +16,14 @@ from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
 from pace_envs.link_inertia import NAMES
+from pace_envs.tasks.pace import TORQUE_LAG, TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
+from pace_optim.recording.dataset import Dataset
 from pace_optim.recording.notes import notes_by_kind
 
 
@@ -128,6 +130,11 @@ class FitResult(DriveResult):
         return [name for name in self.parameters if name in NAMES]
 
     @property
+    def sensor_parameters(self) -> list[str]:
+        """Names of the parameters of sensors of torques."""
+        return [name for name in (TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG) if name in self.parameters]
+
+    @property
     def joint_types(self) -> tuple[JointType, ...]:
         """Whether each joint turns or slides."""
         return tuple(self.joint_type(joint) for joint in self.joint_names)
@@ -144,10 +151,10 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     }
 
 
-def _torque_rmse(residuals: Residuals, problem: Problem, where: torch.Tensor) -> dict[str, float]:
+def torque_rmse(residuals: Residuals, dataset: Dataset, where: torch.Tensor | None = None) -> dict[str, float]:
     """Root mean square error of each torque that is followed, over a (K, R) part of the samples [N m]."""
-    values = residuals.torque_rms(problem.dataset, where).tolist()
-    return {joint: value for joint, value in zip(problem.joint_names, values, strict=True) if value > 0}
+    values = residuals.torque_rms(dataset, where).tolist()
+    return {joint: value for joint, value in zip(dataset.recordings[0].joint_names, values, strict=True) if value > 0}
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
@@ -267,8 +274,8 @@ def make_result(
         torque_rmse={}
         if data.torques is None
         else {
-            "train": _torque_rmse(residuals, problem, train),
-            "validation": _torque_rmse(residuals, problem, validation),
+            "train": torque_rmse(residuals, data, train),
+            "validation": torque_rmse(residuals, data, validation),
         },
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
