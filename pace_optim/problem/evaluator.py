@@ -12,8 +12,8 @@ import torch
 from pace_envs.tasks.pace import TORQUE_LAG, TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.rollout import Rollout
-from pace_optim.recording.dataset import Dataset
+from pace_optim.problem.rollout import Rollout, between_straight
+from pace_optim.recording.dataset import Dataset, Torques
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 
 if TYPE_CHECKING:
@@ -276,47 +276,66 @@ class Evaluator:
         data = self.dataset
         mask = data.train if where is None else where
         step = mask.any(dim=1).nonzero()[:, 0]
+        if data.torques is not None and TORQUE_LAG in self.space.slices:
+            return self._with_torques(physical, mask, step, initial_offset, data.torques)
         rollout = self.rollout(len(physical))
         rollout.start(physical, mask, initial_offset=initial_offset)
         bias = rollout.physical[:, self.space["encoder_bias"]]
         m, count, n = len(physical), data.num_recordings, bias.shape[1]
-        sensor = self._sensor(rollout)
-        if sensor is None:
-            shown, torque = rollout.positions(step), None
-        else:
-            scale, offset, lag = sensor
-            shown, torque = rollout.positions_and_torques(step, lag)
-            torque.mul_(scale).add_(offset)
-        error = shown.sub_(bias)
+        error = rollout.positions(step).sub_(bias)
         error.view(len(step), m, count, n).sub_(rollout.dataset.measured[step][:, None])
         kept = mask[step]
         error = error.to("cpu", torch.float64).view(len(step), m, count, n)
         if not bool(kept.all()):
             error.mul_(kept[:, None, :, None])
         error = error.permute(1, 0, 2, 3)
-        if torque is not None and data.torques is not None:
-            off, known = data.torques.error(torque.view(len(step), m, count, n), step)
-            known &= kept[..., None]
-            off = torch.where(known[:, None], off, 0.0).permute(1, 0, 2, 3)
-            where = torch.cat([kept, known.any(dim=2)], dim=1)
-            both = torch.cat([error, off], dim=2)
-            return Residuals(error=both, where=where, step=step, prior=self._prior(physical), with_torques=True)
         if data.weight is None or self.phases is None:
             return Residuals(error=error, where=kept, step=step, prior=self._prior(physical))
         weight = data.weight[step]
         error = self.phases.taken_out(error, step, mask).mul_(weight)
         return Residuals(error=error, where=kept, step=step, weight=weight, prior=self._prior(physical))
 
-    def _sensor(self, rollout: Rollout) -> list[torch.Tensor] | None:
-        """Scale, offset [N m] and lag [control steps] of torques that are followed, (num_envs, n) each; or none are."""
-        if self.dataset.torques is None or TORQUE_LAG not in self.space.slices:
-            return None
+    def _with_torques(
+        self,
+        physical: torch.Tensor,
+        mask: torch.Tensor,
+        step: torch.Tensor,
+        initial_offset: torch.Tensor | None,
+        torques: Torques,
+    ) -> Residuals:
+        """Errors of positions and torques; candidates that differ in their sensors alone are simulated once."""
+        motion = physical * self.space.moves
+        keys = motion if initial_offset is None else torch.cat([motion, initial_offset], dim=1)
+        place: dict[tuple[float, ...], int] = {}
+        of = [place.setdefault(tuple(key), len(place)) for key in keys.tolist()]
+        rows = [of.index(i) for i in range(len(place))]
+        rollout = self.rollout(len(rows))
+        rollout.start(physical[rows], mask, initial_offset=None if initial_offset is None else initial_offset[rows])
+        scale, offset, lag = self._sensors(physical)
+        shown, given, when = rollout.positions_and_torques(step, float(lag.min()))
+        shape = len(rows), self.dataset.num_recordings, shown.shape[-1]
+        shown, given, when = (each.view(len(each), *shape)[:, of] for each in (shown, given, when))
+        error = shown - physical[:, None, self.space["encoder_bias"]] - self.dataset.measured[step][:, None]
+        off = between_straight(given, when - lag).mul_(scale).add_(offset)
+        off = off.sub_(torques.measured[step][:, None]).mul_(torques.weight)
+        kept, known = mask[step], torques.known[step] & mask[step][..., None]
+        parts = error.mul_(kept[:, None, :, None]), torch.where(known[:, None], off, 0.0)
+        return Residuals(
+            error=torch.cat(parts, dim=2).permute(1, 0, 2, 3),
+            where=torch.cat([kept, known.any(dim=2)], dim=1),
+            step=step,
+            prior=self._prior(physical),
+            with_torques=True,
+        )
+
+    def _sensors(self, physical: torch.Tensor) -> list[torch.Tensor]:
+        """Scale, offset [N m] and lag [control steps] of the torques of candidates (m, size), (m, 1, n) each."""
         parameter = next(p for p in self.space.parameters if p.name == TORQUE_LAG)
-        names = self.dataset.recordings[0].joint_names
-        joints, result = [names.index(key) for key in parameter.keys], []
-        for name, usual in ((TORQUE_SCALE, 1.0), (TORQUE_OFFSET, 0.0), (TORQUE_LAG, 0.0)):
-            values = torch.full((len(rollout.physical), len(names)), usual, dtype=rollout.physical.dtype)
-            values[:, joints] = rollout.physical[:, self.space[name]]
+        names, result = self.dataset.recordings[0].joint_names, []
+        joints = [names.index(key) for key in parameter.keys]
+        for name in (TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG):
+            values = torch.zeros(len(physical), 1, len(names), dtype=physical.dtype)
+            values[..., joints] = physical[:, None, self.space[name]]
             result.append(values)
         return result
 

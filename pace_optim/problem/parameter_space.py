@@ -52,6 +52,8 @@ class ParameterSpace:
         self.upper = torch.tensor([v for p in parameters for v in p.upper], dtype=torch.float64)
         self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
         self.is_logarithmic = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
+        self.moves = torch.tensor([p.moves for p in parameters for _ in p.keys])
+        """Which entries change how the robot moves, (size,) bool."""
         self._box = Box(self.lower, self.upper, self.is_logarithmic)
         self.prior = torch.tensor(
             [float("inf") if p.prior is None else p.prior for p in parameters for _ in p.keys], dtype=torch.float64

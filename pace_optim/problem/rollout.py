@@ -215,41 +215,40 @@ class Rollout:
         shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
         return torch.stack([position.clone() for k, position in shown if k in wanted])
 
-    def positions_and_torques(self, at: torch.Tensor, late: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The same, and the motors' torques as a sensor has them, both (len(at), num_envs, n) [rad, N m].
-
-        A torque is that of a sample's instant or of one before it, straight between control steps.
+    def positions_and_torques(
+        self, at: torch.Tensor, earliest: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The same, and the motors' torques at all control steps, with the instants of the samples among them.
 
         Args:
             at: As for :meth:`positions`.
-            late: How late the sensor is [control steps], (num_envs, n); below 0: early.
+            earliest: Smallest lag of a sensor [control steps]; below 0: it is early.
+
+        Returns:
+            Positions (len(at), num_envs, n) [rad], torques (T, num_envs, n) [N m], and instants, as the positions
+            [control steps].
         """
-        sensed = self.dataset.torques
-        after = torch.zeros(1) if sensed is None else sensed.after[at]
-        last, beyond = self.duration_steps, 2 + math.ceil(max(0.0, float(after.max()) - float(late.min())))
+        last, offset, sensed = self.duration_steps, self.dataset.sample_offset, self.dataset.torques
+        after = torch.zeros(len(at), self.dataset.num_recordings) if sensed is None else sensed.after[at]
+        beyond = 2 + math.ceil(max(0.0, float(after.max()) - earliest))
         torques: list[torch.Tensor] = []
 
         def simulated(steps: int) -> torch.Tensor:
-            torque = torch.zeros(steps, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype)
-            shown = self._in_one_go(torch.arange(steps), torque=torque)
-            torques.append(torque)
-            return shown
+            shape = steps + beyond, self.env.num_envs, self.robot.num_joints
+            torques.append(torch.zeros(shape, dtype=self.env.dtype))
+            return self._in_one_go(torch.arange(steps + beyond), torque=torques[0])[:steps]
 
-        lag, offset = self.observation_lag(last), self.dataset.sample_offset
+        lag = self.observation_lag(last)
         if lag is None and offset is None:
-            positions = simulated(last + beyond)[at]
+            positions = simulated(last)[at]
         else:
             wanted = set(at.tolist())
-            shown = self.samples(simulated=lambda steps: simulated(steps + beyond)[:steps])
-            positions = torch.stack([position.clone() for k, position in shown if k in wanted])
-        when = at[:, None, None] - late
-        if sensed is not None:
-            when = when + torch.stack([self._rows(each[:, None]) for each in after])
+            positions = torch.stack([shown.clone() for k, shown in self.samples(simulated) if k in wanted])
+        after = after if offset is None else after + offset[at]
+        when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
         if lag is not None:
             when = when - torch.lerp(lag[0], lag[1], (at / max(1, last - 1))[:, None, None])
-        if offset is not None:
-            when = when + torch.stack([self._rows(each[:, None]) for each in offset[at]])
-        return positions, _straight(torques[0], when)
+        return positions, torques[0], when
 
     def motion(self, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Simulate that many control steps, as :meth:`simulated` does.
@@ -527,7 +526,7 @@ def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -
     return result
 
 
-def _straight(series: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+def between_straight(series: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
     """Values (length, m, n) at real-valued steps (K, m, n), straight between two; the first before it."""
     whole = at.floor().clamp(0, len(series) - 2)
     low = whole.long()

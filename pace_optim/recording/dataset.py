@@ -120,13 +120,6 @@ class Torques:
         followed = self.known.any(dim=1).any(dim=0)
         return torch.where(followed, self.position_noise / self.noise.clamp(min=1e-300), 0.0)
 
-    def error(self, torque: torch.Tensor, step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Weighed errors of torques (K, m, R, n) [N m] at some control steps (K,), and where they are known (K, R, n).
-
-        The errors are changed from the torques in place [rad].
-        """
-        return torque.sub_(self.measured[step][:, None]).mul_(self.weight), self.known[step]
-
     def at(self, step: Any, recording: Any) -> Torques:
         """Those of some control steps and recordings, by index."""
         known, after = self.known[step, recording], self.after[step, recording]

@@ -70,6 +70,9 @@ class Parameter:
     joints: tuple[str, ...] | None = None
     """The driven joint that moves what each key names, where keys are links; ``None``: keys are joints."""
 
+    moves: bool = True
+    """Whether it changes how the robot moves, and not only what a sensor shows."""
+
     per_joint_copies: bool = False
     """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
 
@@ -204,11 +207,18 @@ def torque_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
 
     def parameter(name: str, unit: str, bounds: Sequence[tuple[float, float, float]], **more: Any) -> Parameter:
         lower, start, upper = zip(*bounds, strict=True)
-        units = _units(unit, joints, cfg)
         return Parameter(
-            name=name, unit=unit, lower=lower, upper=upper, start=start, keys=joints, units=units, apply=_of_a_sensor,
+            name=name,
+            unit=unit,
+            lower=lower,
+            upper=upper,
+            start=start,
+            keys=joints,
+            units=_units(unit, joints, cfg),
+            apply=_of_a_sensor,
+            moves=False,
             **more,
-        )  # fmt: skip
+        )
 
     prior = math.log1p(TORQUE_SCALE_STD) / math.log(_TORQUE_SCALE)
     scale = [(1 / _TORQUE_SCALE, 1.0, _TORQUE_SCALE)] * len(joints)
