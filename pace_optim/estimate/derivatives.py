@@ -154,8 +154,8 @@ def _principal_directions(hessian: torch.Tensor, x: torch.Tensor, colouring: Col
     """A direction for each entry whose largest component is 1, (size, size).
 
     Those of a tree's own entries are the principal directions of their part of H; those of entries that several trees
-    share, what these change although the others make up for it. An entry at a bound, without influence, or of a sensor, is
-    alone.
+    share, what these change although the others make up for it. An entry at a bound, without influence, or of a sensor
+    is alone.
     """
     joints = colouring.joints
     least = NO_INFLUENCE * float(hessian.diagonal().max())

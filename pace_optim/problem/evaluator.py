@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.tasks.pace import TORQUE_LAG, TORQUE_OFFSET, TORQUE_SCALE
+from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.rollout import Rollout, between_straight
+from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset, Torques
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 
@@ -276,7 +276,7 @@ class Evaluator:
         data = self.dataset
         mask = data.train if where is None else where
         step = mask.any(dim=1).nonzero()[:, 0]
-        if data.torques is not None and TORQUE_LAG in self.space.slices:
+        if data.torques is not None and TORQUE_SCALE in self.space.slices:
             return self._with_torques(physical, mask, step, initial_offset, data.torques)
         rollout = self.rollout(len(physical))
         rollout.start(physical, mask, initial_offset=initial_offset)
@@ -311,13 +311,11 @@ class Evaluator:
         rows = [of.index(i) for i in range(len(place))]
         rollout = self.rollout(len(rows))
         rollout.start(physical[rows], mask, initial_offset=None if initial_offset is None else initial_offset[rows])
-        scale, offset, lag = self._sensors(physical)
-        shown, given, when = rollout.positions_and_torques(step, float(lag.min()))
-        shape = len(rows), self.dataset.num_recordings, shown.shape[-1]
-        shown, given, when = (each.view(len(each), *shape)[:, of] for each in (shown, given, when))
+        scale, offset = self._sensors(physical)
+        both = rollout.positions_and_torques(step, torques)
+        shown, given = (each.view(len(step), len(rows), self.dataset.num_recordings, -1)[:, of] for each in both)
         error = shown - physical[:, None, self.space["encoder_bias"]] - self.dataset.measured[step][:, None]
-        off = between_straight(given, when - lag).mul_(scale).add_(offset)
-        off = off.sub_(torques.measured[step][:, None]).mul_(torques.weight)
+        off = given.mul_(scale).add_(offset).sub_(torques.measured[step][:, None]).mul_(torques.weight)
         kept, known = mask[step], torques.known[step] & mask[step][..., None]
         parts = error.mul_(kept[:, None, :, None]), torch.where(known[:, None], off, 0.0)
         return Residuals(
@@ -329,11 +327,11 @@ class Evaluator:
         )
 
     def _sensors(self, physical: torch.Tensor) -> list[torch.Tensor]:
-        """Scale, offset [N m] and lag [control steps] of the torques of candidates (m, size), (m, 1, n) each."""
-        parameter = next(p for p in self.space.parameters if p.name == TORQUE_LAG)
+        """Scale and offset [N m] of the torques of candidates (m, size), (m, 1, n) each."""
+        parameter = next(p for p in self.space.parameters if p.name == TORQUE_SCALE)
         names, result = self.dataset.recordings[0].joint_names, []
         joints = [names.index(key) for key in parameter.keys]
-        for name in (TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG):
+        for name in (TORQUE_SCALE, TORQUE_OFFSET):
             values = torch.zeros(len(physical), 1, len(names), dtype=physical.dtype)
             values[..., joints] = physical[:, None, self.space[name]]
             result.append(values)

@@ -41,7 +41,7 @@ from pace_optim.problem.log_and_robot import (
 from pace_optim.problem.moving_base import on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
-from pace_optim.problem.start import start_by_torques, torque_sensors, widen_bounds
+from pace_optim.problem.start import start_by_torques, widen_bounds
 from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
@@ -193,7 +193,7 @@ class Problem:
         """The same without the torques that are followed."""
         plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
         for each in (plain, cfg):
-            each.sim2real.torque_sensors = {}
+            each.sim2real.torque_offsets = {}
         dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
         return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
 
@@ -428,7 +428,7 @@ def _posed(
     for fact in set(unknown) - set(asked):  # gains that are stated beside those that are read
         gains[GAINS[fact]] = dict.fromkeys(sim2real.joint_order, (1.0, 1.0, 1.0)) | gains.get(GAINS[fact], {})
     sim2real.effect_bounds = {**sim2real.effect_bounds, **bounds, **gains}
-    sim2real.torque_sensors = torque_sensors(channel)
+    sim2real.torque_offsets = channel.offsets
     if "effort_limit" in unknown:
         for drive in robot.actuators.values():
             drive.effort_limit.fill_(math.inf)
@@ -452,12 +452,11 @@ def _posed(
     refuse_open_loops(env, [*recordings, *held_out])
     dataset = with_work(make_dataset(recordings, held_out), env)
     if channel.noise:
-        settled = math.ceil(max(each.lag_bounds[1] for each in sim2real.torque_sensors.values())) + 1
         held = all(
             not drive.implicit and (drive.drive_dt or control_dt) >= control_dt * (1 - 1e-6)
             for drive in cfg.scene.robot.actuators.values()
         )
-        dataset = replace(dataset, torques=Torques.of(dataset, channel, settled, held))
+        dataset = replace(dataset, torques=Torques.of(dataset, channel, held))
     return Problem(
         task=facts.task,
         plain_cfg=cfg,

@@ -15,7 +15,7 @@ from pace_envs.compiled_drive.robot_kernel import CompiledRobot
 from pace_envs.moving_frame import Course
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
-from pace_optim.recording.dataset import Dataset, Work
+from pace_optim.recording.dataset import Dataset, Torques, Work
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -215,22 +215,17 @@ class Rollout:
         shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
         return torch.stack([position.clone() for k, position in shown if k in wanted])
 
-    def positions_and_torques(
-        self, at: torch.Tensor, earliest: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The same, and the motors' torques at all control steps, with the instants of the samples among them.
+    def positions_and_torques(self, at: torch.Tensor, sensed: Torques) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same, and the motors' torques as late as sensors show them, both (len(at), num_envs, n) [rad, N m].
+
+        Torques run straight between control steps.
 
         Args:
             at: As for :meth:`positions`.
-            earliest: Smallest lag of a sensor [control steps]; below 0: it is early.
-
-        Returns:
-            Positions (len(at), num_envs, n) [rad], torques (T, num_envs, n) [N m], and instants, as the positions
-            [control steps].
+            sensed: What measured torques are compared with it.
         """
-        last, offset, sensed = self.duration_steps, self.dataset.sample_offset, self.dataset.torques
-        after = torch.zeros(len(at), self.dataset.num_recordings) if sensed is None else sensed.after[at]
-        beyond = 2 + math.ceil(max(0.0, float(after.max()) - earliest))
+        last, offset, after = self.duration_steps, self.dataset.sample_offset, sensed.after[at]
+        beyond = 2 + math.ceil(max(0.0, float(after.max()) - float(sensed.lag.min())))
         torques: list[torch.Tensor] = []
 
         def simulated(steps: int) -> torch.Tensor:
@@ -248,7 +243,7 @@ class Rollout:
         when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
         if lag is not None:
             when = when - torch.lerp(lag[0], lag[1], (at / max(1, last - 1))[:, None, None])
-        return positions, torques[0], when
+        return positions, _straight(torques[0], when - sensed.lag)
 
     def motion(self, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Simulate that many control steps, as :meth:`simulated` does.
@@ -526,7 +521,7 @@ def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -
     return result
 
 
-def between_straight(series: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+def _straight(series: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
     """Values (length, m, n) at real-valued steps (K, m, n), straight between two; the first before it."""
     whole = at.floor().clamp(0, len(series) - 2)
     low = whole.long()

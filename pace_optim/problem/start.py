@@ -10,19 +10,14 @@ from pace_actuators.base_parameters import CARRIED
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import defaults
 from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
-from pace_envs.tasks.pace.pace_cfg import PaceCfg, TorqueSensor
+from pace_envs.tasks.pace.pace_cfg import PaceCfg
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
-from pace_optim.recording.torque import TorqueChannel
 
 _SHARE = 0.1
 """Of the torque, that each of armature, viscous and Coulomb friction takes at the start."""
 _SMOOTH = 0.02
 """Positions are averaged over this time before they are differentiated [s]."""
-
-
-_LONGEST_LAG = 4.0
-"""Samples by which a log has a torque late, at most."""
 
 
 def start_by_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
@@ -133,17 +128,3 @@ def _smooth(position: np.ndarray, half: int) -> np.ndarray:
     """Each position averaged with its neighbours on both sides, (T, n)."""
     padded = np.pad(position, ((half + 1, half), (0, 0)), mode="edge").cumsum(axis=0)
     return (padded[2 * half + 1 :] - padded[: -2 * half - 1]) / (2 * half + 1)
-
-
-def torque_sensors(channel: TorqueChannel) -> dict[str, TorqueSensor]:
-    """Within what a fit seeks what sensors add to the torques that it follows, by joint."""
-    lags = -channel.stride, _LONGEST_LAG * channel.stride
-    return {
-        joint: TorqueSensor(
-            offset=float(np.clip(channel.offset[joint], -0.5 * peak, 0.5 * peak)),
-            offset_bound=0.5 * peak,
-            lag=float(np.clip(channel.lag[joint], *lags)),
-            lag_bounds=lags,
-        )
-        for joint, peak in channel.peak.items()
-    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -72,15 +73,16 @@ class Torques:
     """That of a position [rad]."""
     after: torch.Tensor
     """By how much later than its sample it was measured, (T, R) [control steps]."""
+    lag: torch.Tensor
+    """How late a sensor shows a torque, (n,) [control steps]; below 0: it is early."""
 
     @classmethod
-    def of(cls, dataset: Dataset, channel: TorqueChannel, settled: int, held: bool) -> Torques:
+    def of(cls, dataset: Dataset, channel: TorqueChannel, held: bool) -> Torques:
         """Those of a dataset's recordings.
 
         Args:
             dataset: The recordings.
             channel: Which joints' torques count, and their noise.
-            settled: From which control step on.
             held: Whether drives hold their torques for a control step.
         """
         names = dataset.recordings[0].joint_names
@@ -94,11 +96,11 @@ class Torques:
                 values = torch.as_tensor(recording.dof_effort)
                 measured[at, r], known[at, r] = values.nan_to_num(nan=0.0), values.isfinite()
         known &= torch.tensor([name in channel.noise for name in names])
-        known[:settled] = False
+        known[: math.ceil(max(0.0, *channel.lag.values())) + 1] = False
         size = (measured.square() * known).sum(dim=(0, 1)) / known.sum(dim=(0, 1)).clamp(min=1)
-        noise, floor = (
+        noise, floor, lag = (
             torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64)
-            for own in (channel.noise, channel.floor)
+            for own in (channel.noise, channel.floor, channel.lag)
         )
         variance = noise_variance([dataset.recordings[r] for r in dataset.trained()])
         return cls(
@@ -108,6 +110,7 @@ class Torques:
             floor=torch.maximum(floor, _LEAST_TORQUE_NOISE * size.sqrt()),
             position_noise=max(variance, LEAST_NOISE**2) ** 0.5,
             after=after.floor() if held else after,
+            lag=lag,
         ).with_noise(noise)
 
     def with_noise(self, noise: torch.Tensor) -> Torques:

@@ -16,7 +16,7 @@ from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
 from pace_envs.link_inertia import NAMES
-from pace_envs.tasks.pace import TORQUE_LAG, TORQUE_OFFSET, TORQUE_SCALE
+from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.evaluator import Residuals
@@ -132,7 +132,7 @@ class FitResult(DriveResult):
     @property
     def sensor_parameters(self) -> list[str]:
         """Names of the parameters of sensors of torques."""
-        return [name for name in (TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG) if name in self.parameters]
+        return [name for name in (TORQUE_SCALE, TORQUE_OFFSET) if name in self.parameters]
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:

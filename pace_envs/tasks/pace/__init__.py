@@ -1,10 +1,9 @@
 """Identification: a robot held in the air follows a recording's commands."""
 
-from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg, TorqueSensor
+from pace_envs.tasks.pace.pace_cfg import ExcitationCfg, PaceCfg
 from pace_envs.tasks.pace.pace_sim2real_env_cfg import PaceSim2realEnvCfg, PaceSim2realSceneCfg
 from pace_envs.tasks.pace.parameters import (
     GLOBAL,
-    TORQUE_LAG,
     TORQUE_OFFSET,
     TORQUE_SCALE,
     Parameter,
@@ -17,7 +16,6 @@ from pace_envs.tasks.pace.parameters import (
 
 __all__ = [
     "GLOBAL",
-    "TORQUE_LAG",
     "TORQUE_OFFSET",
     "TORQUE_SCALE",
     "ExcitationCfg",
@@ -25,7 +23,6 @@ __all__ = [
     "PaceSim2realEnvCfg",
     "PaceSim2realSceneCfg",
     "Parameter",
-    "TorqueSensor",
     "base_parameters",
     "effect_parameters",
     "link_parameters",

@@ -31,23 +31,6 @@ class ExcitationCfg(Config):
     """Amplitude [rad] of a signal that runs from -1 to 1, one per joint."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TorqueSensor:
-    """Within what a fit seeks what a joint's sensor of torques adds to them."""
-
-    offset: float
-    """Start of the offset [N m]."""
-
-    offset_bound: float
-    """Largest size of the offset [N m]."""
-
-    lag: float
-    """Start of the lag [control steps]."""
-
-    lag_bounds: tuple[float, float]
-    """Smallest and largest lag [control steps]; below 0: the log has a torque before its position."""
-
-
 @dataclass(kw_only=True)
 class PaceCfg(Config):
     """Names, bounds and motion of a robot's identification."""
@@ -101,8 +84,9 @@ class PaceCfg(Config):
     """Links whose inertial parameters are identified, as the model has them (:func:`~pace_envs.tasks.pace.sought_links`
     finds them)."""
 
-    torque_sensors: Mapping[str, TorqueSensor] = field(default_factory=dict)
-    """Joints whose measured torques a fit follows beside their positions."""
+    torque_offsets: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Joints whose measured torques a fit follows beside their positions, and where it seeks their sensors' offsets:
+    ``{joint: (lower, start, upper)}`` [N m]."""
 
     extra_parameters: tuple[Any, ...] = ()
     """Parameters of your own (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
@@ -197,7 +181,7 @@ class PaceCfg(Config):
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             links=(),
-            torque_sensors={},
+            torque_offsets={},
             extra_parameters=(),
         )
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 GLOBAL = ALL
 """The key of a parameter that all joints share."""
-TORQUE_SCALE, TORQUE_OFFSET, TORQUE_LAG = "torque_scale", "torque_offset", "torque_lag"
+TORQUE_SCALE, TORQUE_OFFSET = "torque_scale", "torque_offset"
 """Parameters of a sensor of torques."""
 TORQUE_SCALE_STD = 0.1
 """Standard deviation of the scale's prior: motors' torque constants are known to a tenth."""
@@ -199,9 +199,9 @@ def link_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
 
 
 def torque_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
-    """Of sensors of torques that a fit follows: scale s, offset o and lag l of what they show, s τ(t - l) + o."""
-    sensors = cfg.torque_sensors
-    joints = tuple(joint for joint in cfg.joint_order if joint in sensors)
+    """Of sensors of torques that a fit follows: scale s and offset o of what they show, s τ + o."""
+    offsets = cfg.torque_offsets
+    joints = tuple(joint for joint in cfg.joint_order if joint in offsets)
     if not joints:
         return ()
 
@@ -222,13 +222,8 @@ def torque_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
 
     prior = math.log1p(TORQUE_SCALE_STD) / math.log(_TORQUE_SCALE)
     scale = [(1 / _TORQUE_SCALE, 1.0, _TORQUE_SCALE)] * len(joints)
-    offset = [(-sensors[j].offset_bound, sensors[j].offset, sensors[j].offset_bound) for j in joints]
-    lag = [(*sensors[j].lag_bounds[:1], sensors[j].lag, *sensors[j].lag_bounds[1:]) for j in joints]
-    return (
-        parameter(TORQUE_SCALE, "1", scale, scale="log", prior=prior),
-        parameter(TORQUE_OFFSET, "N m", offset),
-        parameter(TORQUE_LAG, "control steps", lag),
-    )
+    offset = [offsets[joint] for joint in joints]
+    return parameter(TORQUE_SCALE, "1", scale, scale="log", prior=prior), parameter(TORQUE_OFFSET, "N m", offset)
 
 
 def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[str]) -> tuple[Reference, ...]:

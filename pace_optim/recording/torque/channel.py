@@ -14,23 +14,26 @@ from pace_optim.recording.noise import noise_floor
 from .drives import MeasuredDrives, follows
 from .law import SURE, MeasuredLaw
 
+_LARGEST_OFFSET = 0.5
+"""Part of the largest torque that a sensor's offset is at most."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueChannel:
-    """Joints whose measured torques a fit follows, τ_m(t) = s τ(t - l) + o + noise, and what it begins with."""
+    """Joints whose measured torques a fit follows, τ_m(t) = s τ(t - l) + o + noise, and what it begins with.
+
+    The scale s and the offset o are sought. The lag l is that of the law: beside one that is free, a damping would be
+    viscous friction (a lag of kp (q* - q) is kp l q̇).
+    """
 
     noise: Mapping[str, float] = field(default_factory=dict)
     """Standard deviation of what the best law of the drive leaves of a torque, by joint [N m]."""
     floor: Mapping[str, float] = field(default_factory=dict)
     """That of its noise, by joint [N m]."""
     lag: Mapping[str, float] = field(default_factory=dict)
-    """Start of l, by joint [control steps]."""
-    offset: Mapping[str, float] = field(default_factory=dict)
-    """Start of o, by joint [N m]."""
-    peak: Mapping[str, float] = field(default_factory=dict)
-    """Largest torque, by joint [N m]."""
-    stride: float = 1.0
-    """Control steps from one sample of the torque to the next."""
+    """l, by joint [control steps]; below 0: the log has a torque before its position."""
+    offsets: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Lower bound, start and upper bound of o, by joint [N m]."""
     notes: tuple[str, ...] = ()
     """Which joints they are, and which are left out, in sentences."""
 
@@ -81,11 +84,15 @@ def torque_channel(
         noise=noise,
         floor={joint: _floor(recordings, joint, measured.laws[joint]) for joint in noise},
         lag={joint: float(np.median([law.feedback_lag for law in laws])) for joint, laws in known.items()},
-        offset={joint: float(np.median([law.offset for law in laws])) for joint, laws in known.items()},
-        peak={joint: max(law.peak for law in laws) for joint, laws in known.items()},
-        stride=max((law.resolution for laws in known.values() for law in laws), default=1.0),
+        offsets={joint: _offsets(laws) for joint, laws in known.items()},
         notes=tuple(notes),
     )
+
+
+def _offsets(laws: Sequence[MeasuredLaw]) -> tuple[float, float, float]:
+    """Where the offset of a joint's sensor is sought [N m]."""
+    most = _LARGEST_OFFSET * max(law.peak for law in laws)
+    return -most, float(np.clip(np.median([law.offset for law in laws]), -most, most)), most
 
 
 def _why_not(joint: str, laws: Sequence[MeasuredLaw], measured: MeasuredDrives, asked: bool) -> str:
