@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
+from pace_optim.estimate.error_bars.torque_noise import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
@@ -24,7 +25,6 @@ from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem, as_vector
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
-from pace_optim.run.result import torque_rmse
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensorboard_log import TensorBoardLog
 from pace_optim.terminal.processes import Processes
@@ -36,8 +36,15 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP, TORQUE_NOISE = "loop of {:g} s, ", "step of {:g} s, ", "torque noise, "
-"""What the stages' names begin with on the way of another loop, at a finer step, and by the noise that torques have."""
+OTHER_LOOP, FINER_STEP, TORQUE_NOISE, POSITIONS, WEIGHED = (
+    "loop of {:g} s, ", "step of {:g} s, ", "torque noise {}, ", "positions, ", "torque noise, "
+)  # fmt: skip
+"""What the stages' names begin with: with another loop, at a finer step, by the noise that torques have, without
+torques, and by that noise from a vector that is known."""
+_TORQUE_ATTEMPTS = 3
+"""Times that the noise of torques is set."""
+_BY_CHANCE = 2.0
+"""Times the number of parameters by which χ² of the positions may rise because torques are followed too."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _STEP_IN_DOUBT = 1.3
@@ -167,17 +174,49 @@ class Optimization:
             return way
         if way is not None:
             best = min(way.descents, key=lambda d: d.score)
-        way = self._by_torque_noise(self._in_use.way.pieces, best.x)
-        way.begin([best.x])
-        return way
-
-    def _by_torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> WayDown:
-        """The way on which what torques leave at a normalised vector (size,) is their noise."""
-        with evaluator.again() if self._restored else nullcontext():
-            residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
-        noise = torque_rmse(residuals, evaluator.dataset)
-        self._use(self._course(self.problem.with_torque_noise(noise), TORQUE_NOISE))
+        self._use(self._by_torque_noise(best.x))
         return self._in_use.way
+
+    def _by_torque_noise(self, x: torch.Tensor) -> _Course:
+        """The course on which torques weigh by what they leave on pieces, begun at a normalised vector (size,).
+
+        Their noise grows where positions are then followed worse than without them, by more than noise explains: a
+        filter makes errors that are none. A change of parameters is as the square of a torque's weight, and χ² of the
+        positions as the square of that.
+        """
+        problem, size = self.problem, int(self.problem.space.moves.sum())
+        noise = self._torque_noise(self._in_use.way.pieces, x)
+        alone: torch.Tensor | None = None
+        for attempt in range(1, _TORQUE_ATTEMPTS + 1):
+            course = self._course(problem.with_torque_noise(noise), TORQUE_NOISE.format(attempt))
+            end = course.way.begin([x])
+            if alone is None:
+                without = self._course(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), POSITIONS)
+                alone = without.way.begin([end.x]).x
+            with self._found_again():
+                both = course.way.pieces.residuals(problem.space.to_physical(torch.stack([end.x, alone]))).positions
+            (followed, best), count = both.joint_score, int(problem.dataset.train.sum())
+            chi2 = count * (followed / best - 1) / (_BY_CHANCE * size / len(noise))
+            if not bool((chi2 > 1).any()):
+                break
+            noise = {
+                joint: course.problem.torque_noise.get(joint, 0.0) * more
+                for joint, more in zip(noise, chi2.clamp(min=1.0).pow(0.25).tolist(), strict=True)
+            }
+            x = alone
+        return course
+
+    def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
+        """What torques leave at a normalised vector (size,), by joint [N m]."""
+        with self._found_again():
+            residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
+        torques = evaluator.dataset.torques
+        values = [] if torques is None else torque_noise(residuals, torques)
+        return dict(zip(self.problem.joint_names, values, strict=False))
+
+    def _found_again(self) -> AbstractContextManager[None]:
+        """Of what a run that is resumed simulates once more: it was counted before."""
+        return self._in_use.way.pieces.again() if self._restored else nullcontext()
 
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
@@ -263,7 +302,8 @@ class Optimization:
         if self.settings.start is not None:
             x, way = as_vector(self.problem, self.settings.start), self.way
             if self.problem.dataset.torques is not None:
-                way = self._by_torque_noise(self.evaluator, x)
+                self._use(self._course(self.problem.with_torque_noise(self._torque_noise(self.evaluator, x)), WEIGHED))
+                way = self._in_use.way
             end = way.near(x, NEAR)
         else:
             searches = self.settings.optimizer != "least_squares"

@@ -88,20 +88,11 @@ class Residuals:
         count = self.num_recordings
         return replace(self, error=self.error[:, :, :count], where=self.where[:, :count], with_torques=False)
 
-    def torque_rms(self, dataset: Dataset, where: torch.Tensor | None = None) -> torch.Tensor:
-        """Root mean square error of the first candidate's torques, (n,) [N m]; 0 where none is followed.
-
-        Args:
-            dataset: Whose residuals these are.
-            where: Which of their samples count, (K, R) bool; ``None``: all.
-        """
-        torques, count = dataset.torques, self.num_recordings
-        if torques is None or not self.with_torques:
-            return torch.zeros(self.error.shape[-1], dtype=torch.float64)
-        known = torques.known[self.step] & self.where[:, count:, None]
-        known = known if where is None else known & where[..., None]
-        square = (self.error[0, :, count:].square() * known).sum(dim=(0, 1)) / known.sum(dim=(0, 1)).clamp(min=1)
-        return torch.where(torques.weight > 0, square.sqrt() / torques.weight.clamp(min=1e-300), 0.0)
+    def torque_errors(self, torques: Torques) -> tuple[torch.Tensor, torch.Tensor]:
+        """Errors of the first candidate's torques [N m], and where they are known, (K, R, n) each."""
+        count = self.num_recordings
+        known = torques.known[self.step] & self.where[:, count:, None] & (torques.weight > 0)
+        return self.error[0, :, count:] / torques.weight.clamp(min=1e-300) * known, known
 
     def columns_of(self, recording: int) -> list[int]:
         """Columns of a recording: its positions, and its torques."""

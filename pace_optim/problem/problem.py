@@ -42,7 +42,7 @@ from pace_optim.problem.moving_base import on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques, widen_bounds
-from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
+from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
 from pace_optim.recording.parts import affordable
@@ -196,6 +196,15 @@ class Problem:
             each.sim2real.torque_offsets = {}
         dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
         return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
+
+    @property
+    def torque_noise(self) -> dict[str, float]:
+        """Noise that torques are weighed by, by joint [N m]; none where none is followed."""
+        torques = self.dataset.torques
+        if torques is None:
+            return {}
+        followed = zip(self.joint_names, torques.noise.tolist(), torques.weight.tolist(), strict=True)
+        return {joint: noise for joint, noise, weight in followed if weight > 0}
 
     def with_torque_noise(self, noise: Mapping[str, float]) -> Problem:
         """The same with other noise of the torques that are followed, by joint [N m]."""
@@ -424,12 +433,17 @@ def _posed(
     asked = unknown
     measured, unknown, channel = _read_torques(env, [*groups[0], *groups[1]], control_dt, unknown, residual)
     told, bounds = lift_limits(cfg, measured.recordings, unknown)
+    effects = list(effects or sim2real.effects)
+    if channel.noise and not LIMITS.keys() & set(unknown):
+        cut = channel.noise.keys() & measured.taken.get("effort_limit", frozenset())
+        told, limits, effects = refined_limits(told, cut, effects)
+        bounds, unknown = {**bounds, **limits}, (*unknown, *(["effort_limit"] if limits else []))
     gains = measured.gain_bounds(unknown, GAINS, channel.noise)
-    for fact in set(unknown) - set(asked):  # gains that are stated beside those that are read
+    for fact in GAINS.keys() & (set(unknown) - set(asked)):  # gains that are stated beside those that are read
         gains[GAINS[fact]] = dict.fromkeys(sim2real.joint_order, (1.0, 1.0, 1.0)) | gains.get(GAINS[fact], {})
     sim2real.effect_bounds = {**sim2real.effect_bounds, **bounds, **gains}
     sim2real.torque_offsets = channel.offsets
-    if "effort_limit" in unknown:
+    if "effort_limit" in asked:
         for drive in robot.actuators.values():
             drive.effort_limit.fill_(math.inf)
     if measured.delay_bounds is not None:  # sought where the recordings' torques have it, or from there
@@ -444,7 +458,7 @@ def _posed(
         sim2real.set_bounds("armature", torch.maximum(low, torch.minimum(least, 0.5 * (low + high))))
     if is_model_file(facts.task):
         sim2real.start_params = {**sim2real.start_params, **start_by_torques(env, recordings)}
-    simulated = _configured(cfg, physics_dt, with_unknown(effects or sim2real.effects, unknown))
+    simulated = _configured(cfg, physics_dt, with_unknown(effects, unknown))
     space, trees = ParameterSpace.of(simulated.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), simulated.decimation, max_duration, tell

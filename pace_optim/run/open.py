@@ -105,8 +105,8 @@ class Run:
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
         path = self.folder / "result.json"
-        if problem.dataset.torques is not None and path.is_file():
-            problem = problem.with_torque_noise(FitResult.load(path).torque_rmse.get("train", {}))
+        if problem.torque_noise and path.is_file():
+            problem = problem.with_torque_noise(FitResult.load(path).torque_noise)
         if data:  # other recordings have other bounds; the run's values must be within
             problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)

@@ -23,7 +23,7 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
-from pace_optim.recording.dataset import Dataset
+from pace_optim.recording.dataset import Torques
 from pace_optim.recording.notes import notes_by_kind
 
 
@@ -63,7 +63,9 @@ class FitResult(DriveResult):
     contested: list[str] = field(default_factory=list)
     """Facts that are stated and that the torque in a recording contradicts."""
     torque_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]; empty: it follows none."""
+    """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]."""
+    torque_noise: dict[str, float] = field(default_factory=dict)
+    """Standard deviation of the noise that they are weighed by, by joint [N m]; empty: it follows none."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
@@ -151,10 +153,16 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     }
 
 
-def torque_rmse(residuals: Residuals, dataset: Dataset, where: torch.Tensor | None = None) -> dict[str, float]:
+def torque_rmse(
+    residuals: Residuals, torques: Torques | None, where: torch.Tensor, joint_names: tuple[str, ...]
+) -> dict[str, float]:
     """Root mean square error of each torque that is followed, over a (K, R) part of the samples [N m]."""
-    values = residuals.torque_rms(dataset, where).tolist()
-    return {joint: value for joint, value in zip(dataset.recordings[0].joint_names, values, strict=True) if value > 0}
+    if torques is None:
+        return {}
+    error, known = residuals.torque_errors(torques)
+    count = (known & where[..., None]).sum(dim=(0, 1))
+    square = (error.square() * where[..., None]).sum(dim=(0, 1)) / count.clamp(min=1)
+    return {joint: math.sqrt(v) for joint, v, k in zip(joint_names, square.tolist(), count.tolist(), strict=True) if k}
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
@@ -271,12 +279,11 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
-        torque_rmse={}
-        if data.torques is None
-        else {
-            "train": torque_rmse(residuals, data, train),
-            "validation": torque_rmse(residuals, data, validation),
+        torque_rmse={
+            "train": torque_rmse(residuals, data.torques, train, problem.joint_names),
+            "validation": torque_rmse(residuals, data.torques, validation, problem.joint_names),
         },
+        torque_noise=problem.torque_noise,
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
         findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),

@@ -28,7 +28,7 @@ def summary(result: FitResult) -> list[str]:
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     error = f"error, all joints: {errors_of(result, 'all')} mrad (train / validation); score {result.score:.3e} rad²"
     lines.append(units_for(error, result.joint_types))
-    if result.torque_rmse:
+    if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
         parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
