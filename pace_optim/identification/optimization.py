@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -36,11 +36,11 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP, TORQUE_NOISE, POSITIONS, WEIGHED = (
-    "loop of {:g} s, ", "step of {:g} s, ", "torque noise {}, ", "positions, ", "torque noise, "
+OTHER_LOOP, FINER_STEP, FURTHER, TORQUE_NOISE, POSITIONS, WEIGHED = (
+    "loop of {:g} s, ", "step of {:g} s, ", "further {}, ", "torque noise {}, ", "positions, ", "torque noise, ",
 )  # fmt: skip
-"""What the stages' names begin with: with another loop, at a finer step, by the noise that torques have, without
-torques, and by that noise from a vector that is known."""
+"""What the stages' names begin with: with another loop, at a finer step, where pieces had not ended, by the noise that
+torques have, without torques, and by that noise from a vector that is known."""
 _TORQUE_ATTEMPTS = 3
 """Times that the noise of torques is set."""
 _BY_CHANCE = 2.0
@@ -51,6 +51,8 @@ _STEP_IN_DOUBT = 1.3
 """Times the noise above which a fit may go on at half its physics step ..."""
 _OF_THE_STEP = 0.25
 """... where the step makes this part of what is above the noise, ..."""
+_OF_TORQUES = 0.7
+"""Part of what torques leave that is left of it at half a physics step that shows."""
 _HALVINGS = 2
 """... so many times."""
 _FEWEST_GENERATIONS = 5
@@ -174,6 +176,10 @@ class Optimization:
             return way
         if way is not None:
             best = min(way.descents, key=lambda d: d.score)
+        for attempt in range(_TORQUE_ATTEMPTS):  # what is left before a descent has ended is no noise
+            if best.stop_reason == "converged":
+                break
+            best = self._course(self.problem, FURTHER.format(attempt)).way.begin([best.x])
         self._use(self._by_torque_noise(best.x))
         return self._in_use.way
 
@@ -184,8 +190,10 @@ class Optimization:
         filter makes errors that are none. A change of parameters is as the square of a torque's weight, and χ² of the
         positions as the square of that.
         """
-        problem, size = self.problem, int(self.problem.space.moves.sum())
         noise = self._torque_noise(self._in_use.way.pieces, x)
+        while (found := self._at_finer_step(x, noise)) is not None:
+            x, noise = found
+        problem, size = self.problem, int(self.problem.space.moves.sum())
         alone: torch.Tensor | None = None
         for attempt in range(1, _TORQUE_ATTEMPTS + 1):
             course = self._course(problem.with_torque_noise(noise), TORQUE_NOISE.format(attempt))
@@ -205,6 +213,28 @@ class Optimization:
             }
             x = alone
         return course
+
+    def _at_finer_step(
+        self, x: torch.Tensor, noise: Mapping[str, float]
+    ) -> tuple[torch.Tensor, dict[str, float]] | None:
+        """Where pieces end at half the physics step, and what torques leave there, if that is far less for one of them.
+
+        Torques show a step before positions do: sensors are good to a part of a hundred.
+        """
+        floor = self.problem.torque_floor
+        above = [joint for joint, value in noise.items() if value > _STEP_IN_DOUBT * floor.get(joint, np.inf)]
+        if not above or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+            return None
+        problem = self.problem.with_physics_dt(self.problem.physics_dt / 2)
+        finer = self._course(problem, FINER_STEP.format(problem.physics_dt))
+        end = finer.way.begin([x])
+        left = self._torque_noise(finer.way.pieces, end.x)
+        if not any(left[joint] < _OF_TORQUES * noise[joint] for joint in above):
+            return None
+        self._halvings += 1
+        self.progress.say(f"the physics step shows in torques: going on with one of {1e3 * problem.physics_dt:g} ms")
+        self._use(finer)
+        return end.x, left
 
     def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
         """What torques leave at a normalised vector (size,), by joint [N m]."""

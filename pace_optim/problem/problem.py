@@ -201,10 +201,18 @@ class Problem:
     def torque_noise(self) -> dict[str, float]:
         """Noise that torques are weighed by, by joint [N m]; none where none is followed."""
         torques = self.dataset.torques
-        if torques is None:
-            return {}
-        followed = zip(self.joint_names, torques.noise.tolist(), torques.weight.tolist(), strict=True)
-        return {joint: noise for joint, noise, weight in followed if weight > 0}
+        return {} if torques is None else self._followed(torques, torques.noise)
+
+    @property
+    def torque_floor(self) -> dict[str, float]:
+        """What it is at least."""
+        torques = self.dataset.torques
+        return {} if torques is None else self._followed(torques, torques.floor)
+
+    def _followed(self, torques: Torques, values: torch.Tensor) -> dict[str, float]:
+        """Values of joints whose torques are followed, by joint."""
+        each = zip(self.joint_names, values.tolist(), torques.weight.tolist(), strict=True)
+        return {joint: value for joint, value, weight in each if weight > 0}
 
     def with_torque_noise(self, noise: Mapping[str, float]) -> Problem:
         """The same with other noise of the torques that are followed, by joint [N m]."""
