@@ -201,7 +201,7 @@ class Optimization:
             if alone is None:
                 without = self._course(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), POSITIONS)
                 alone = without.way.begin([end.x]).x
-            with self._found_again():
+            with self._found_again(course.way.pieces):
                 both = course.way.pieces.residuals(problem.space.to_physical(torch.stack([end.x, alone]))).positions
             (followed, best), count = both.joint_score, int(problem.dataset.train.sum())
             chi2 = count * (followed / best - 1) / (_BY_CHANCE * size / len(noise))
@@ -238,15 +238,15 @@ class Optimization:
 
     def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
         """What torques leave at a normalised vector (size,), by joint [N m]."""
-        with self._found_again():
+        with self._found_again(evaluator):
             residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
         torques = evaluator.dataset.torques
         values = [] if torques is None else torque_noise(residuals, torques)
         return dict(zip(self.problem.joint_names, values, strict=False))
 
-    def _found_again(self) -> AbstractContextManager[None]:
+    def _found_again(self, evaluator: Evaluator) -> AbstractContextManager[None]:
         """Of what a run that is resumed simulates once more: it was counted before."""
-        return self._in_use.way.pieces.again() if self._restored else nullcontext()
+        return evaluator.again() if self._restored else nullcontext()
 
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
