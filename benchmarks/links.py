@@ -3,10 +3,12 @@
     python benchmarks/links.py                     # all cases, then the table
     python benchmarks/links.py --only ur5e         # of some robots
     python benchmarks/links.py --table             # of what is done
+    python benchmarks/links.py --labels torque     # with measured torques and without stated gains
 
 Plants are plain MuJoCo robots of public wheels (`wheel_plant.py`, which shares no code with the project): PD loops at
 1 kHz, encoder noise of 0.1 mrad. The plant has the file's links; the fit gets a copy of the file with one deliberate
-error, or the plant carries a tool that the file does not have. Wheels, logs and runs lie in the cache of
+error, or the plant carries a tool that the file does not have. Sensors of torques have scales within 5 % of 1, offsets
+of 2 % and noise of 1 % of the torque. Wheels, logs and runs lie in the cache of
 `wheel_robots.py`. Each finished case is a line of `CACHE/results_links.jsonl`.
 """
 
@@ -127,22 +129,41 @@ def true_plant(case: Case, path: Path) -> Plant:
     return plant
 
 
-def make_logs(case: Case, cache: Path) -> tuple[Path, Path, Drives]:
-    """Log and held-out log of a case, made where they are not in the cache."""
+def make_logs(case: Case, cache: Path, sensed: bool) -> tuple[Path, Path, Drives]:
+    """Log and held-out log of a case, made where they are not in the cache; with torques they state no gains."""
     path = model_file(ROBOTS[case.robot], cache)
     folder = cache / "links" / case.robot
     folder.mkdir(parents=True, exist_ok=True)
     seed = zlib.crc32(case.robot.encode()) % 10_000 + case.seed
     drives = draw(load(path), seed)
     drives = replace(drives, rate=400.0)
-    kind = f"{case.name if case.kind == 'tool' else f'clean_{case.seed}'}_{SECONDS:g}s"
+    kind = f"{case.name if case.kind == 'tool' else f'clean_{case.seed}'}_{SECONDS:g}s{'_torque' if sensed else ''}"
     files = folder / f"{kind}.csv", folder / f"{kind}_held_out.csv"
     for number, (file, seconds) in enumerate(zip(files, (SECONDS, HELD_OUT_SECONDS), strict=True), start=1):
         if not file.is_file():
             target = commands(drives, seconds, seed + number)
             plant = true_plant(case, path)
-            _write_log(file, plant, drives, target, log(plant, drives, target, seed + 10 * number))
+            torques = np.zeros_like(target) if sensed else None
+            _write_log(file, plant, drives, target, log(plant, drives, target, seed + 10 * number, torques))
+            if torques is not None:
+                _add_torques(file, drives, torques, seed, number)
     return *files, drives
+
+
+def _add_torques(file: Path, drives: Drives, torques: np.ndarray, seed: int, number: int) -> None:
+    """Columns of what sensors show of torques (T, n) [N m]; the log's gains are not stated any more."""
+    size, n = torques.std(axis=0), len(drives.joints)
+    sensors, noise = np.random.default_rng(seed), np.random.default_rng(seed + 100 * number)
+    shown = torques * sensors.uniform(0.95, 1.05, n) + sensors.uniform(-0.02, 0.02, n) * size
+    shown += 0.01 * size * noise.normal(size=torques.shape)
+    lines = file.read_text().splitlines()
+    lines[0] += "".join(f",dof_effort/{joint}" for joint in drives.joints)
+    lines[1:] = [
+        f"{line},{','.join(f'{value:.8g}' for value in row)}" for line, row in zip(lines[1:], shown, strict=True)
+    ]
+    file.write_text("\n".join(lines) + "\n")
+    facts = {key: value for key, value in drives.facts().items() if key not in ("stiffness", "damping")}
+    file.with_suffix(".json").write_text(json.dumps(facts))
 
 
 def truth_of(case: Case, path: Path) -> tuple[float, np.ndarray]:
@@ -154,7 +175,7 @@ def truth_of(case: Case, path: Path) -> tuple[float, np.ndarray]:
 
 def run_case(case: Case, options: list[str], label: str, name: bool, cache: Path) -> dict:
     """Fit one robot as a user would, and perhaps ask which link is wrong; returns its line."""
-    data, held_out, drives = make_logs(case, cache)
+    data, held_out, drives = make_logs(case, cache, label == "torque")
     runs = cache / "runs" / "links" / label / case.robot / case.name
     runs.mkdir(parents=True, exist_ok=True)
     words = [sys.executable, ROOT / "scripts" / "fit.py", "--task", wrong_file(case, cache), "--data", data]
@@ -178,6 +199,8 @@ def run_case(case: Case, options: list[str], label: str, name: bool, cache: Path
     result = json.loads((Path(folder) / "result.json").read_text())
     row["held_out_mrad"] = 1e3 * result["rmse"]["validation"]["all"]
     row["drive_error"] = drive_errors(result, drives.truth())
+    if label == "torque":
+        row["drive_error"] |= gain_errors(result, drives)
     if case.link and case.link in result.get("links", {}):
         mass, com = truth_of(case, model_file(ROBOTS[case.robot], cache))
         found = result["links"][case.link]
@@ -211,6 +234,16 @@ def drive_errors(result: dict, truth: dict) -> dict[str, float]:
     return errors
 
 
+def gain_errors(result: dict, drives: Drives) -> dict[str, float]:
+    """Largest relative error of the gains, which a fit finds as factors of what it read from the torques."""
+    errors = {}
+    for name, gain in (("stiffness", "proportional_gain.gain"), ("damping", "derivative_gain.gain")):
+        factors, laws = result["parameters"].get(gain, {}), result["measured_drive"]
+        found = [factors.get(j, 1.0) * next(iter(laws[j].values()))[name] for j in drives.joints]
+        errors[name] = float(np.abs(np.array(found) / getattr(drives, name) - 1).max())
+    return errors
+
+
 def table(rows: list[dict]) -> str:
     """What is done, as Markdown."""
     lines = [
@@ -235,7 +268,10 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), metavar="ROBOT")
     parser.add_argument("--kinds", nargs="+", default=["clean", "mass", "com", "tool"], metavar="KIND")
     parser.add_argument(
-        "--labels", nargs="+", default=["file", "links"], help="file: with the file alone; links: with --links"
+        "--labels",
+        nargs="+",
+        default=["file", "links"],
+        help="file: with the file alone; links: with --links; torque: that with measured torques, no stated gains",
     )
     parser.add_argument("--table", action="store_true", help="print what is done, run nothing")
     parser.add_argument("--cache", type=Path, default=CACHE)
@@ -248,8 +284,9 @@ def main() -> None:
         for label in args.labels:
             if label == "links" and not case.link:
                 continue
+            seeks = label != "file" and case.link
             parts = {"mass": "mass", "com": "com", "tool": "load"}.get(case.kind)
-            options = ["--links", f"{case.link}@{parts}"] if label == "links" else []
+            options = ["--links", f"{case.link}@{parts}"] if seeks else []
             row = run_case(case, options, label, label == "file", args.cache)
             rows = [r for r in rows if (r["robot"], r["case"], r["label"]) != (case.robot, case.name, label)] + [row]
             done.write_text("".join(json.dumps(r) + "\n" for r in rows))

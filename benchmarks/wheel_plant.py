@@ -364,8 +364,15 @@ def commands(drives: Drives, seconds: float, seed: int) -> np.ndarray:
     return drives.home + 1.5 * drives.amplitude * wave * ramp**2 * (3 - 2 * ramp)
 
 
-def log(plant: Plant, drives: Drives, target: np.ndarray, seed: int) -> np.ndarray:
+def log(plant: Plant, drives: Drives, target: np.ndarray, seed: int, torques: np.ndarray | None = None) -> np.ndarray:
     """Positions that the encoders show at the log's rate, (T, n), with noise.
+
+    Args:
+        plant: The robot.
+        drives: Its drives.
+        target: What they are told, (T, n).
+        seed: Of the noise.
+        torques: Gets the motors' torques at the same instants, (T, n) [N m].
 
     Raises:
         ValueError: If the robot does not stay where its commands are: a mistake of the drawing, not of a fit.
@@ -399,6 +406,8 @@ def log(plant: Plant, drives: Drives, target: np.ndarray, seed: int) -> np.ndarr
             torque = np.clip(asked, -drives.effort_limit, drives.effort_limit)
             if drives.hidden == "torque_constant":
                 torque = np.where(hit, 0.75, 1.0) * torque
+        if torques is not None and now >= 0 and now % per_row == 0:
+            torques[now // per_row] = torque
         force = torque.copy()
         if drives.hidden == "stribeck":
             extra = hit * 1.5 * np.exp(-((data.qvel[dofs] / slow) ** 2))

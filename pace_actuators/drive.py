@@ -245,7 +245,7 @@ class Drive:
         self._jump: Jump | None = None
 
         self.computed_effort = torch.zeros_like(self.stiffness)
-        self.applied_effort = self._held_effort = torch.zeros_like(self.stiffness)
+        self.applied_effort = self._held_effort = self.motor_effort = torch.zeros_like(self.stiffness)
         delayed = ("positions", "velocities", "efforts") if cfg.delay_mode == "command" else ("torque",)
         dt = self._physics_dt = cfg.physics_dt or physics_dt
         delay, max_delay = delay_in_steps(cfg, dt)

@@ -172,6 +172,7 @@ class PaceDCMotor(DriveWithEffects):
 
     Attributes:
         computed_effort: The controller's torque before the drive's limits [N m], (num_envs, num_joints).
+        motor_effort: The motor's torque, before friction and transmission [N m], (num_envs, num_joints).
         applied_effort: The torque at the joint [N m], (num_envs, num_joints).
         stiffness, damping, effort_limit, saturation_effort, velocity_limit: See the configuration;
             each (num_envs, num_joints) and writable per environment.
@@ -236,7 +237,7 @@ class PaceDCMotor(DriveWithEffects):
                 self._loop_slope = self._loop_slope * self.effects.state.speed_slope
         if self._feeds_back:
             asked, self._loop_slope = self.effects.fed_back(asked)  # type: ignore[union-attr]
-        effort = self.drive_effort(asked, joint_pos, joint_vel)
+        effort = self.motor_effort = self.drive_effort(asked, joint_pos, joint_vel)
         self._jump = None
         if self.effects is not None:
             effort = self.transmitted_effort(effort)

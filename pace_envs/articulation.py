@@ -37,6 +37,8 @@ class Articulation(RobotState):
         super().__init__(cfg, sim)
         self._links = LinkInertias(sim, self._layout.driven.joints)
         self._columns: dict[PaceDCMotor, torch.Tensor] = {}
+        self.note_torque: torch.Tensor | None = None
+        """Gets the motors' torques [N m], (num_envs, n), when the drives next run."""
         self._build_actuators()
         self.reset()
 
@@ -131,7 +133,7 @@ class Articulation(RobotState):
 
     def write_data_to_sim(self) -> None:
         """Run the drives on the present targets and state, and apply their torques."""
-        data = self.data
+        data, noted, self.note_torque = self.data, self.note_torque, None
         for actuator in self.actuators.values():
             ids, place = actuator.joint_indices, self._place_of(actuator)
             self._tell_link(actuator)
@@ -146,6 +148,8 @@ class Articulation(RobotState):
             else:
                 data.computed_torque[:, ids] = actuator.computed_effort
                 data.applied_torque[:, ids] = efforts
+            if noted is not None:
+                noted[:, ids] = actuator.motor_effort
             self._sim.qfrc_applied[:, place] = actuator.held_effort
             if actuator.changes_passive or actuator.changes_armature:
                 self._write_what_drags(actuator, place)

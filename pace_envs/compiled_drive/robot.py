@@ -36,6 +36,8 @@ class DriveProgram:
     """What becomes of leaves in a control step, by index."""
     shown: Node
     """What the encoders show before it."""
+    torque: Node
+    """What the motor gives in its first physics step [N m]."""
     entries: list[int]
     """How many numbers each leaf has."""
     leaves: list[Read]
@@ -82,8 +84,10 @@ def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor)
         shown = cast(Symbol, robot.sensed_joint_pos()).cell.node
         if dataset.torque_enable is not None:
             actuator.set_torque_enable(cast(torch.Tensor, places.symbol("torque_enable")))
+        torque: Node | None = None
         for _ in range(env.cfg.decimation):
             robot.write_data_to_sim()
+            torque = torque or cast(Symbol, actuator.motor_effort).cell.node
             sim.step()
             robot.update()
         sim.end()
@@ -96,6 +100,7 @@ def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor)
         written=sim.written,
         updates=updates,
         shown=shown,
+        torque=cast(Node, torque),
         entries=places.entries,
         leaves=places.reads,
         rings=[read for _, read in used],

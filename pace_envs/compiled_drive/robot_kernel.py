@@ -45,12 +45,15 @@ class CompiledRobot:
         self._kernel: RobotKernel | None = None
         self._refused = False
 
-    def positions(self, at: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor | None:
+    def positions(
+        self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
+    ) -> torch.Tensor | None:
         """What the encoders show, without their bias, (len(at), num_envs, n) [rad]; ``None``: the drives must.
 
         Args:
             at: Control steps, ascending, all after the first, which has been made.
             state: Gets MuJoCo's positions and speeds at them, (len(at), num_envs, nq + nv) float64.
+            torque: Gets the motors' torques at them, (len(at), num_envs, n) float64 [N m].
 
         Raises:
             ValueError: If MuJoCo refuses to step a robot.
@@ -62,7 +65,7 @@ class CompiledRobot:
             if self._kernel is None:
                 self._kernel = RobotKernel(self._env, self._dataset, kernels, self._course)
             self._kernel.record()
-            return self._kernel.positions(at, state) if self._kernel.pays(int(at[-1])) else None
+            return self._kernel.positions(at, state, torque) if self._kernel.pays(int(at[-1])) else None
         except CannotCompileError:
             self._refused = True
             return None
@@ -122,12 +125,15 @@ class RobotKernel:
         series = [commands(self._env, self._dataset, name).double() for name in self._source.series]
         self._series = torch.stack(series).contiguous() if series else torch.zeros(1, dtype=torch.float64)
 
-    def positions(self, at: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+    def positions(
+        self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """What the encoders show, without their bias, at control steps after the first, (len(at), num_envs, n) [rad].
 
         Args:
             at: Control steps, ascending, all above 0.
             state: Gets MuJoCo's positions and speeds at them, (len(at), num_envs, nq + nv) float64.
+            torque: Gets the motors' torques at them, (len(at), num_envs, n) float64 [N m].
 
         Raises:
             CannotCompileError: If what was recorded cannot be compiled.
@@ -164,6 +170,7 @@ class RobotKernel:
             "commands": len(self._dataset.command),
             **{name: tensor.data_ptr() for name, tensor in tensors.items()},
             "state": 0 if state is None else state.data_ptr(),
+            "effort": 0 if torque is None else torque.data_ptr(),
         }
         block = max(1, _BLOCK // env.num_envs)
         for first in range(1, end + 1, block):

@@ -4,7 +4,7 @@ import os
 import sys
 
 from pace_actuators.text import listed
-from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, UNKNOWN_FACTS
+from pace_optim.terminal.choices import DELAY_MODES, OPTIMIZERS, RESIDUALS, UNKNOWN_FACTS
 from pace_optim.terminal.cli import given_options, make_parser
 from pace_optim.terminal.options import (
     add_common_options,
@@ -65,6 +65,14 @@ def main() -> None:
         default=[],
         metavar="FACT",
         help=f"unknown facts of the drives, to be identified: {', '.join(UNKNOWN_FACTS)}",
+    )
+    parser.add_argument(
+        "--residual",
+        nargs="+",
+        default=[],
+        choices=RESIDUALS,
+        metavar="NAME",
+        help="what is fitted: position (default), or position effort with the measured torques too",
     )
     parser.add_argument(
         "--optimizer",

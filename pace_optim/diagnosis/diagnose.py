@@ -57,12 +57,12 @@ def diagnose(
     candidate_effects(settings.effects, only=settings.only)  # before the work: complains about names
     fits = fits_on(settings.device, settings.cfg.fitting)
     physics_dt = settings.physics_dt or min(result.physics_dt, 0.5 * result.control_dt)
-    whole = _as_found(run.problem(physics_dt=physics_dt), result).with_links(result.links)
+    whole = run.problem(physics_dt=physics_dt).with_links(result.links)
     values = {name: result.parameters[name] for name in whole.space.slices}
     wrong = LinkFindings()
     if settings.links and not whole.joints_stand_alone:  # there an effect on the joint says the same
         wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, settings.cfg.links)
-    problem = whole.with_effects(()).with_links(wrong.links)
+    problem = _as_found(whole, result).with_effects(()).with_links(wrong.links).on_positions()
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)
     candidates = candidate_effects(settings.effects, only=settings.only, switched_off=off)
@@ -139,7 +139,7 @@ def _refit(
     """
     progress.say(f"fitting the whole robot with {', '.join([*(each.link for each in wrong.wrong), *found.paying])}")
     final, before = found.outcome.final, FitResult.load(run.folder)
-    links = {name: dict(before.parameters[name]) for name in before.link_parameters}
+    links = {name: dict(before.parameters[name]) for name in (*before.link_parameters, *before.sensor_parameters)}
     for each in wrong.wrong:
         for value in each.values:
             links.setdefault(value["parameter"], {})[each.link] = value["found"]

@@ -49,6 +49,8 @@ class Colouring:
     """Entries perturbed together."""
     joints: tuple[tuple[int, ...], ...]
     """For each entry of the vector, the indices of the joints that it moves."""
+    sensors: tuple[int, ...] = ()
+    """Entries that change what sensors show, and no motion: each is perturbed without the others of its tree."""
 
 
 def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
@@ -75,7 +77,8 @@ def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: S
         tuple(index[name] for name in (joint_names if owner is None else trees[owner])) if free[entry] else ()
         for entry, owner in enumerate(owners)
     )
-    return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints)
+    sensors = tuple(entry for entry, moves in enumerate(space.moves.tolist()) if not moves)
+    return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints, sensors=sensors)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,11 +154,13 @@ def _principal_directions(hessian: torch.Tensor, x: torch.Tensor, colouring: Col
     """A direction for each entry whose largest component is 1, (size, size).
 
     Those of a tree's own entries are the principal directions of their part of H; those of entries that several trees
-    share, what these change although the others make up for it. An entry at a bound, or without influence, is alone.
+    share, what these change although the others make up for it. An entry at a bound, without influence, or of a sensor
+    is alone.
     """
     joints = colouring.joints
     least = NO_INFLUENCE * float(hessian.diagonal().max())
     inner = [i for i in range(len(x)) if float(hessian[i, i]) > least and 1 - abs(float(x[i])) > _AT_BOUND]
+    inner = [i for i in inner if i not in colouring.sensors]
     result = torch.eye(len(x), dtype=torch.float64)
     trees = {joints[i] for i in inner}
     shared = [i for i in inner if any(set(tree) < set(joints[i]) for tree in trees)]

@@ -271,8 +271,9 @@ def _consistent(run: Optimization, end: _End) -> _End:
     """Fit each recording alone, where there are several and the optimizer can afford it."""
     if not run.settings.check_consistency or run.settings.optimizer == "cmaes":
         return end
-    train = end.problem.dataset.train[end.at.residuals.step]
-    score = float(end.at.residuals.error[0].square()[train].sum(dim=1).mean())
+    every = end.at.residuals
+    train = end.problem.dataset.train[every.step].repeat(1, 1 + every.with_torques) & every.where
+    score = float(every.error[0].square()[train].sum(dim=1).mean())
     result = check_consistency(end.problem, end.x, score, run.progress.say, end.jacobian)
     if result.recordings:
         run.folder.write_json("consistency.json", asdict(result))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
+from pace_optim.estimate.error_bars.torque_noise import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
@@ -34,14 +36,23 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-OTHER_LOOP, FINER_STEP = "loop of {:g} s, ", "step of {:g} s, "
-"""What the stages' names begin with on the way of another loop, and at a finer step."""
+OTHER_LOOP, FINER_STEP, FURTHER, TORQUE_NOISE, POSITIONS, WEIGHED = (
+    "loop of {:g} s, ", "step of {:g} s, ", "further {}, ", "torque noise {}, ", "positions, ", "torque noise, ",
+)  # fmt: skip
+"""What the stages' names begin with: with another loop, at a finer step, where pieces had not ended, by the noise that
+torques have, without torques, and by that noise from a vector that is known."""
+_TORQUE_ATTEMPTS = 3
+"""Times that the noise of torques is set."""
+_BY_CHANCE = 2.0
+"""Times the number of parameters by which χ² of the positions may rise because torques are followed too."""
 _LOOP_IN_DOUBT = 1.5
 """Times the noise above which pieces with an assumed loop rate are fitted with another."""
 _STEP_IN_DOUBT = 1.3
 """Times the noise above which a fit may go on at half its physics step ..."""
 _OF_THE_STEP = 0.25
 """... where the step makes this part of what is above the noise, ..."""
+_OF_TORQUES = 0.7
+"""Part of what torques leave that is left of it at half a physics step that shows."""
 _HALVINGS = 2
 """... so many times."""
 _FEWEST_GENERATIONS = 5
@@ -158,6 +169,85 @@ class Optimization:
         every = {self.searcher, *used}
         return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
 
+    def _elsewhere(self, best: Descent) -> WayDown | None:
+        """The way of other facts, begun at the best end on pieces: another loop rate, the noise that torques have."""
+        way = self._with_other_loop(best)
+        if self.problem.dataset.torques is None:
+            return way
+        if way is not None:
+            best = min(way.descents, key=lambda d: d.score)
+        for attempt in range(_TORQUE_ATTEMPTS):  # what is left before a descent has ended is no noise
+            if best.stop_reason == "converged":
+                break
+            best = self._course(self.problem, FURTHER.format(attempt)).way.begin([best.x])
+        self._use(self._by_torque_noise(best.x))
+        return self._in_use.way
+
+    def _by_torque_noise(self, x: torch.Tensor) -> _Course:
+        """The course on which torques weigh by what they leave on pieces, begun at a normalised vector (size,).
+
+        Their noise grows where positions are then followed worse than without them, by more than noise explains: a
+        filter makes errors that are none. A change of parameters is as the square of a torque's weight, and χ² of the
+        positions as the square of that.
+        """
+        noise = self._torque_noise(self._in_use.way.pieces, x)
+        while (found := self._at_finer_step(x, noise)) is not None:
+            x, noise = found
+        problem, size = self.problem, int(self.problem.space.moves.sum())
+        alone: torch.Tensor | None = None
+        for attempt in range(1, _TORQUE_ATTEMPTS + 1):
+            course = self._course(problem.with_torque_noise(noise), TORQUE_NOISE.format(attempt))
+            end = course.way.begin([x])
+            if alone is None:
+                without = self._course(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), POSITIONS)
+                alone = without.way.begin([end.x]).x
+            with self._found_again(course.way.pieces):
+                both = course.way.pieces.residuals(problem.space.to_physical(torch.stack([end.x, alone]))).positions
+            (followed, best), count = both.joint_score, int(problem.dataset.train.sum())
+            chi2 = count * (followed / best - 1) / (_BY_CHANCE * size / len(noise))
+            if not bool((chi2 > 1).any()):
+                break
+            noise = {
+                joint: course.problem.torque_noise.get(joint, 0.0) * more
+                for joint, more in zip(noise, chi2.clamp(min=1.0).pow(0.25).tolist(), strict=True)
+            }
+            x = alone
+        return course
+
+    def _at_finer_step(
+        self, x: torch.Tensor, noise: Mapping[str, float]
+    ) -> tuple[torch.Tensor, dict[str, float]] | None:
+        """Where pieces end at half the physics step, and what torques leave there, if that is far less for one of them.
+
+        Torques show a step before positions do: sensors are good to a part of a hundred.
+        """
+        floor = self.problem.torque_floor
+        above = [joint for joint, value in noise.items() if value > _STEP_IN_DOUBT * floor.get(joint, np.inf)]
+        if not above or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+            return None
+        problem = self.problem.with_physics_dt(self.problem.physics_dt / 2)
+        finer = self._course(problem, FINER_STEP.format(problem.physics_dt))
+        end = finer.way.begin([x])
+        left = self._torque_noise(finer.way.pieces, end.x)
+        if not any(left[joint] < _OF_TORQUES * noise[joint] for joint in above):
+            return None
+        self._halvings += 1
+        self.progress.say(f"the physics step shows in torques: going on with one of {1e3 * problem.physics_dt:g} ms")
+        self._use(finer)
+        return end.x, left
+
+    def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
+        """What torques leave at a normalised vector (size,), by joint [N m]."""
+        with self._found_again(evaluator):
+            residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
+        torques = evaluator.dataset.torques
+        values = [] if torques is None else torque_noise(residuals, torques)
+        return dict(zip(self.problem.joint_names, values, strict=False))
+
+    def _found_again(self, evaluator: Evaluator) -> AbstractContextManager[None]:
+        """Of what a run that is resumed simulates once more: it was counted before."""
+        return evaluator.again() if self._restored else nullcontext()
+
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
         problem, noise = self.problem, noise_score(self.problem)
@@ -240,11 +330,15 @@ class Optimization:
             self._search(self.optimizer)
             return Outcome(x=self._best_of(self.optimizer), stop_reasons=self._search_stop)
         if self.settings.start is not None:
-            end = self.way.near(as_vector(self.problem, self.settings.start), NEAR)
+            x, way = as_vector(self.problem, self.settings.start), self.way
+            if self.problem.dataset.torques is not None:
+                self._use(self._course(self.problem.with_torque_noise(self._torque_noise(self.evaluator, x)), WEIGHED))
+                way = self._in_use.way
+            end = way.near(x, NEAR)
         else:
             searches = self.settings.optimizer != "least_squares"
             starts = self._without_effects_too(self.problem.space.start)
-            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._with_other_loop)
+            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])

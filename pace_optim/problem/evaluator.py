@@ -9,20 +9,17 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
-from pace_optim.recording.dataset import Dataset
-from pace_optim.recording.noise import noise_variance
+from pace_optim.recording.dataset import Dataset, Torques
+from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
 
 _WIDEST = 512
-
-
-_LEAST_NOISE = 1e-7
-"""Noise that a prior is weighed by where recordings have less [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,18 +58,45 @@ class Prior:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """Errors q_sim - bias - q_measured of m candidates at K steps of R recordings and n joints."""
+    """Errors q_sim - bias - q_measured of m candidates at K steps of R recordings and n joints.
+
+    Where torques are followed too, R more columns have their errors, s τ_sim + o - τ_measured, times
+    :attr:`~pace_optim.recording.dataset.Torques.weight`: all that looks at columns weighs both by their noise.
+    """
 
     error: torch.Tensor
-    """(m, K, R, n) [rad]; zero where a recording has no sample."""
+    """(m, K, R or 2 R, n) [rad]; zero where a recording has no sample."""
     where: torch.Tensor
-    """Where there is a sample, (K, R) bool."""
+    """Where there is a sample, (K, R or 2 R) bool."""
     step: torch.Tensor
     """Control step of each of the K steps, (K,)."""
     weight: torch.Tensor | None = None
     """What errors were multiplied by, (K, R, n): see :attr:`~pace_optim.recording.dataset.Dataset.weight`."""
     prior: Prior | None = None
     """Of the candidates; ``None``: no parameter has one."""
+    with_torques: bool = False
+    """Whether the second half of the columns are torques."""
+
+    @property
+    def num_recordings(self) -> int:
+        """R."""
+        return self.where.shape[1] // (1 + self.with_torques)
+
+    @property
+    def positions(self) -> Residuals:
+        """Without torques."""
+        count = self.num_recordings
+        return replace(self, error=self.error[:, :, :count], where=self.where[:, :count], with_torques=False)
+
+    def torque_errors(self, torques: Torques) -> tuple[torch.Tensor, torch.Tensor]:
+        """Errors of the first candidate's torques [N m], and where they are known, (K, R, n) each."""
+        count = self.num_recordings
+        known = torques.known[self.step] & self.where[:, count:, None] & (torques.weight > 0)
+        return self.error[0, :, count:] / torques.weight.clamp(min=1e-300) * known, known
+
+    def columns_of(self, recording: int) -> list[int]:
+        """Columns of a recording: its positions, and its torques."""
+        return list(range(recording, self.where.shape[1], self.num_recordings))
 
     def rows(self, begin: int, end: int) -> Residuals:
         """Those of some of the candidates."""
@@ -243,6 +267,8 @@ class Evaluator:
         data = self.dataset
         mask = data.train if where is None else where
         step = mask.any(dim=1).nonzero()[:, 0]
+        if data.torques is not None and TORQUE_SCALE in self.space.slices:
+            return self._with_torques(physical, mask, step, initial_offset, data.torques)
         rollout = self.rollout(len(physical))
         rollout.start(physical, mask, initial_offset=initial_offset)
         bias = rollout.physical[:, self.space["encoder_bias"]]
@@ -260,6 +286,48 @@ class Evaluator:
         error = self.phases.taken_out(error, step, mask).mul_(weight)
         return Residuals(error=error, where=kept, step=step, weight=weight, prior=self._prior(physical))
 
+    def _with_torques(
+        self,
+        physical: torch.Tensor,
+        mask: torch.Tensor,
+        step: torch.Tensor,
+        initial_offset: torch.Tensor | None,
+        torques: Torques,
+    ) -> Residuals:
+        """Errors of positions and torques; candidates that differ in their sensors alone are simulated once."""
+        motion = physical * self.space.moves
+        keys = motion if initial_offset is None else torch.cat([motion, initial_offset], dim=1)
+        place: dict[tuple[float, ...], int] = {}
+        of = [place.setdefault(tuple(key), len(place)) for key in keys.tolist()]
+        rows = [of.index(i) for i in range(len(place))]
+        rollout = self.rollout(len(rows))
+        rollout.start(physical[rows], mask, initial_offset=None if initial_offset is None else initial_offset[rows])
+        scale, offset = self._sensors(physical)
+        both = rollout.positions_and_torques(step, torques)
+        shown, given = (each.view(len(step), len(rows), self.dataset.num_recordings, -1)[:, of] for each in both)
+        error = shown - physical[:, None, self.space["encoder_bias"]] - self.dataset.measured[step][:, None]
+        off = given.mul_(scale).add_(offset).sub_(torques.measured[step][:, None]).mul_(torques.weight)
+        kept, known = mask[step], torques.known[step] & mask[step][..., None]
+        parts = error.mul_(kept[:, None, :, None]), torch.where(known[:, None], off, 0.0)
+        return Residuals(
+            error=torch.cat(parts, dim=2).permute(1, 0, 2, 3),
+            where=torch.cat([kept, known.any(dim=2)], dim=1),
+            step=step,
+            prior=self._prior(physical),
+            with_torques=True,
+        )
+
+    def _sensors(self, physical: torch.Tensor) -> list[torch.Tensor]:
+        """Scale and offset [N m] of the torques of candidates (m, size), (m, 1, n) each."""
+        parameter = next(p for p in self.space.parameters if p.name == TORQUE_SCALE)
+        names, result = self.dataset.recordings[0].joint_names, []
+        joints = [names.index(key) for key in parameter.keys]
+        for name in (TORQUE_SCALE, TORQUE_OFFSET):
+            values = torch.zeros(len(physical), 1, len(names), dtype=physical.dtype)
+            values[..., joints] = physical[:, None, self.space[name]]
+            result.append(values)
+        return result
+
     def _prior(self, physical: torch.Tensor) -> Prior | None:
         """What is known of candidates (m, size) beforehand."""
         std = self.space.prior
@@ -268,7 +336,7 @@ class Evaluator:
         if self._noise is None:
             recordings = self.dataset.recordings
             trained = [recordings[r] for r in self.dataset.trained()] or recordings
-            self._noise = max(noise_variance(trained), _LEAST_NOISE**2)
+            self._noise = max(noise_variance(trained), LEAST_NOISE**2)
         x = self.space.to_normalised(physical.to("cpu", torch.float64))
         return Prior(x=x, precision=std.pow(-2), noise=self._noise)
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.tasks.pace import GLOBAL, PaceCfg, Parameter, base_parameters, effect_parameters, link_parameters
+from pace_envs.tasks.pace import (
+    GLOBAL,
+    PaceCfg,
+    Parameter,
+    base_parameters,
+    effect_parameters,
+    link_parameters,
+    torque_parameters,
+)
 from pace_optim.problem.box import Box
 
 if TYPE_CHECKING:
@@ -44,6 +52,8 @@ class ParameterSpace:
         self.upper = torch.tensor([v for p in parameters for v in p.upper], dtype=torch.float64)
         self.labels = tuple(f"{p.name}/{key}" for p in parameters for key in p.keys)
         self.is_logarithmic = torch.tensor([p.scale == "log" for p in parameters for _ in p.keys])
+        self.moves = torch.tensor([p.moves for p in parameters for _ in p.keys])
+        """Which entries change how the robot moves, (size,) bool."""
         self._box = Box(self.lower, self.upper, self.is_logarithmic)
         self.prior = torch.tensor(
             [float("inf") if p.prior is None else p.prior for p in parameters for _ in p.keys], dtype=torch.float64
@@ -52,8 +62,9 @@ class ParameterSpace:
 
     @classmethod
     def of(cls, cfg: PaceCfg) -> ParameterSpace:
-        """The space of a robot's configuration: the base parameters, the effects', links', and the user's own."""
-        return cls((*base_parameters(cfg), *effect_parameters(cfg), *link_parameters(cfg), *cfg.extra_parameters))
+        """The space of a robot's configuration: base parameters, those of effects, links, sensors, and the user's."""
+        of_parts = effect_parameters(cfg), link_parameters(cfg), torque_parameters(cfg)
+        return cls((*base_parameters(cfg), *(each for part in of_parts for each in part), *cfg.extra_parameters))
 
     def by_magnitude(self) -> ParameterSpace:
         """The same entries, on a logarithmic scale where no value is negative and the bounds span magnitudes.

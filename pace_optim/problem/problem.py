@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -42,11 +42,11 @@ from pace_optim.problem.moving_base import on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.start import start_by_torques, widen_bounds
-from pace_optim.problem.unknown_facts import GAINS, lift_limits, with_unknown
+from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
-from pace_optim.recording.dataset import Dataset, make_dataset
+from pace_optim.recording.dataset import Dataset, Torques, make_dataset
 from pace_optim.recording.parts import affordable
-from pace_optim.recording.torque import MeasuredDrives, read_drives
+from pace_optim.recording.torque import MeasuredDrives, TorqueChannel, read_drives, torque_channel
 from pace_optim.recording.windows import Windows
 from pace_optim.terminal.choices import DELAY_MODES
 
@@ -83,6 +83,8 @@ class Problem:
     """Whether the control step is that of the log's commands, as nothing states one."""
     assumed_loop: float | None = None
     """Assumed period of the drives' loops [s]; 0: continuous. ``None``: it is stated."""
+    torque_notes: tuple[str, ...] = ()
+    """Which measured torques are followed and which are not, in sentences."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -186,6 +188,38 @@ class Problem:
         for each in (known.plain_cfg, known.env_cfg):
             each.scene.robot.links = {**each.scene.robot.links, **links}
         return known
+
+    def on_positions(self) -> Problem:
+        """The same without the torques that are followed."""
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            each.sim2real.torque_offsets = {}
+        dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
+        return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
+
+    @property
+    def torque_noise(self) -> dict[str, float]:
+        """Noise that torques are weighed by, by joint [N m]; none where none is followed."""
+        torques = self.dataset.torques
+        return {} if torques is None else self._followed(torques, torques.noise)
+
+    @property
+    def torque_floor(self) -> dict[str, float]:
+        """What it is at least."""
+        torques = self.dataset.torques
+        return {} if torques is None else self._followed(torques, torques.floor)
+
+    def _followed(self, torques: Torques, values: torch.Tensor) -> dict[str, float]:
+        """Values of joints whose torques are followed, by joint."""
+        each = zip(self.joint_names, values.tolist(), torques.weight.tolist(), strict=True)
+        return {joint: value for joint, value, weight in each if weight > 0}
+
+    def with_torque_noise(self, noise: Mapping[str, float]) -> Problem:
+        """The same with other noise of the torques that are followed, by joint [N m]."""
+        if (torques := self.dataset.torques) is None:
+            return self
+        values = torch.tensor([noise.get(joint, 0.0) for joint in self.joint_names], dtype=torch.float64)
+        return replace(self, dataset=replace(self.dataset, torques=torques.with_noise(values)))
 
     @property
     def loop_dt(self) -> float:
@@ -317,6 +351,7 @@ def load_problem(
     effects: Sequence[EffectCfg | str] = (),
     links: Sequence[str] = (),
     unknown: Sequence[str] = (),
+    residual: Sequence[str] = (),
     env_cfg: Any = None,
     joints: str | None = None,
     columns: str | Path | None = None,
@@ -342,6 +377,7 @@ def load_problem(
             ``"name@mass,com,inertia"`` with some of these.
         unknown: Unknown facts of the drives (:data:`UNKNOWN_FACTS`): read from the recordings' torques where
             they have them, else identified.
+        residual: What a fit follows: ``"position"`` and ``"effort"``; none: positions alone.
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         joints: Regular expression of the joints to identify; the others are held. ``None``: those of the recordings.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
@@ -367,7 +403,9 @@ def load_problem(
         if facts is not stated:
             env.close()
             env = facts.make_env()
-        return _posed(facts, logs, env, effects, links, unknown, strict=strict, max_duration=max_duration, tell=tell)
+        return _posed(
+            facts, logs, env, effects, links, unknown, residual, strict=strict, max_duration=max_duration, tell=tell
+        )
     finally:
         env.close()
 
@@ -379,6 +417,7 @@ def _posed(
     effects: Sequence[EffectCfg | str],
     links: Sequence[str],
     unknown: Sequence[str],
+    residual: Sequence[str],
     *,
     strict: bool,
     max_duration: float | None,
@@ -398,14 +437,27 @@ def _posed(
     if is_model_file(facts.task):
         widen_bounds(sim2real, env, groups[0])
     count = len(groups[0])
-    measured, unknown = _read_torques(env, [*groups[0], *groups[1]], control_dt, unknown)
+    asked = unknown
+    measured, unknown, channel = _read_torques(env, [*groups[0], *groups[1]], control_dt, unknown, residual)
     told, bounds = lift_limits(cfg, measured.recordings, unknown)
-    sim2real.effect_bounds = {**sim2real.effect_bounds, **bounds, **measured.gain_bounds(unknown, GAINS)}
-    if "effort_limit" in unknown:
+    effects = list(effects or sim2real.effects)
+    if channel.noise and not LIMITS.keys() & set(unknown):
+        cut = channel.noise.keys() & measured.taken.get("effort_limit", frozenset())
+        told, limits, effects = refined_limits(told, cut, effects)
+        bounds, unknown = {**bounds, **limits}, (*unknown, *(["effort_limit"] if limits else []))
+    gains = measured.gain_bounds(unknown, GAINS, channel.noise)
+    for fact in GAINS.keys() & (set(unknown) - set(asked)):  # gains that are stated beside those that are read
+        gains[GAINS[fact]] = dict.fromkeys(sim2real.joint_order, (1.0, 1.0, 1.0)) | gains.get(GAINS[fact], {})
+    sim2real.effect_bounds = {**sim2real.effect_bounds, **bounds, **gains}
+    sim2real.torque_offsets = channel.offsets
+    if "effort_limit" in asked:
         for drive in robot.actuators.values():
             drive.effort_limit.fill_(math.inf)
-    if measured.delay_bounds is not None:  # sought where the recordings' torques have it
-        sim2real.set_bounds("delay", *measured.delay_bounds)
+    if measured.delay_bounds is not None:  # sought where the recordings' torques have it, or from there
+        if channel.noise:
+            sim2real.start_params = {**sim2real.start_params, "delay": sum(measured.delay_bounds) / 2}
+        else:
+            sim2real.set_bounds("delay", *measured.delay_bounds)
     recordings, held_out = (_with_notes(env, each) for each in (told[:count], told[count:]))
     if not {"stiffness", "damping"} & set(unknown):  # sought where the loops are stable, with a width to seek in
         low, high = sim2real.bounds["armature"].unbind(dim=1)
@@ -413,23 +465,31 @@ def _posed(
         sim2real.set_bounds("armature", torch.maximum(low, torch.minimum(least, 0.5 * (low + high))))
     if is_model_file(facts.task):
         sim2real.start_params = {**sim2real.start_params, **start_by_torques(env, recordings)}
-    simulated = _configured(cfg, physics_dt, with_unknown(effects or sim2real.effects, unknown))
+    simulated = _configured(cfg, physics_dt, with_unknown(effects, unknown))
     space, trees = ParameterSpace.of(simulated.sim2real), independent_trees(env)
     recordings, held_out = affordable(
         [recordings, held_out], control_dt, _columns(space, trees), simulated.decimation, max_duration, tell
     )
     refuse_open_loops(env, [*recordings, *held_out])
+    dataset = with_work(make_dataset(recordings, held_out), env)
+    if channel.noise:
+        held = all(
+            not drive.implicit and (drive.drive_dt or control_dt) >= control_dt * (1 - 1e-6)
+            for drive in cfg.scene.robot.actuators.values()
+        )
+        dataset = replace(dataset, torques=Torques.of(dataset, channel, held))
     return Problem(
         task=facts.task,
         plain_cfg=cfg,
         env_cfg=simulated,
-        dataset=with_work(make_dataset(recordings, held_out), env),
+        dataset=dataset,
         space=space,
         trees=trees,
         delay_mode=next(iter(cfg.scene.robot.actuators.values())).delay_mode,
         control_dt=control_dt,
         measured=measured,
         unknown=unknown,
+        torque_notes=channel.notes,
         logged_rate=facts.logged_rate,
         assumed_loop=_assumed_loop(facts, cfg, told, unknown),
         contradictions=(*told_of_gains(env, told, unknown), *_contradictions(env, [*recordings, *held_out])),
@@ -462,17 +522,21 @@ def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
 
 
 def _read_torques(
-    env: ManagerBasedRLEnv, recordings: Sequence[Recording], control_dt: float, unknown: Sequence[str]
-) -> tuple[MeasuredDrives, tuple[str, ...]]:
-    """What the recordings' torques show of the drives, and what stays unknown.
+    env: ManagerBasedRLEnv,
+    recordings: Sequence[Recording],
+    control_dt: float,
+    unknown: Sequence[str],
+    residual: Sequence[str],
+) -> tuple[MeasuredDrives, tuple[str, ...], TorqueChannel]:
+    """What the recordings' torques show of the drives, what stays unknown, and which torques a fit follows.
 
     A fact is read if every recording has it of every joint; else it is identified, and all recordings keep what they
-    state. Gains that are read are refined.
+    state. Gains that are read are refined, if a fit follows torques or they are declared unknown.
     """
     sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
     low, high = sim2real.bounds["delay"][0].tolist()
 
-    def read(facts: Sequence[str]) -> MeasuredDrives:
+    def read(facts: Sequence[str], sensed: Collection[str] = ()) -> MeasuredDrives:
         return read_drives(
             recordings,
             {name: of_joints(env, name) for name in ("stiffness", "damping", "effort_limit")},
@@ -482,12 +546,22 @@ def _read_torques(
             unknown=facts,
             assumed=sim2real.assumed_gains,
             slides=sim2real.slide_joints,
+            sensed=sensed,
         )
 
     measured = read(unknown)
     known = [fact for fact in unknown if len(measured.taken.get(fact, ())) == len(sim2real.joint_order)]
-    measured = read(known) if len(known) < len(unknown) and measured.laws else measured
-    return measured, tuple(fact for fact in unknown if fact not in known or fact in GAINS)
+    if again := len(known) < len(unknown) and bool(measured.laws):
+        measured = read(known)
+    channel = TorqueChannel()
+    if "effort" in residual:
+        why_not = "the base moves" if any(recording.frame is not None for recording in recordings) else ""
+        channel = torque_channel(recordings, measured, why_not)
+    if channel.noise:
+        measured = read(known if again else unknown, channel.noise)
+    refined = [fact for fact in GAINS if channel.noise.keys() & measured.taken.get(fact, frozenset())]
+    kept = tuple(fact for fact in unknown if fact not in known or fact in GAINS)
+    return measured, (*kept, *(fact for fact in refined if fact not in kept)), channel
 
 
 def _ranges(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:

@@ -15,7 +15,7 @@ from pace_envs.compiled_drive.robot_kernel import CompiledRobot
 from pace_envs.moving_frame import Course
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
-from pace_optim.recording.dataset import Dataset, Work
+from pace_optim.recording.dataset import Dataset, Torques, Work
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -215,6 +215,36 @@ class Rollout:
         shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
         return torch.stack([position.clone() for k, position in shown if k in wanted])
 
+    def positions_and_torques(self, at: torch.Tensor, sensed: Torques) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same, and the motors' torques as late as sensors show them, both (len(at), num_envs, n) [rad, N m].
+
+        Torques run straight between control steps.
+
+        Args:
+            at: As for :meth:`positions`.
+            sensed: What measured torques are compared with it.
+        """
+        last, offset, after = self.duration_steps, self.dataset.sample_offset, sensed.after[at]
+        beyond = 2 + math.ceil(max(0.0, float(after.max()) - float(sensed.lag.min())))
+        torques: list[torch.Tensor] = []
+
+        def simulated(steps: int) -> torch.Tensor:
+            shape = steps + beyond, self.env.num_envs, self.robot.num_joints
+            torques.append(torch.zeros(shape, dtype=self.env.dtype))
+            return self._in_one_go(torch.arange(steps + beyond), torque=torques[0])[:steps]
+
+        lag = self.observation_lag(last)
+        if lag is None and offset is None:
+            positions = simulated(last)[at]
+        else:
+            wanted = set(at.tolist())
+            positions = torch.stack([shown.clone() for k, shown in self.samples(simulated) if k in wanted])
+        after = after if offset is None else after + offset[at]
+        when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
+        if lag is not None:
+            when = when - torch.lerp(lag[0], lag[1], (at / max(1, last - 1))[:, None, None])
+        return positions, _straight(torques[0], when - sensed.lag)
+
     def motion(self, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Simulate that many control steps, as :meth:`simulated` does.
 
@@ -227,8 +257,13 @@ class Rollout:
         positions, speeds = state.split(sizes, dim=-1)
         return self._in_one_go(torch.arange(steps), state), positions, speeds
 
-    def _in_one_go(self, at: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
-        """Simulated positions at control steps, (len(at), num_envs, n) [rad]; ``state`` gets MuJoCo's there."""
+    def _in_one_go(
+        self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Simulated positions at control steps, (len(at), num_envs, n) [rad].
+
+        ``state`` gets MuJoCo's there, and ``torque`` the motors', which is not that of the last step where it ends.
+        """
         last, robot = int(at[-1]), self.robot
 
         def note(row: int, step: int) -> None:
@@ -244,8 +279,10 @@ class Rollout:
         if begin:
             note(0, 0)
         if last > 0:
+            robot.note_torque = torque[0] if begin and torque is not None else None
             self.advance(0)
-            compiled = self._compiled.positions(at[begin:], None if state is None else state[begin:])
+            rest = (None if each is None else each[begin:] for each in (state, torque))
+            compiled = self._compiled.positions(at[begin:], *rest)
             if compiled is None:
                 row = {k: i for i, k in enumerate(at.tolist())}
                 for k in range(1, last + 1):
@@ -255,6 +292,7 @@ class Rollout:
                         self.hold(k)
                         robot.sensed_joint_pos()  # brings the motor to the present
                     if k < last:
+                        robot.note_torque = torque[row[k]] if k in row and torque is not None else None
                         self.advance(k)
             else:
                 result[begin:] = compiled
@@ -481,3 +519,10 @@ def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -
         rows = (index + i) % len(seen) if ring else (index + i).clamp(0, len(seen) - 1)
         result += weight * seen.gather(0, rows)
     return result
+
+
+def _straight(series: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+    """Values (length, m, n) at real-valued steps (K, m, n), straight between two; the first before it."""
+    whole = at.floor().clamp(0, len(series) - 2)
+    low = whole.long()
+    return torch.lerp(series.gather(0, low), series.gather(0, low + 1), (at - whole).clamp(0.0, 1.0))

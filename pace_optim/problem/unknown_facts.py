@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -98,6 +99,32 @@ def lift_limits(
         infinite = np.full(len(joints), np.inf)
         recordings = [replace(r, drive=replace(r.drive, **{fact: infinite})) for r in recordings]
     return list(recordings), bounds
+
+
+def refined_limits(
+    recordings: Sequence[Recording], joints: Collection[str], effects: Sequence[EffectCfg | str]
+) -> tuple[list[Recording], dict[str, dict[str, tuple[float, float, float]]], list[EffectCfg | str]]:
+    """Let some joints' torque limits be sought from those on that recordings state.
+
+    Args:
+        recordings: The recordings; all have these limits, as their torques say them.
+        joints: The joints.
+        effects: What is fitted; nothing changes where a limit is among it.
+
+    Returns:
+        Recordings without these limits, where they are sought, and the effects with what takes their place.
+    """
+    own = UNKNOWN_FACTS["effort_limit"]
+    stated = [np.asarray(each) for r in recordings if (each := r.drive.effort_limit) is not None]
+    if not joints or own in {cfg.effect_class.name for cfg in effect_cfgs(effects)}:
+        return list(recordings), {}, list(effects)
+    names = recordings[0].joint_names
+    start = dict(zip(names, np.max(stated, axis=0).tolist(), strict=True))
+    bounds = {joint: (start[joint] / _FACTOR, start[joint], start[joint] * _FACTOR) for joint in joints}
+    free = [np.where(np.isin(names, list(joints)), np.inf, each) for each in stated]
+    told = [replace(r, drive=replace(r.drive, effort_limit=v)) for r, v in zip(recordings, free, strict=True)]
+    expression = "|".join(re.escape(joint) for joint in names if joint in joints)
+    return told, {LIMITS["effort_limit"]: bounds}, [*effects, f"{own}@{expression}"]
 
 
 def with_identified(

@@ -19,6 +19,9 @@ from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base
 
+_EARLY = 0.02
+"""Part of a control step by which a torque that a loop gives may be stamped before it, as stamps jitter."""
+
 
 def conform_recording(
     recording: Recording,
@@ -165,7 +168,6 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
     for key, interpolate in (
         ("dof_pos", interpolate_smooth),
         ("dof_vel", interpolate_smooth),
-        ("dof_effort", interpolate_linear),
         ("real_ee_pose", interpolate_linear),
         ("base_ang_vel", interpolate_linear),
         ("base_lin_acc", interpolate_linear),
@@ -176,6 +178,10 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
         if (values := getattr(recording, key)) is not None:
             after = np.searchsorted(stamps, at).clip(1, len(stamps) - 1)
             result[key] = values[after - (at - stamps[after - 1] < stamps[after] - at)]
+    if recording.dof_effort is not None:  # it may jump: its samples keep their instants
+        following = np.searchsorted(stamps, at - _EARLY * control_dt).clip(max=len(stamps) - 1)
+        result["dof_effort"] = recording.dof_effort[following]
+        result["effort_offset"] = np.maximum(stamps[following] - at, 0.0) / control_dt
     if recording.torque_enable is not None:
         share_on = hold_on_grid(stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count)
         result["command_torque_enable"] = share_on[:, 0] >= 0.5

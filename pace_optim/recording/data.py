@@ -114,6 +114,8 @@ class Recording:
     """Nearest control step of each sample, (T,), where they do not lie on every `sample_stride`-th; else None."""
     sample_offset: np.ndarray | None = None
     """By how much later than that each of these samples was taken, (T,) [control steps]."""
+    effort_offset: np.ndarray | None = None
+    """By how much later than its sample each `dof_effort` was measured, (T,) [control steps]; None: with it."""
     command: np.ndarray | None = None
     """Commanded positions on the control grid, ((T - 1) * sample_stride + 1, n) [rad]; None until conformed.
 

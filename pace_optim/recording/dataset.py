@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -13,13 +14,17 @@ import torch
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion
+from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
+from pace_optim.recording.torque import TorqueChannel
 
 _TURN = 4.0
 """Of a robot that walks, so much time is trained and validated on in turns [s]."""
 _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
+_LEAST_TORQUE_NOISE = 1e-3
+"""Part of a torque's root mean square that its noise is at least: simulations are no better."""
 _SHORTEST = 3.0
 """A recording that is no longer than this many times that keeps its beginning."""
 
@@ -50,6 +55,78 @@ class Work:
         edges = (each.to(time_constant) for each in (self.begin, self.end))
         first, last = (torch.exp(-(time - edge).clamp(min=0.0)[:, :, None] / time_constant[:, None]) for edge in edges)
         return ((last - first) * self.square.to(time_constant)[:, joints]).sum(dim=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Torques:
+    """Measured torques of R recordings, laid out like their positions, and what their errors weigh."""
+
+    measured: torch.Tensor
+    """(T, R, n) [N m]; zero where it is not known."""
+    known: torch.Tensor
+    """Where it is, (T, R, n) bool."""
+    noise: torch.Tensor
+    """Standard deviation of what is taken for a torque's noise, (n,) [N m]."""
+    floor: torch.Tensor
+    """That of its noise by itself, (n,) [N m]."""
+    position_noise: float
+    """That of a position [rad]."""
+    after: torch.Tensor
+    """By how much later than its sample it was measured, (T, R) [control steps]."""
+    lag: torch.Tensor
+    """How late a sensor shows a torque, (n,) [control steps]; below 0: it is early."""
+
+    @classmethod
+    def of(cls, dataset: Dataset, channel: TorqueChannel, held: bool) -> Torques:
+        """Those of a dataset's recordings.
+
+        Args:
+            dataset: The recordings.
+            channel: Which joints' torques count, and their noise.
+            held: Whether drives hold their torques for a control step.
+        """
+        names = dataset.recordings[0].joint_names
+        measured, known = torch.zeros_like(dataset.measured), torch.zeros(dataset.measured.shape, dtype=torch.bool)
+        after = torch.zeros(measured.shape[:2], dtype=torch.float64)
+        for r, recording in enumerate(dataset.recordings):
+            at = torch.as_tensor(recording.sample_steps)
+            if recording.effort_offset is not None:
+                after[at, r] = torch.as_tensor(recording.effort_offset)
+            if recording.dof_effort is not None:
+                values = torch.as_tensor(recording.dof_effort)
+                measured[at, r], known[at, r] = values.nan_to_num(nan=0.0), values.isfinite()
+        known &= torch.tensor([name in channel.noise for name in names])
+        known[: math.ceil(max(0.0, *channel.lag.values())) + 1] = False
+        size = (measured.square() * known).sum(dim=(0, 1)) / known.sum(dim=(0, 1)).clamp(min=1)
+        noise, floor, lag = (
+            torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64)
+            for own in (channel.noise, channel.floor, channel.lag)
+        )
+        variance = noise_variance([dataset.recordings[r] for r in dataset.trained()])
+        return cls(
+            measured=measured,
+            known=known,
+            noise=torch.zeros_like(noise),
+            floor=torch.maximum(floor, _LEAST_TORQUE_NOISE * size.sqrt()),
+            position_noise=max(variance, LEAST_NOISE**2) ** 0.5,
+            after=after.floor() if held else after,
+            lag=lag,
+        ).with_noise(noise)
+
+    def with_noise(self, noise: torch.Tensor) -> Torques:
+        """The same where this is taken for noise, (n,) [N m], but for what is below the floor."""
+        return replace(self, noise=torch.maximum(noise, self.floor))
+
+    @property
+    def weight(self) -> torch.Tensor:
+        """Noise of a position over that of a torque, (n,) [rad/(N m)]: so weighed, both have the same noise."""
+        followed = self.known.any(dim=1).any(dim=0)
+        return torch.where(followed, self.position_noise / self.noise.clamp(min=1e-300), 0.0)
+
+    def at(self, step: Any, recording: Any) -> Torques:
+        """Those of some control steps and recordings, by index."""
+        known, after = self.known[step, recording], self.after[step, recording]
+        return replace(self, measured=self.measured[step, recording], known=known, after=after)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +174,8 @@ class Dataset:
     is not known; ``None`` without any."""
     carried: Carried | None = None
     """How bases move, and where joints are held; ``None`` where all bases rest."""
+    torques: Torques | None = None
+    """Measured torques that a fit follows; ``None``: positions alone."""
 
     @cached_property
     def weight(self) -> torch.Tensor | None:
@@ -147,6 +226,7 @@ class Dataset:
             work=self.work,
             settling=None if self.settling is None else self.settling[:, chosen],
             carried=None if self.carried is None else self.carried.select(chosen),
+            torques=None if self.torques is None else self.torques.at(slice(None), chosen),
         )
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Dataset:
@@ -174,6 +254,7 @@ class Dataset:
             start_vel=self.start_vel[..., chosen],
             carried=None if self.carried is None else self.carried.on_joints(chosen),
             work=None if self.work is None else self.work.on_joints(chosen),
+            torques=None,
         )
 
     def trained(self) -> list[int]:

@@ -21,6 +21,8 @@ _ABOVE = 1.5
 """A spectrum this many times the noise's is motion."""
 _MOST_STEPS = 50
 _NUMERICAL = 1e-9
+LEAST_NOISE = 1e-7
+"""Noise of positions that is assumed where recordings have less [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -145,6 +145,7 @@ def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
         time=recording.time[first:end] - begin,
         sample_at=None if recording.sample_at is None else at - at[0],
         sample_offset=None if recording.sample_offset is None else recording.sample_offset[first:end],
+        effort_offset=None if recording.effort_offset is None else recording.effort_offset[first:end],
         des_time=None,
         time_origin=recording.time_origin + begin,
         notes=(),

@@ -86,7 +86,7 @@ def fit_time_base(time: np.ndarray, control_dt: float, source: str, may_place: b
     if not exact:
         notes.append(
             f"Resampled to {spacing * 1e3:g} ms ({1 / spacing:g} Hz): positions and speeds by cubics, "
-            "torques by straight lines, commands held and averaged over each control step of "
+            "each torque that is measured next, commands held and averaged over each control step of "
             f"{control_dt * 1e3:g} ms."
         )
     if not exact and median < 0.95 * control_dt:

@@ -95,6 +95,7 @@ class Windows:
             start_time=dataset.start_time[self.recording] + since,
             session_start=dataset.session_start[self.recording] + since,
             carried=None if dataset.carried is None else dataset.carried.at(*self._at(dataset.command)),
+            torques=None if dataset.torques is None else dataset.torques.at(*self._at(dataset.command)),
         )
 
     def _at(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -104,6 +104,9 @@ class Run:
             if data or str(self.folder) in str(error):
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
+        path = self.folder / "result.json"
+        if problem.torque_noise and path.is_file():
+            problem = problem.with_torque_noise(FitResult.load(path).torque_noise)
         if data:  # other recordings have other bounds; the run's values must be within
             problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)
@@ -164,6 +167,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str],
         effects=settings.effects,
         links=settings.links,
         unknown=settings.unknown,
+        residual=("position",) if settings.only_searches else settings.residual,
         env_cfg=env_cfg,
         joints=settings.joints,
         columns=settings.columns,

@@ -17,12 +17,14 @@ from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
 from pace_envs.link_inertia import NAMES
+from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import whole_delay
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
+from pace_optim.recording.dataset import Torques
 from pace_optim.recording.notes import notes_by_kind
 
 
@@ -61,6 +63,10 @@ class FitResult(DriveResult):
     """What the torque in the recordings says of each drive, by joint and recording."""
     contested: list[str] = field(default_factory=list)
     """Facts that are stated and that the torque in a recording contradicts."""
+    torque_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]."""
+    torque_noise: dict[str, float] = field(default_factory=dict)
+    """Standard deviation of the noise that they are weighed by, by joint [N m]; empty: it follows none."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
@@ -127,6 +133,11 @@ class FitResult(DriveResult):
         return [name for name in self.parameters if name in NAMES]
 
     @property
+    def sensor_parameters(self) -> list[str]:
+        """Names of the parameters of sensors of torques."""
+        return [name for name in (TORQUE_SCALE, TORQUE_OFFSET) if name in self.parameters]
+
+    @property
     def joint_types(self) -> tuple[JointType, ...]:
         """Whether each joint turns or slides."""
         return tuple(self.joint_type(joint) for joint in self.joint_names)
@@ -136,11 +147,23 @@ def rmse_by_joint(residuals: Residuals, where: torch.Tensor, joint_names: tuple[
     """Root mean square error of each joint and of all, over a (K, R) part of the samples [rad]; empty if none."""
     if not bool(where.any()):
         return {}
-    square = residuals.error[0].square()[where].mean(dim=0)
+    square = residuals.positions.error[0].square()[where].mean(dim=0)
     return {
         **{name: math.sqrt(value) for name, value in zip(joint_names, square.tolist(), strict=True)},
         ALL: math.sqrt(float(square.mean())),
     }
+
+
+def torque_rmse(
+    residuals: Residuals, torques: Torques | None, where: torch.Tensor, joint_names: tuple[str, ...]
+) -> dict[str, float]:
+    """Root mean square error of each torque that is followed, over a (K, R) part of the samples [N m]."""
+    if torques is None:
+        return {}
+    error, known = residuals.torque_errors(torques)
+    count = (known & where[..., None]).sum(dim=(0, 1))
+    square = (error.square() * where[..., None]).sum(dim=(0, 1)) / count.clamp(min=1)
+    return {joint: math.sqrt(v) for joint, v, k in zip(joint_names, square.tolist(), count.tolist(), strict=True) if k}
 
 
 def by_parameter(space: ParameterSpace, errors: np.ndarray) -> dict[str, dict[str, float | None]]:
@@ -230,7 +253,7 @@ def make_result(
     data, space = problem.dataset, problem.space
     physical = space.to_physical(x)
     train, validation = data.train[residuals.step], data.validation[residuals.step]
-    trained = residuals.error[0].square()[train]
+    trained = residuals.positions.error[0].square()[train]
     if facts.get("std_means_nothing"):  # then the file has none
         uncertainty = uncertainty.without_error_bars()
     values, std = space.to_dict(physical), by_parameter(space, uncertainty.std)
@@ -257,6 +280,11 @@ def make_result(
             "validation": rmse_by_joint(residuals, validation, problem.joint_names),
         },
         recordings={"train": data.names("train"), "validation": data.names("validation")},
+        torque_rmse={
+            "train": torque_rmse(residuals, data.torques, train, problem.joint_names),
+            "validation": torque_rmse(residuals, data.torques, validation, problem.joint_names),
+        },
+        torque_noise=problem.torque_noise,
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
         findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),
@@ -277,6 +305,6 @@ def assumptions(problem: Problem, shown: Container[str] = ()) -> list[str]:
         problem: What is fitted.
         shown: Notes that were printed already: they are omitted.
     """
-    of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes]
+    of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes, *problem.torque_notes]
     recordings = [replace(r, notes=tuple(n for n in r.notes if n not in shown)) for r in problem.dataset.recordings]
     return [*(note for note in of_robot if note not in shown), *notes_by_kind(recordings)]

@@ -40,6 +40,10 @@ class FitSettings:
     """Unknown facts of the drives (``stiffness``, ``damping``, ``effort_limit``, ``saturation_effort``,
     ``velocity_limit``): read from the recordings' torques where they have them, else identified."""
 
+    residual: list[str] = field(default_factory=list)
+    """What is fitted: ``position``, or ``position effort`` with the measured torques too; none: positions. A search by
+    scores alone (``cmaes``, a custom objective) scores positions."""
+
     num_envs: int = 512
     """Simulations at once in a search; refining takes as many as it needs."""
 
@@ -129,6 +133,15 @@ class FitSettings:
             raise ValueError(
                 f"links are identified by least squares, which know their prior, and the optimizer is "
                 f"{self.optimizer}. Choose hybrid or least_squares."
+            )
+        if self.residual and sorted(set(self.residual)) not in (["position"], ["effort", "position"]):
+            raise ValueError(
+                f"--residual {' '.join(self.residual)} is not understood. Available: position, or position effort."
+            )
+        if "effort" in self.residual and self.only_searches:
+            raise ValueError(
+                f"Measured torques are followed by least squares, and the optimizer is {self.optimizer}. Choose hybrid "
+                "or least_squares."
             )
         for name, lowest in (("num_envs", 1), ("max_iteration", 1), ("seed", 0)):
             value = getattr(self, name)

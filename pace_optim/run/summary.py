@@ -35,6 +35,8 @@ def summary(result: FitResult) -> list[str]:
             of += " and of the assumed loop rate"
         lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
+    if result.torque_noise:
+        lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
         parts = " / ".join("-" if part is None else f"{part:.4g}" for part in result.objective.values())
         lines.append(f"objective {result.optimizer}: {parts} (train / validation)")
@@ -58,6 +60,16 @@ def next_line(result: FitResult, folder: Path) -> list[str]:
         return []
     verb = "diagnose" if result.std_means_nothing else "compare"
     return [f"next: {command(verb)} {shlex.quote(str(folder))}"]
+
+
+def _torque_errors(result: FitResult) -> list[str]:
+    """Errors of torques that the fit follows, joint by joint."""
+    train, validation = (result.torque_rmse[part] for part in ("train", "validation"))
+    return [
+        f"{joint} {value:.2g} / {f'{validation[joint]:.2g}' if joint in validation else '-'} "
+        f"{units_for('N m', [result.joint_type(joint)])}"
+        for joint, value in train.items()
+    ]
 
 
 def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:

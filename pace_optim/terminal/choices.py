@@ -4,6 +4,8 @@ OPTIMIZERS = ("hybrid", "least_squares", "cmaes")
 """How a fit looks for the parameters."""
 DELAY_MODES = ("command", "effort")
 """What a drive's delay delays."""
+RESIDUALS = ("position", "effort")
+"""What a fit follows."""
 UNKNOWN_FACTS = {
     "stiffness": "proportional_gain",
     "damping": "derivative_gain",

@@ -41,8 +41,13 @@ def chirp(seconds: float, amplitude: float = 0.5, top: float = 6.0) -> np.ndarra
     return 0.3 + amplitude * np.sin(2 * np.pi * (0.2 * t + 0.5 * (top - 0.2) / seconds * t**2))
 
 
-def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, *, enabled=None, seed: int = 0) -> Path:
-    """Write a CSV of the drive that follows commands (T,) [rad], [rad/s], [N m], and the JSON of what is stated."""
+def record(
+    path: Path, bench: Bench, position=None, velocity=None, effort=None, *, enabled=None, sensor=None, seed: int = 0
+) -> Path:
+    """Write a CSV of the drive that follows commands (T,) [rad], [rad/s], [N m], and the JSON of what is stated.
+
+    ``sensor`` makes what a log has of the motor's torques (T,) [N m].
+    """
     given = {"des_dof_pos": position, "des_dof_vel": velocity, "des_dof_effort": effort}
     commands = {name: values for name, values in given.items() if values is not None}
     count, per_step = len(next(iter(commands.values()))), round(CONTROL_DT / STEP)
@@ -52,7 +57,7 @@ def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, 
     kp = bench.kp if position is not None else 0.0
     late = round(bench.delay / STEP)
     q, v = (0.0 if position is None else float(position[0])) + bench.bias, 0.0
-    seen, asked_of = np.empty(count), np.empty(count)
+    seen, given_by_motor = np.empty(count), np.empty(count)
     for k in range(count):
         reading = q - bench.bias + bench.noise * rng.normal()
         seen[k], speed = reading, v
@@ -65,9 +70,9 @@ def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, 
                 arrived.get("des_dof_vel", 0.0) - speed
             )
             asked += arrived.get("des_dof_effort", 0.0)
-            if part == 0:
-                asked_of[k] = asked
             limited = min(max(asked, -bench.current_limit), bench.current_limit)
+            if part == 0:
+                given_by_motor[k] = bench.motor_gain * limited
             viscous = bench.viscous
             if enabled is not None and not enabled[k]:
                 limited, viscous = 0.0, viscous if bench.off_viscous is None else bench.off_viscous
@@ -78,6 +83,8 @@ def record(path: Path, bench: Bench, position=None, velocity=None, effort=None, 
             q += STEP * v
     columns = {"time": np.arange(count) * CONTROL_DT, "dof_pos/servo": seen}
     columns |= {f"{name}/servo": np.asarray(values, dtype=float) for name, values in commands.items()}
+    if sensor is not None:
+        columns["dof_effort/servo"] = sensor(given_by_motor)
     if enabled is not None:
         columns["torque_enable"] = np.asarray(enabled, dtype=float)
     rows = np.column_stack(list(columns.values()))

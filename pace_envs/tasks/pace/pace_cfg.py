@@ -84,6 +84,10 @@ class PaceCfg(Config):
     """Links whose inertial parameters are identified, as the model has them (:func:`~pace_envs.tasks.pace.sought_links`
     finds them)."""
 
+    torque_offsets: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Joints whose measured torques a fit follows beside their positions, and where it seeks their sensors' offsets:
+    ``{joint: (lower, start, upper)}`` [N m]."""
+
     extra_parameters: tuple[Any, ...] = ()
     """Custom parameters (:class:`~pace_envs.tasks.pace.Parameter`), identified beside the base ones."""
 
@@ -177,6 +181,7 @@ class PaceCfg(Config):
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             links=(),
+            torque_offsets={},
             extra_parameters=(),
         )
 

@@ -25,6 +25,12 @@ if TYPE_CHECKING:
 
 GLOBAL = ALL
 """The key of a parameter that all joints share."""
+TORQUE_SCALE, TORQUE_OFFSET = "torque_scale", "torque_offset"
+"""Parameters of a sensor of torques."""
+TORQUE_SCALE_STD = 0.1
+"""Standard deviation of the scale's prior: motors' torque constants are known to a tenth."""
+_TORQUE_SCALE = 5.0
+"""How far from 1 a scale is sought, both ways."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +69,9 @@ class Parameter:
 
     joints: tuple[str, ...] | None = None
     """The driven joint that moves what each key names, where keys are links; ``None``: keys are joints."""
+
+    moves: bool = True
+    """Whether it changes how the robot moves, and not only what a sensor shows."""
 
     per_joint_copies: bool = False
     """Whether ``apply`` of a shared parameter also takes one value per joint, (num_envs, num_joints)."""
@@ -189,6 +198,34 @@ def link_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
     return tuple(result)
 
 
+def torque_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
+    """Of sensors of torques that a fit follows: scale s and offset o of what they show, s τ + o."""
+    offsets = cfg.torque_offsets
+    joints = tuple(joint for joint in cfg.joint_order if joint in offsets)
+    if not joints:
+        return ()
+
+    def parameter(name: str, unit: str, bounds: Sequence[tuple[float, float, float]], **more: Any) -> Parameter:
+        lower, start, upper = zip(*bounds, strict=True)
+        return Parameter(
+            name=name,
+            unit=unit,
+            lower=lower,
+            upper=upper,
+            start=start,
+            keys=joints,
+            units=_units(unit, joints, cfg),
+            apply=_of_a_sensor,
+            moves=False,
+            **more,
+        )
+
+    prior = math.log1p(TORQUE_SCALE_STD) / math.log(_TORQUE_SCALE)
+    scale = [(1 / _TORQUE_SCALE, 1.0, _TORQUE_SCALE)] * len(joints)
+    offset = [offsets[joint] for joint in joints]
+    return parameter(TORQUE_SCALE, "1", scale, scale="log", prior=prior), parameter(TORQUE_OFFSET, "N m", offset)
+
+
 def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[str]) -> tuple[Reference, ...]:
     """The links whose inertial parameters are to be identified.
 
@@ -233,6 +270,10 @@ def _apply_effect(
     env: ManagerBasedEnv, values: torch.Tensor, *, effect: str, parameter: str, joint_ids: list[int]
 ) -> None:
     env.scene["robot"].write_effect_parameter_to_sim(effect, parameter, values, joint_ids)
+
+
+def _of_a_sensor(env: ManagerBasedEnv, values: torch.Tensor) -> None:
+    """Nothing: what a sensor shows does not move the robot."""
 
 
 def _apply_link(env: ManagerBasedEnv, values: torch.Tensor, *, references: Sequence[Reference], name: str) -> None:

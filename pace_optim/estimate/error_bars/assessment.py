@@ -230,7 +230,7 @@ def _shaken(
 
 def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
     """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
-    data, result = problem.dataset, []
+    data, residuals, result = problem.dataset, residuals.positions, []
     for r, recording in enumerate(data.recordings):
         at = residuals.where[:, r]
         measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]

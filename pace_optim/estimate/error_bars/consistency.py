@@ -16,7 +16,6 @@ from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -125,10 +124,10 @@ def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) 
 def _of_recording(there: Jacobian, r: int) -> Jacobian:
     """Residuals and derivatives of one of the recordings."""
     whole = there.residuals
-    at = whole.where[:, r]
-    error, where = whole.error[:, at, r : r + 1], whole.where[at, r : r + 1]
-    own = Residuals(error=error, where=where, step=whole.step[at], prior=whole.prior)
-    return replace(there, residuals=own, columns=there.columns[:, at, r : r + 1])
+    at, columns = whole.where[:, r], whole.columns_of(r)
+    error, where = whole.error[:, at][:, :, columns], whole.where[at][:, columns]
+    own = replace(whole, error=error, where=where, step=whole.step[at], weight=None)
+    return replace(there, residuals=own, columns=there.columns[:, at][:, :, columns])
 
 
 def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> list[str]:

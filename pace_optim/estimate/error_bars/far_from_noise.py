@@ -20,12 +20,26 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
         problem: What was fitted.
         rmse: Of all joints [rad].
     """
-    noise = (noise_score(problem) / len(problem.joint_names)) ** 0.5
+    noise = (_of_positions(problem) / len(problem.joint_names)) ** 0.5
     return rmse / noise if rmse and noise > 0 else None
 
 
 def noise_score(problem: Problem) -> float:
-    """The score that the noise of what is trained on leaves, Σ_joints of its mean variance [rad²]."""
+    """The score that the noise of what is trained on leaves, Σ_joints of its mean variance [rad²].
+
+    Where torques are followed, it is the mean over their samples and the positions'.
+    """
+    positions, torques = _of_positions(problem), problem.dataset.torques
+    if torques is None:
+        return positions
+    count = int(problem.dataset.train.sum())
+    known = torques.known & problem.dataset.train[..., None]
+    of_torques = float((known * (torques.weight * torques.floor).square()).sum())
+    return (positions * count + of_torques) / (count + int(known.any(dim=2).sum()))
+
+
+def _of_positions(problem: Problem) -> float:
+    """Σ_joints of the mean variance of the positions' noise [rad²]."""
     trained = [problem.dataset.recordings[r] for r in problem.dataset.trained()]
     return noise_variance(trained) * len(problem.joint_names)
 

@@ -217,13 +217,16 @@ def _from_first_sample(
             # what a joint moves is its tree: the joints of the entries that move it and not all joints
             tree = min((set(j) for j in colouring.joints if joint in j), key=len, default=set())
             own = [entry for entry in row if tree & set(colouring.joints[entry])]
-            for r in range(residuals.where.shape[1]):
+            for r in range(residuals.num_recordings):
                 at = residuals.where[:, r]
                 if int(at.sum()) < 2:
                     continue
                 noise = 0.5 * float(residuals.error[0, at, r, joint].diff().square().mean())
-                columns = jacobian.columns[[row[entry] for entry in own]][:, :, r, sorted(tree)]
-                effect = (columns * moved[None, :, r, sorted(tree)]).sum(dim=(1, 2)).numpy()
+                columns = jacobian.columns[[row[entry] for entry in own]]
+                effect = np.zeros(len(own))
+                for column in residuals.columns_of(r):
+                    both = columns[:, :, column, sorted(tree)] * moved[None, :, column, sorted(tree)]
+                    effect += both.sum(dim=(1, 2)).numpy()
                 total[np.ix_(own, own)] += noise * np.outer(effect, effect)
     return total
 

@@ -18,6 +18,8 @@ from .words import contradiction, delay_sentence, line_of_joint
 FOLLOWS = 0.9
 """A torque of which the law explains less is not that of this law: a current with much else in it, or another unit."""
 _OF_THE_LAW = ("stiffness", "damping")
+_ROOM_WITH_SCALE = 5.0
+"""How far from a gain that is read a fit seeks it, both ways, where a scale of the torque is sought beside it."""
 _LEAST_ROOM, _MOST_ROOM = 0.01, 0.5
 """Parts of a gain that is read within which a fit refines it, at least and at most."""
 
@@ -40,13 +42,18 @@ class MeasuredDrives:
     """What contradicts what is stated."""
     contested: tuple[str, ...] = ()
     """Facts that are stated and that a torque contradicts: what is stated is used."""
+    contested_joints: frozenset[str] = frozenset()
+    """Joints of which such a fact is."""
 
-    def gain_bounds(self, facts: Collection[str], factors: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    def gain_bounds(
+        self, facts: Collection[str], factors: Mapping[str, str], sensed: Collection[str] = ()
+    ) -> dict[str, dict[str, Any]]:
         """Within what unknown gains are refined that torques say: lower, start and upper factor, by label and joint.
 
         Args:
             facts: What nobody knows.
             factors: The parameter that is a factor of each gain.
+            sensed: Joints whose torques a fit follows: their gains are as unsure as their sensors' scales.
         """
         result: dict[str, dict[str, Any]] = {}
         for fact in facts:
@@ -54,7 +61,8 @@ class MeasuredDrives:
                 laws = self.laws[joint].values()
                 off = max(law.std[fact] / abs(getattr(law, fact)) for law in laws if getattr(law, fact))
                 width = min(max(SURE * off, _LEAST_ROOM), _MOST_ROOM)
-                result.setdefault(factors[fact], {})[joint] = (1 - width, 1.0, 1 + width)
+                bounds = (1 / _ROOM_WITH_SCALE, 1.0, _ROOM_WITH_SCALE) if sensed else (1 - width, 1.0, 1 + width)
+                result.setdefault(factors[fact], {})[joint] = bounds
         return result
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
@@ -76,6 +84,7 @@ def read_drives(
     unknown: Collection[str] = (),
     assumed: Collection[str] = (),
     slides: Collection[str] = (),
+    sensed: Collection[str] = (),
 ) -> MeasuredDrives:
     """Read the law of every joint in every recording that has its torque, and take what nobody stated.
 
@@ -88,21 +97,23 @@ def read_drives(
         unknown: Facts that are stated and that are not to be believed.
         assumed: Joints whose gains nobody states: those that are configured are assumed.
         slides: Joints that slide.
+        sensed: Joints whose torques a fit follows: a constant part is one of their sensors, and not of their drives.
     """
     laws: dict[str, dict[str, MeasuredLaw]] = {}
     changed: list[Recording] = []
     warnings: dict[str, str] = {}
     taken_in: list[dict[str, set[str]]] = []
-    contested: dict[str, None] = {}
+    contested: dict[str, dict[str, None]] = {}
     for recording in recordings:
         own = {j: law for j in range(recording.num_joints) if (law := read_law(recording, j, delay_bounds[1]))}
         for law in own.values():
             laws.setdefault(law.joint, {})[recording.name] = law
         good = {j: law for j, law in own.items() if follows(law)}
-        new, taken, said = _with_facts(recording, good, configured, unknown, assumed, slides)
+        new, taken, said = _with_facts(recording, good, configured, unknown, assumed, slides, sensed)
         for fact, joint, text in said:
             warnings.setdefault(f"{fact} {joint}", f"{recording.name}: {text}")
-            contested |= {} if joint in taken.get(fact, ()) else {fact: None}
+            if joint not in taken.get(fact, ()):
+                contested.setdefault(fact, {})[joint] = None
         changed.append(new)
         taken_in.append(taken)
     every = [law for by_recording in laws.values() for law in by_recording.values() if follows(law)]
@@ -119,6 +130,7 @@ def read_drives(
         notes=(*lines, *([sentence] if sentence else [])),
         warnings=tuple(warnings.values()),
         contested=tuple(contested),
+        contested_joints=frozenset(joint for joints in contested.values() for joint in joints),
     )
 
 
@@ -139,6 +151,7 @@ def _with_facts(
     unknown: Collection[str],
     assumed: Collection[str],
     slides: Collection[str],
+    sensed: Collection[str],
 ) -> tuple[Recording, dict[str, set[str]], list[tuple[str, str, str]]]:
     """A recording with what its torques say and nobody states; what was taken; and what contradicts: fact, joint, text.
 
@@ -171,7 +184,7 @@ def _with_facts(
         if fact in taken:
             facts[fact] = values
     changed = replace(recording, drive=replace(recording.drive, **facts)) if facts else recording
-    return _with_feed_forward(replace(changed, logged=None), laws), taken, said
+    return _with_feed_forward(replace(changed, logged=None), laws, sensed), taken, said
 
 
 def _value(law: MeasuredLaw, fact: str) -> tuple[float | None, float]:
@@ -188,7 +201,7 @@ def apart(value: float, std: float, stated: float) -> bool:
     return abs(value - stated) > max(SURE * std, APART * abs(stated))
 
 
-def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw]) -> Recording:
+def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw], sensed: Collection[str]) -> Recording:
     """The commanded torques as the drives take them, with the constant ones that no command says."""
     shape = (recording.num_samples - 1) * recording.sample_stride + 1, recording.num_joints
     effort = np.zeros(shape) if recording.command_effort is None else recording.command_effort.copy()
@@ -197,7 +210,7 @@ def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw]) ->
         if law.feed_forward is not None and apart(law.feed_forward, law.std["feed_forward"], 1.0):
             effort[:, j] *= law.feed_forward
             changed = True
-        if has_offset(law):
+        if has_offset(law) and law.joint not in sensed:
             effort[:, j] += law.offset
             changed = True
     return replace(recording, command_effort=effort) if changed else recording

@@ -81,7 +81,10 @@ def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
 
 def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
     folder, refit = write_run(tmp_path / "run"), write_run(tmp_path / "refit")
-    content = make_diagnosis() | {"sizes": [SIZE | {"joint": f"joint_{i}", "value": i, "factor": None} for i in range(6)], "likes": {"torque_gain": ["payload"]}}
+    content = make_diagnosis() | {
+        "sizes": [SIZE | {"joint": f"joint_{i}", "value": i, "factor": None} for i in range(6)],
+        "likes": {"torque_gain": ["payload"]},
+    }
     content["runs"] = [str(folder), str(refit)]
     for each in (folder, refit):
         write_json(each / "diagnosis.json", content)

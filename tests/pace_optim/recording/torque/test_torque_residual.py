@@ -1,0 +1,159 @@
+"""Measured torques, followed beside the positions."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from bench_recordings import CONTROL_DT, Bench, chirp, record
+
+from pace_optim.estimate.error_bars.torque_noise import torque_noise
+from pace_optim.identification.fit import fit
+from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.problem import load_problem
+from pace_optim.recording.dataset import Torques
+from pace_optim.run.open import open_problem
+from pace_optim.run.settings import FitSettings
+
+TASK = "Pace-TestBench-v0"
+BOTH = ["position", "effort"]
+SCALE, OFFSET, NOISE = 1.05, 0.2, 0.05
+GAINS = ["stiffness", "damping"]
+
+
+def sensed(torque: np.ndarray) -> np.ndarray:
+    return SCALE * torque + OFFSET + NOISE * np.random.default_rng(5).normal(size=len(torque))
+
+
+def filtered(torque: np.ndarray) -> np.ndarray:
+    result = torque.copy()
+    for k in range(1, len(torque)):
+        result[k] = result[k - 1] + (torque[k] - result[k - 1]) / 3
+    return result
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A drive with a sensor of its torques; its gains are stated as half of what they are."""
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    return record(path, Bench(stated={"stiffness": 20.0, "damping": 0.5}), position=chirp(4.0), sensor=sensed)
+
+
+def settings(data, folder, **more) -> FitSettings:
+    return FitSettings(
+        task=TASK, data=[str(data)], optimizer="least_squares", check_consistency=False, log_dir=str(folder), **more
+    )
+
+
+@pytest.fixture(scope="module")
+def run(log, tmp_path_factory):
+    return fit(settings(log, tmp_path_factory.mktemp("runs"), unknown=GAINS, residual=BOTH))
+
+
+def test_gains_and_what_a_sensor_adds_are_found_beside_the_drive(run):
+    result, _ = run
+    found = {name: values["servo"] for name, values in result.parameters.items() if "servo" in values}
+    law = result.measured_drive["servo"]["log"]
+    kp, kd = (law[name] * found[f"{effect}_gain.gain"] for name, effect in
+              (("stiffness", "proportional"), ("damping", "derivative")))  # fmt: skip
+    assert (kp, kd) == pytest.approx((40.0, 1.0), rel=0.01)
+    assert (found["armature"], found["viscous_friction"], found["friction"]) == pytest.approx(
+        (0.05, 0.5, 0.3), rel=0.02
+    )
+    for name, truth in (("torque_scale", SCALE), ("torque_offset", OFFSET)):
+        assert abs(found[name] - truth) < 5 * result.std[name]["servo"] < 0.2 * truth
+    assert result.torque_rmse["validation"]["servo"] == pytest.approx(NOISE, rel=0.1)
+    assert any("follows dof_effort of servo" in note for note in result.notes)
+
+
+def test_a_run_is_opened_with_the_noise_that_its_torques_had(run):
+    result, folder = run
+    problem = open_problem(folder)
+    assert problem.torque_noise == result.torque_noise == {"servo": pytest.approx(NOISE, rel=0.2)}
+    alone = problem.on_positions()
+    assert not alone.torque_noise and not any(label.startswith("torque") for label in alone.space.labels)
+
+
+def test_compiled_and_stepped_torques_are_those_of_the_law(run, monkeypatch):
+    problem = open_problem(run[1]).with_effects(()).with_physics_dt(CONTROL_DT)
+    physical = problem.space.to_physical(problem.space.start)
+    physical[problem.space["delay"]] = 0.0
+    torques, at = problem.dataset.torques, torch.arange(200)
+
+    def simulated() -> list[torch.Tensor]:
+        rollout = problem.evaluator().rollout(1)
+        rollout.start(physical[None])
+        return [each[:, 0] for each in rollout.positions_and_torques(at, torques)]
+
+    shown, compiled = simulated()
+    monkeypatch.setattr("pace_envs.compiled_drive.robot_kernel.CompiledRobot.positions", lambda *_: None)
+    assert torch.allclose(compiled, simulated()[1], rtol=0.0, atol=1e-9)
+    (recording,), bias = problem.dataset.recordings, physical[problem.space["encoder_bias"]]
+    kp, kd = recording.drive.stiffness[0], recording.drive.damping[0]
+    held = kp * (problem.dataset.command[at, 0] - shown + bias)
+    speed = torch.gradient(shown, spacing=CONTROL_DT, dim=0)[0]
+    assert torch.allclose(compiled[2:-2], (held - kd * speed)[2:-2], atol=0.1) and float(held.std()) > 1
+
+
+def test_a_filtered_torque_does_not_spoil_a_fit(tmp_path):
+    log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0), sensor=filtered)
+    result, _ = fit(settings(log, tmp_path, residual=BOTH))
+    found = {name: values["servo"] for name, values in result.parameters.items() if "servo" in values}
+    assert (found["armature"], found["viscous_friction"], found["friction"]) == pytest.approx(
+        (0.05, 0.5, 0.3), rel=0.02
+    )
+    assert result.torque_noise["servo"] > 0.05
+
+
+def test_torques_that_say_nothing_are_left_out_and_told(tmp_path):
+    told = np.sin(np.arange(1600) / 40)
+    log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0), effort=told, sensor=lambda _: told)
+    with pytest.raises(ValueError, match="repeats the torque that is commanded"):
+        load_problem(TASK, data=[log], residual=BOTH)
+    assert load_problem(TASK, data=[log]).dataset.torques is None
+    log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0))
+    with pytest.raises(ValueError, match="no recording has any"):
+        load_problem(TASK, data=[log], residual=BOTH)
+
+
+def test_a_limit_that_a_torque_shows_is_refined(tmp_path):
+    log = record(tmp_path / "log.csv", Bench(current_limit=8.0), position=chirp(4.0), sensor=sensed)
+    facts = json.loads(log.with_suffix(".json").read_text())
+    log.with_suffix(".json").write_text(json.dumps({**facts, "effort_limit": 1e3}))
+    problem = load_problem(TASK, data=[log], unknown=["effort_limit", *GAINS], residual=BOTH)
+    assert problem.effects == ["torque_limit@servo", "proportional_gain", "derivative_gain"]
+    start = problem.space.to_physical(problem.space.start)
+    assert float(start[problem.space["torque_limit.effort"]]) == pytest.approx(8.0 * SCALE, rel=0.03)
+    assert np.isinf(problem.dataset.recordings[0].drive.effort_limit).all()
+
+
+def test_the_noise_of_a_torque_is_that_of_white_noise_that_hides_as_much():
+    rng, count = np.random.default_rng(0), 20_000
+    torque, white = np.sin(np.arange(count) / 50), rng.normal(size=count)
+    for left, noise in ((white, 1.0), (np.convolve(white, np.ones(9), mode="same"), 9.0)):
+        measured = torch.as_tensor(torque)[:, None, None]
+        known = torch.ones(count, 1, 1, dtype=torch.bool)
+        torques = Torques(
+            measured=measured, known=known, noise=torch.ones(1), floor=torch.zeros(1), position_noise=1.0,
+            after=torch.zeros(count, 1), lag=torch.zeros(1),
+        )  # fmt: skip
+        error = torch.stack([torch.zeros(count), torch.as_tensor(left)], dim=1)[None, :, :, None].double()
+        residuals = Residuals(
+            error=error, where=torch.ones(count, 2, dtype=torch.bool), step=torch.arange(count), with_torques=True
+        )
+        assert torque_noise(residuals, torques) == [pytest.approx(noise, rel=0.1)]
+        halves = replace(residuals, where=residuals.where & (torch.arange(count) < count // 2)[:, None])
+        assert torque_noise(halves, torques) == [pytest.approx(noise, rel=0.15)]
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"residual": ["effort"]}, "position effort"),
+        ({"residual": ["position", "effort"], "optimizer": "cmaes"}, "least"),
+    ],
+)
+def test_residuals_that_cannot_be_are_refused(more, says):
+    with pytest.raises(ValueError, match=says):
+        FitSettings(**{"task": TASK, **more})
