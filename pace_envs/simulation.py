@@ -35,7 +35,7 @@ _INTEGRATORS = {
 
 _STATE = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart", "time")
 _FRICTION = ("qfrc_constraint", "nf", "nefc")
-"""What tells the friction of a step, and whether it acted alone."""
+"""The constraints' forces after a step, how many frictions there are, and how many constraints."""
 
 
 @dataclass(kw_only=True)
