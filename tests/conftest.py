@@ -12,7 +12,16 @@ if "PACE_TEST_STATE" not in os.environ:  # processes that tests start share it
     os.environ["PACE_TEST_STATE"] = os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="pace-state-")
     atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
+from warm_python import WarmPython, warm_python
+
 from pace_actuators.effects import registry
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[WarmPython]:
+    """A ``python`` that starts at once, for tests that start commands."""
+    with warm_python() as python:
+        yield python
 
 
 @pytest.fixture(autouse=True, scope="module")

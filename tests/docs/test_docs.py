@@ -13,7 +13,7 @@ from command_lines import run_script
 from other_simulators import isaaclab_wheel, others_python
 from places import ROOT, SUPPORT
 from torque_sequence import write_result
-from warm_python import warm_python
+from warm_python import WarmPython
 
 from pace_actuators.effects.__main__ import page as page_of_effects
 from pace_optim.export import export
@@ -29,7 +29,7 @@ def blocks(page: Path, language: str | None = None) -> list[tuple[str, str]]:
     return [(kind, text) for kind, text in found if language in (None, kind)]
 
 
-def type_in(page: Path, home: Path, start: Path) -> str:
+def type_in(warm: WarmPython, page: Path, home: Path, start: Path) -> str:
     """Run all blocks of a page in one shell, as a reader who starts in the checkout would."""
     script = ["set -eo pipefail"]
     for i, (kind, text) in enumerate(blocks(page)):
@@ -43,48 +43,47 @@ def type_in(page: Path, home: Path, start: Path) -> str:
             script.append(f"python - < {home / f'block_{i}.py'}")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     kernels = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")  # each takes a compiler seconds
-    with warm_python() as function:
-        run = subprocess.run(
-            ["bash", "-c", "\n".join([function, *script])],
-            cwd=start,
-            env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": kernels, "PATH": path, "PYTHONUTF8": "1"},
-            capture_output=True,
-            text=True,
-            timeout=280,
-            check=False,
-        )
+    run = subprocess.run(
+        ["bash", "-c", "\n".join([warm.bash, *script])],
+        cwd=start,
+        env={**os.environ, "HOME": str(home), "XDG_CACHE_HOME": kernels, "PATH": path, "PYTHONUTF8": "1"},
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
     assert run.returncode == 0, f"{page.name}:\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}"
     return run.stdout
 
 
 @pytest.mark.slow
-def test_the_tutorial_for_an_own_robot_works_when_typed(tmp_path):
-    printed = type_in(ROOT / "docs" / "your_own_robot.md", tmp_path, ROOT)
+def test_the_tutorial_for_an_own_robot_works_when_typed(warm, tmp_path):
+    printed = type_in(warm, ROOT / "docs" / "your_own_robot.md", tmp_path, ROOT)
     assert "replay: " in printed
     assert list(tmp_path.glob("my_arm/logs/pace/my_arm/*/result.json"))
 
 
 @pytest.mark.slow
-def test_the_tutorial_for_an_own_objective_works_when_typed(tmp_path):
-    type_in(ROOT / "docs" / "your_own_objective.md", tmp_path, ROOT)
+def test_the_tutorial_for_an_own_objective_works_when_typed(warm, tmp_path):
+    type_in(warm, ROOT / "docs" / "your_own_objective.md", tmp_path, ROOT)
 
 
 @pytest.mark.slow
-def test_the_tutorial_for_an_own_effect_works_when_typed(tmp_path):
-    printed = type_in(ROOT / "docs" / "your_own_effect.md", tmp_path, ROOT)
+def test_the_tutorial_for_an_own_effect_works_when_typed(warm, tmp_path):
+    printed = type_in(warm, ROOT / "docs" / "your_own_effect.md", tmp_path, ROOT)
     assert "mrad without the cable" in printed
     assert "verdict: effect\nMissing: cable_drag. On held-out" in printed
 
 
 @pytest.mark.slow
-def test_the_tutorial_for_a_walking_robot_works_when_typed(tmp_path):
-    printed = type_in(ROOT / "docs" / "walking.md", tmp_path, ROOT)
+def test_the_tutorial_for_a_walking_robot_works_when_typed(warm, tmp_path):
+    printed = type_in(warm, ROOT / "docs" / "walking.md", tmp_path, ROOT)
     assert "verdict: nothing_missing" in printed
 
 
 @pytest.mark.slow
-def test_the_page_for_users_of_pace_works_when_typed(tmp_path):
-    printed = type_in(ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
+def test_the_page_for_users_of_pace_works_when_typed(warm, tmp_path):
+    printed = type_in(warm, ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
     assert "plot: " in printed and "objective my_optimizers:Weighted" in printed
 
 
@@ -102,14 +101,12 @@ SHOWN = [
 
 
 @pytest.mark.parametrize("page", SHOWN, ids=lambda page: page.name)
-def test_the_code_runs(page, tmp_path):
+def test_the_code_runs(warm, page, tmp_path):
     write_result(tmp_path / "result.json")
     for i, (_, text) in enumerate(blocks(page, "python")):
         if text.startswith("# in "):  # another simulator's environment
             continue
-        run = subprocess.run(
-            [sys.executable, "-"], input=text, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
-        )
+        run = warm.run("-", input=text, cwd=tmp_path, timeout=120)
         assert run.returncode == 0, f"block {i}:\n{run.stderr}"
 
 

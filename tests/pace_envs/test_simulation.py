@@ -2,8 +2,6 @@
 
 import math
 import os
-import subprocess
-import sys
 
 import mujoco
 import numpy as np
@@ -301,8 +299,8 @@ assert torch.equal(calm[others], wild[others])
 """
 
 
-def test_a_diverged_simulation_disturbs_no_other_and_is_quiet(tmp_path):
-    done = subprocess.run([sys.executable, "-c", DIVERGE], cwd=tmp_path, capture_output=True, text=True)
+def test_a_diverged_simulation_disturbs_no_other_and_is_quiet(warm, tmp_path):
+    done = warm.run("-c", DIVERGE, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert os.listdir(tmp_path) == []
 

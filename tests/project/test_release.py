@@ -71,15 +71,13 @@ def test_the_archive_can_be_built_from(built):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_notebook_runs_from_top_to_bottom(tmp_path):
+def test_the_notebook_runs_from_top_to_bottom(warm, tmp_path):
     cells = json.loads((ROOT / "docs" / "demo.ipynb").read_text("utf-8"))["cells"]
     assert not any(cell.get("outputs") for cell in cells), "outputs stay out of the repository"
     code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     guarded = "if __name__ == '__main__':\n" + "\n".join(f"    {line}" for line in code.splitlines())
     (tmp_path / "notebook.py").write_text(guarded, encoding="utf-8")
-    run = subprocess.run(
-        [sys.executable, "notebook.py"], cwd=tmp_path, capture_output=True, text=True, timeout=580, check=False
-    )
+    run = warm.run("notebook.py", cwd=tmp_path, timeout=580)
     assert run.returncode == 0, run.stderr[-3000:]
     assert "stribeck_friction" in run.stdout
 

@@ -5,7 +5,6 @@ import math
 import re
 import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -365,13 +364,8 @@ def test_a_parameter_that_cannot_be_applied_leaves_no_run_folder(fails, monkeypa
     assert "gear ratio of servo" in fails("--task", BENCH, "--data", "GOOD", "--optimizer", "least_squares")
 
 
-def test_the_script_itself_exits_with_2_and_one_line(tmp_path):
-    done = subprocess.run(
-        [sys.executable, ROOT / "scripts" / "fit.py", "--task", BENCH, "--data", "none.npz"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+def test_the_script_itself_exits_with_2_and_one_line(warm, tmp_path):
+    done = warm.run(ROOT / "scripts" / "fit.py", "--task", BENCH, "--data", "none.npz", cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("error: none.npz") and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []

@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 
 import pytest
 from places import SUPPORT
@@ -13,14 +11,8 @@ TRIALS = 60
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="trials are forked processes")
-def test_bad_input_of_every_kind_is_one_line(tmp_path):
+def test_bad_input_of_every_kind_is_one_line(warm, tmp_path):
     words = ("--trials", str(TRIALS), "--seed", "11", "--quick")
-    done = subprocess.run(
-        [sys.executable, SUPPORT / "bad_input.py", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    done = warm.run(SUPPORT / "bad_input.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
     assert re.search(rf"^\| all \| {TRIALS} \|( 0 \|)+$", done.stdout, re.MULTILINE), done.stdout

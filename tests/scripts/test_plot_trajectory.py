@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import os
 import runpy
 import subprocess
 import sys
@@ -65,9 +64,8 @@ def test_it_plots_both_of_the_newest_run_by_default(home):
     assert all((home / path).read_bytes().startswith(b"\x89PNG") for path in paths)
 
 
-def test_without_a_display_files_go_to_the_run(home):
-    command = [sys.executable, SCRIPT, "--robot_name", "leg", "--plot_score"]
-    paths = written(subprocess.run(command, cwd=home, env=dict(os.environ), capture_output=True, text=True))
+def test_without_a_display_files_go_to_the_run(warm, home):
+    paths = written(warm.run(SCRIPT, "--robot_name", "leg", "--plot_score", cwd=home))
     assert paths == [f"logs/pace/leg/{NEW}/score.png"]
 
 

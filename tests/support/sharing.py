@@ -18,12 +18,13 @@ def main() -> None:
     """Search, and print all scores and where it is; the rank named by LOSE ends without a word after a generation."""
     torch.set_num_threads(1)
     processes, _ = join("cpu")
-    print(searched(sys.argv[1] if len(sys.argv) > 1 else "Pace-TestBench-v0", processes))
+    task, recording = sys.argv[1:]
+    print(searched(task, recording, processes))
 
 
-def searched(task: str, processes: Processes) -> list:
+def searched(task: str, recording: str, processes: Processes) -> list:
     """All scores, where the search is and its best scores."""
-    problem = load_problem(task).on_pieces(0.1)
+    problem = load_problem(task, data=[recording]).on_pieces(0.1)
     evaluator = problem.training_evaluator()
     optimizer = CMAESOptimizer(
         problem.space, 9, CMAESOptimizerCfg.of(problem.env_cfg.sim2real), trees=problem.trees, processes=processes

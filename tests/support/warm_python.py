@@ -1,7 +1,8 @@
-"""A ``python`` that starts at once: a process that holds the libraries, none of our modules, forks for each command.
+"""A ``python`` that starts at once: a process that has imported the libraries and our packages forks for each command.
 
-Importing torch, SciPy and MuJoCo takes two seconds, of which a page that types twenty commands spends most of its time.
-The command itself runs as in a process of its own: its folder, environment and streams are those of who typed it.
+Importing torch, SciPy, MuJoCo and our packages takes three seconds, of which most commands of the tests spend most of
+their time. The command itself runs as in a process of its own: its folder, environment and streams are those of who
+started it. What is read while a library is imported (``OMP_NUM_THREADS``, ``OPENBLAS_CORETYPE``) is the server's.
 """
 
 import contextlib
@@ -15,6 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,55 +31,121 @@ with socket.socket(socket.AF_UNIX) as server:
     sys.exit(int(server.recv(8) or b"1"))
 """
 
+PACE = "import sys; from pace_optim.commands import main; sys.exit(main())"
+
+IMPORTED = (
+    "gymnasium",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.figure",
+    "mujoco",
+    "scipy.optimize",
+    "scipy.signal",
+    "scipy.stats",
+    "torch.distributed",
+    "torch.utils.tensorboard",
+    "pace_actuators.effects",
+    "pace_envs.rl",
+    "pace_optim.commands.compare",
+    "pace_optim.commands.data_collection",
+    "pace_optim.commands.diagnose",
+    "pace_optim.commands.fit",
+    "pace_optim.comparison.compare",
+    "pace_optim.diagnosis.diagnose",
+    "pace_optim.export",
+    "pace_optim.identification.fit",
+    "pace_optim.report.page",
+    "pace_optim.report.plots",
+)
+
+
+class WarmPython:
+    """Starts commands: a script, ``-`` (code from standard input) or ``-c CODE``, with their arguments."""
+
+    def __init__(self, client: list[str]):
+        """Take the words that a command's words follow."""
+        self._client = client
+
+    @property
+    def bash(self) -> str:
+        """Bash that makes ``python`` and ``pace`` functions."""
+        python, pace = shlex.join(self._client), shlex.quote(PACE)
+        return f'python() {{ {python} "$@"; }}\npace() {{ {python} -c {pace} "$@"; }}'
+
+    def start(self, *words: object, **options: object) -> subprocess.Popen[str]:
+        """As ``subprocess.Popen([sys.executable, *words], text=True, **options)``; its end is the command's end."""
+        return subprocess.Popen([*self._client, *map(str, words)], text=True, **options)  # type: ignore[call-overload]
+
+    def run(self, *words: object, **options: object) -> subprocess.CompletedProcess[str]:
+        """As ``subprocess.run``, with what is printed."""
+        return subprocess.run(  # type: ignore[call-overload]
+            [*self._client, *map(str, words)], capture_output=True, text=True, check=False, **options
+        )
+
 
 @contextlib.contextmanager
-def warm_python() -> Iterator[str]:
-    """Bash that makes ``python`` a function: scripts and code from standard input go to a process that is warm."""
+def warm_python() -> Iterator[WarmPython]:
+    """Run a server while this lasts."""
     with tempfile.TemporaryDirectory(prefix="py-") as folder:  # a socket's path is short
         place, client = Path(folder, "socket"), Path(folder, "client.py")
         client.write_text(CLIENT)
-        server = subprocess.Popen([sys.executable, __file__, place], stdout=subprocess.PIPE)
+        server = subprocess.Popen(
+            [sys.executable, __file__, place], stdout=subprocess.PIPE, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        )
         try:
             assert server.stdout is not None and server.stdout.readline() == b"ready\n"
-            words = shlex.join([sys.executable, "-I", "-S", str(client), str(place)])
-            yield f'python() {{ {words} "$@"; }}'
+            yield WarmPython([sys.executable, "-I", "-S", str(client), str(place)])
         finally:
-            server.kill()
+            server.terminate()
             server.wait()
 
 
 def _serve(place: str) -> None:
     """Import, and fork for each command."""
-    import gymnasium  # noqa: F401
-    import matplotlib.figure  # noqa: F401
-    import mujoco  # noqa: F401
-    import scipy.optimize
-    import scipy.signal
-    import scipy.stats  # noqa: F401
-    import torch  # noqa: F401
-
-    assert not [name for name in sys.modules if name.startswith("pace_")]
+    sys.path.pop(0)  # the folder of this file
+    for name in IMPORTED:
+        __import__(name)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(place)
         listening.listen()
         print("ready", flush=True)
         while True:
             asked, _ = listening.accept()
-            size, streams, *_ = socket.recv_fds(asked, 8, 3)
-            with asked.makefile("rb") as file:
-                words, home, environ = json.loads(file.read(int.from_bytes(size, "big")))
-            child = os.fork()
-            if not child:
+            if not os.fork():
                 listening.close()
-                asked.close()
-                for own, stream in enumerate(streams):
-                    os.dup2(stream, own)
-                    os.close(stream)
-                os._exit(_run(words, home, environ))
-            for stream in streams:
-                os.close(stream)
-            asked.sendall(str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode())
+                signal.signal(signal.SIGTERM, signal.SIG_DFL)
+                _attend(asked)
             asked.close()
+            with contextlib.suppress(ChildProcessError):
+                while os.waitpid(-1, os.WNOHANG)[0]:
+                    pass
+
+
+def _attend(asked: socket.socket) -> None:
+    """Fork the command that a client asks for and report its exit status; it ends with its client."""
+    size, streams, *_ = socket.recv_fds(asked, 8, 3)
+    with asked.makefile("rb") as file:
+        words, home, environ = json.loads(file.read(int.from_bytes(size, "big")))
+    command = os.fork()
+    if not command:
+        asked.close()
+        for own, stream in enumerate(streams):
+            os.dup2(stream, own)
+            os.close(stream)
+        os._exit(_run(words, home, environ))
+    for stream in streams:
+        os.close(stream)
+
+    def end_with_the_client() -> None:
+        if not asked.recv(1):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(command, signal.SIGKILL)
+
+    threading.Thread(target=end_with_the_client, daemon=True).start()
+    status = os.waitstatus_to_exitcode(os.waitpid(command, 0)[1])
+    with contextlib.suppress(OSError):
+        asked.sendall(str(status).encode())
+    os._exit(0)
 
 
 def _run(words: list[str], home: str, environ: dict[str, str]) -> int:
@@ -89,12 +157,16 @@ def _run(words: list[str], home: str, environ: dict[str, str]) -> int:
     os.environ.clear()
     os.environ.update(environ)
     script, sys.argv = words[0], words
+    if script == "-c":
+        code, sys.argv = words[1], ["-c", *words[2:]]
     paths = [path for path in environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    sys.path[0] = "" if script == "-" else os.path.dirname(os.path.abspath(script))
-    sys.path[1:1] = [path for path in paths if path not in sys.path]
+    first = "" if script in ("-", "-c") else os.path.dirname(os.path.abspath(script))
+    sys.path[:0] = [first, *(path for path in paths if path not in sys.path)]
     try:
         if script == "-":
             exec(compile(sys.stdin.read(), "<stdin>", "exec"), {"__name__": "__main__"})
+        elif script == "-c":
+            exec(compile(code, "<string>", "exec"), {"__name__": "__main__"})
         else:
             runpy.run_path(script, run_name="__main__")
         status = 0

@@ -1,7 +1,6 @@
 """A diagnosis: its arithmetic on what is known, and whether it names a hidden effect."""
 
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -302,7 +301,7 @@ class Lean(Effect):
 
 
 @pytest.mark.slow
-def test_an_effect_of_one_s_own_is_named_and_kept_when_its_refit_is_broken_off(tmp_path):
+def test_an_effect_of_one_s_own_is_named_and_kept_when_its_refit_is_broken_off(warm, tmp_path):
     run = hidden_run(tmp_path, "torque_offset", duration=2.5).folder
     broken = """
 import importlib, runpy, sys
@@ -319,8 +318,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     (tmp_path / "lean_effects.py").write_text(OWN)
     script = str(ROOT / "scripts" / "diagnose.py")
     options = ["--only", "--effects", "lean_effects:Lean", "--max_effects", "1"]
-    command = [sys.executable, "-c", broken, script, str(run), *options]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    done = warm.run("-c", broken, script, run, *options, cwd=tmp_path)
     assert done.returncode == 0 and "the diagnosis above stands" in done.stderr, done.stderr
     assert done.stdout.startswith("verdict: effect") and (run / "report.html").is_file()
     content = json.loads((run / "diagnosis.json").read_text())

@@ -130,7 +130,7 @@ def test_what_went_wrong_elsewhere_is_told_with_its_place(error):
     assert "in work_of_a_user" in told
 
 
-def test_a_process_ends_with_the_one_that_started_it(tmp_path):
+def test_a_process_ends_with_the_one_that_started_it(warm, tmp_path):
     """A result that nobody reads must not keep it."""
     script = tmp_path / "started.py"
     script.write_text(
@@ -147,7 +147,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
         "    return [bytes(10**7)]\n"
         "processes.parallel_map(work, 'ab', [get_effect('torque_gain'), get_effect('torque_ripple')])\n"
     )
-    first = subprocess.Popen([sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    first = warm.start(script, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     other = int(first.stdout.readline())
     first.stdin.write("\n")
     first.stdin.flush()

@@ -8,7 +8,7 @@ from models import HEAD, KD, KP, MOTORS
 from pace_optim.identification.fit import fit
 from pace_optim.recording import Drive, Recording, save_recording
 from pace_optim.recording.commands import command_interval
-from pace_optim.run.open import open_problem
+from pace_optim.run.open import open_problem, problem_of
 from pace_optim.run.settings import FitSettings
 
 
@@ -55,22 +55,10 @@ def test_a_fit_takes_the_rate_of_the_logs_commands_and_its_run_keeps_it(tmp_path
     robot.write_text(HEAD.format(MOTORS))
     fast, slow = recorded(robot, "fast"), recorded(robot, "slow", dt=0.0025)
 
-    def fitted(**settings):
-        return fit(
-            FitSettings(
-                task=str(robot),
-                data=[fast],
-                optimizer="least_squares",
-                check_consistency=False,
-                log_dir=str(tmp_path / "logs"),
-                **settings,
-            )
-        )
-
-    result, run = fitted()
+    told = {"task": str(robot), "data": [fast], "optimizer": "least_squares", "log_dir": str(tmp_path / "logs")}
+    result, run = fit(FitSettings(check_consistency=False, **told))
     assert result.control_dt == 0.001 and any(note.startswith("control rate: 1000 Hz") for note in result.notes)
     assert result.parameters["viscous_friction"]["pan"] == pytest.approx(0.05, rel=0.01)
     assert open_problem(run, data=[slow]).control_dt == 0.001  # whatever is held against it
     assert FitSettings.load(run / "settings.json")[0].control_dt == 0.001  # what processes that help are given
-    told, _ = fitted(control_dt=0.0025)
-    assert told.control_dt == 0.0025
+    assert problem_of(FitSettings(control_dt=0.0025, **told)).control_dt == 0.0025

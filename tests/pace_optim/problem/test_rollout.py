@@ -17,9 +17,9 @@ from problems import (
     pendulums_cfg,
     pendulums_target,
     physical,
-    record,
 )
 from problems import PENDULUMS_TRUTH as TWO
+from problems import record as recorded
 
 from pace_envs import set_physics_dt
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
@@ -30,6 +30,11 @@ from pace_optim.recording.windows import Windows
 
 EXACT = 1e-12  # [rad²]
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05}
+
+
+def record(target=None, *facts, **more):
+    """Half a second where no motion is given."""
+    return recorded(chirp(0.5) if target is None else target, *facts, **more)
 
 
 def scores(problem, *truths, where=None):
@@ -54,7 +59,7 @@ def test_the_truth_replays_exactly_with_the_joints_in_another_order_than_the_mod
     each = {key: {name: value * (1 + 0.05 * i) for i, name in enumerate(names)} for key, value in ANYMAL_TRUTH.items()}
     truth = {**each, "delay": delay}
     cfg = env_cfg("Pace-AnymalD-v0")
-    recording = record(legs_chirp(cfg), truth, cfg=cfg, delay_mode=delay_mode)
+    recording = record(legs_chirp(cfg, 0.5), truth, cfg=cfg, delay_mode=delay_mode)
     columns = {key: getattr(recording, key)[:, shuffled] for key in ("dof_pos", "des_dof_pos")}
     recording = dataclasses.replace(recording, joint_names=tuple(names[i] for i in shuffled), **columns)
     problem = make_problem(recording, cfg=cfg, delay_mode=delay_mode)
@@ -66,7 +71,7 @@ def test_the_truth_replays_exactly_when_the_robots_own_order_is_not_the_models(t
     cfg = pendulums_cfg(tmp_path)
     swapped = dataclasses.replace(cfg.sim2real, joint_order=("right", "left"))
     turned = dataclasses.replace(cfg, sim2real=swapped)
-    recording = record(pendulums_target(), TWO, cfg=cfg)  # columns left, right
+    recording = record(pendulums_target(0.5), TWO, cfg=cfg)  # columns left, right
     problem = make_problem(recording, cfg=turned)
     assert problem.joint_names == ("right", "left")
     assert scores(problem, TWO) <= EXACT
@@ -163,9 +168,9 @@ def test_nothing_after_the_last_training_sample_is_simulated_or_scored():
     problem = make_problem(record(), train_fraction=0.5)
     rollout = problem.evaluator().rollout(1)
     rollout.start(physical(problem)[None])
-    assert sum(1 for _ in rollout) == round(0.5 * 401)
-    assert rollout.simulated_steps == round(0.5 * 401) - 1
-    moved = dataclasses.replace(record(), dof_pos=record().dof_pos + np.where(np.arange(401) < 250, 0, 0.3)[:, None])
+    assert sum(1 for _ in rollout) == round(0.5 * 201)
+    assert rollout.simulated_steps == round(0.5 * 201) - 1
+    moved = dataclasses.replace(record(), dof_pos=record().dof_pos + np.where(np.arange(201) < 125, 0, 0.3)[:, None])
     assert scores(make_problem(moved, train_fraction=0.5), TRUTH) <= EXACT
 
 
@@ -209,10 +214,10 @@ def test_several_drive_groups_replay_as_one():
 
 
 def test_a_recording_sampled_slower_than_the_control_is_compared_at_its_samples():
-    full = record(np.repeat(chirp()[::4], 4, axis=0)[:401])  # targets held for four control steps
+    full = record(np.repeat(chirp()[::4], 4, axis=0)[:201])  # targets held for four control steps
     slow = dataclasses.replace(full, **{key: getattr(full, key)[::4] for key in ("time", "dof_pos", "des_dof_pos")})
     problem = make_problem(slow)
-    assert int(problem.dataset.sampled.sum()) == 101
+    assert int(problem.dataset.sampled.sum()) == 51
     assert scores(problem, TRUTH) <= EXACT
 
 
@@ -268,7 +273,7 @@ def test_speeds_are_at_hand_while_a_rollout_runs():
         simulated.append(rollout.sim_dof_vel.clone())
         measured.append(rollout.real_dof_vel.clone())
     simulated, measured = torch.stack(simulated), torch.stack(measured)
-    assert simulated.shape == measured.shape == (401, 2, 1)
+    assert simulated.shape == measured.shape == (201, 2, 1)
     between = (simulated[1:] + simulated[:-1]) / 2  # the engine's speed is a backward difference
     largest = float(measured.abs().max())
     assert largest > 4 and float((between - measured[:-1])[5:-5].abs().max()) < 0.02 * largest

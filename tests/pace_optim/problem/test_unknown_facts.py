@@ -99,7 +99,7 @@ def test_an_unknown_limit_is_sought_about_the_stated_one_which_no_longer_acts(tm
 
 
 def test_a_limit_that_was_found_is_that_of_the_drive(tmp_path):
-    path = record(tmp_path / "weak.csv", Bench(current_limit=8.0, stated={"effort_limit": 20.0}), position=chirp(2.0))
+    path = record(tmp_path / "weak.csv", Bench(current_limit=8.0, stated={"effort_limit": 20.0}), position=chirp(1.0))
     settings = FitSettings(
         task=BENCH, data=[str(path)], unknown=["effort_limit"],
         check_consistency=False, log_dir=str(tmp_path),

@@ -198,7 +198,7 @@ def test_temporary_files_of_killed_processes_are_removed(tmp_path):
     assert not left.exists() and own.exists() and other.exists()
 
 
-def test_a_full_disk_is_told_with_the_files_name(tmp_path):
+def test_a_full_disk_is_told_with_the_files_name(warm, tmp_path):
     code = f"""
         import resource, signal
         from pathlib import Path
@@ -214,7 +214,7 @@ def test_a_full_disk_is_told_with_the_files_name(tmp_path):
             else:
                 raise SystemExit("written")
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True)
+    done = warm.run("-c", textwrap.dedent(code), cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert list(tmp_path.iterdir()) == []
 

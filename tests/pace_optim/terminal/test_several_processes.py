@@ -7,13 +7,12 @@ import json
 import os
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from places import ROOT, SUPPORT
-from problems import ANYMAL, BENCH, record
+from problems import ANYMAL, BENCH, TRUTH, chirp, env_cfg, legs_chirp, record
 from sharing import searched
 
 from pace_optim.identification.fit import fit
@@ -43,23 +42,34 @@ def test_pieces_of_work_go_round_the_processes():
     assert owners == [0, 1, 2, 0, 1, 2, 0] and Processes().exchange(["a", "b"]) == ["a", "b"]
 
 
-def _start(count: int, *command: str, **environ: str) -> list[subprocess.Popen[str]]:
-    """One process per rank, as torchrun would start them."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    common = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "PYTHONPATH": paths}
-    return [
-        subprocess.Popen(
-            [sys.executable, *command],
-            env={**os.environ, **common, **environ, "OMP_NUM_THREADS": "1", "RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in range(count)
-    ]
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> str:
+    """A recording's file."""
+    return str(
+        save_recording(tmp_path_factory.mktemp("data") / "bench.npz", record(chirp(0.5), name="bench", noise=1e-4))
+    )
+
+
+@pytest.fixture
+def start(warm):
+    """Starts one process per rank, as torchrun would."""
+
+    def start(count: int, *command: str, **environ: str) -> list[subprocess.Popen[str]]:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        common = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+        return [
+            warm.start(
+                *command,
+                env={**os.environ, **common, **environ, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+            )
+            for rank in range(count)
+        ]
+
+    return start
 
 
 def _texts(processes: list[subprocess.Popen[str]]) -> list[str]:
@@ -70,26 +80,28 @@ def _texts(processes: list[subprocess.Popen[str]]) -> list[str]:
 
 
 @pytest.mark.slow
-def test_two_processes_score_what_one_scores():
+def test_two_processes_score_what_one_scores(start, bench):
     """Exactly: each candidate is simulated by one process."""
-    processes = _start(2, SEARCH)
-    alone = searched(BENCH, Processes())
+    processes = start(2, SEARCH, BENCH, bench)
+    alone = searched(BENCH, bench, Processes())
     first, second = (ast.literal_eval(text.strip().splitlines()[-1]) for text in _texts(processes))
     assert alone == first == second
 
 
 @pytest.mark.slow
-def test_processes_that_share_four_strategies_search_as_one_does_with_all():
+def test_processes_that_share_four_strategies_search_as_one_does_with_all(start, tmp_path):
     """Each does the arithmetic of its own legs' strategies; of four, three processes have two, one and one."""
-    processes = _start(3, SEARCH, ANYMAL)
-    alone = searched(ANYMAL, Processes())
+    cfg = env_cfg(ANYMAL)
+    legs = str(save_recording(tmp_path / "legs.npz", record(legs_chirp(cfg, 0.3), {**TRUTH, "delay": 2.0}, cfg=cfg)))
+    processes = start(3, SEARCH, ANYMAL, legs)
+    alone = searched(ANYMAL, legs, Processes())
     shared = [ast.literal_eval(text.strip().splitlines()[-1]) for text in _texts(processes)]
     assert len(alone[0][0][0]) == 4 and shared == [alone] * 3
 
 
 @pytest.mark.slow
-def test_a_lost_process_ends_the_others_with_one_line():
-    stays, lost = _start(2, SEARCH, LOSE="1")
+def test_a_lost_process_ends_the_others_with_one_line(start, bench):
+    stays, lost = start(2, SEARCH, BENCH, bench, LOSE="1")
     text = stays.communicate(timeout=200)[0]
     lost.communicate(timeout=200)
     assert stays.returncode == 2, text
@@ -98,28 +110,27 @@ def test_a_lost_process_ends_the_others_with_one_line():
 
 
 @pytest.mark.slow
-def test_a_shared_fit_that_is_resumed_ends_as_one_that_nobody_shared(tmp_path):
-    save_recording(tmp_path / "bench.npz", record(name="bench", noise=1e-4))
-    common = {"task": BENCH, "data": [str(tmp_path / "bench.npz")], "num_envs": 9, "optimizer": "cmaes"}
+def test_a_shared_fit_that_is_resumed_ends_as_one_that_nobody_shared(start, bench, tmp_path):
+    common = {"task": BENCH, "data": [bench], "num_envs": 9, "optimizer": "cmaes"}
     alone, _ = fit(FitSettings(**common, max_iteration=4, log_dir=str(tmp_path / "alone")))
-    options = ["--task", BENCH, "--data", common["data"][0], "--num_envs", "9", "--optimizer", "cmaes"]
-    writer, other = _texts(_start(2, FIT, *options, "--max_iteration", "2", "--log_dir", str(tmp_path / "shared")))
+    options = ["--task", BENCH, "--data", bench, "--num_envs", "9", "--optimizer", "cmaes"]
+    writer, other = _texts(start(2, FIT, *options, "--max_iteration", "2", "--log_dir", str(tmp_path / "shared")))
     run = writer.strip().splitlines()[-1].removeprefix("run: ")
     assert "run:" not in other and [str(p) for p in (tmp_path / "shared").glob("*/*")] == [run]
-    _texts(_start(2, FIT, "--resume", run, "--max_iteration", "4"))
+    _texts(start(2, FIT, "--resume", run, "--max_iteration", "4"))
     result = json.loads((Path(run) / "result.json").read_text())
     assert result["generations"] == 4 and result["parameters"] == alone.parameters
 
 
 @pytest.mark.slow
-def test_a_training_is_shared_ends_with_a_lost_process_and_goes_on(tmp_path):
-    stays, lost = _start(2, TRAINING, "train", str(tmp_path), LOSE="1")
+def test_a_training_is_shared_ends_with_a_lost_process_and_goes_on(start, tmp_path):
+    stays, lost = start(2, TRAINING, "train", str(tmp_path), LOSE="1")
     text = stays.communicate(timeout=200)[0]
     lost.communicate(timeout=200)
     line = text.strip().splitlines()[-1]
     assert stays.returncode == 2 and line.startswith("error: A process that shares this job was lost"), text
     (run,) = tmp_path.glob("*/*")
-    texts = [text.strip().splitlines() for text in _texts(_start(2, TRAINING, "resume", str(run)))]
+    texts = [text.strip().splitlines() for text in _texts(start(2, TRAINING, "resume", str(run)))]
     assert [lines[-1] for lines in texts] == [f"run: {run}", "run: None"]
     assert len({lines[-2] for lines in texts}) == 1  # both have the same policy
     assert {p.name for p in run.glob("model_*.pt")} == {"model_0.pt", "model_1.pt"}

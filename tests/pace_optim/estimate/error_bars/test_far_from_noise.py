@@ -183,7 +183,7 @@ def test_a_delay_that_is_not_told_from_none_is_none():
     """Beside large gains it would take damping and inertia along."""
 
     def ended(true, found, std):
-        recording = record(chirp(2.0), {**TRUTH, "delay": true})
+        recording = record(chirp(1.0), {**TRUTH, "delay": true})
         noise = np.random.default_rng(0).normal(0, 1e-4, recording.dof_pos.shape)
         problem = make_problem(replace(recording, dof_pos=recording.dof_pos + noise))
         x = problem.space.to_normalised(physical(problem, {**TRUTH, "delay": found}))

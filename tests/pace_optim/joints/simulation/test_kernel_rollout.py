@@ -1,8 +1,7 @@
 """The single-joint simulation as one kernel moves as itself, on a GPU and on the processor."""
 
+import os
 import shutil
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -206,19 +205,20 @@ def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_
     assert set(kept) == {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a compiler of C++")
 @pytest.mark.parametrize("part", [0.0, 0.1, 0.9])
-def test_a_kernel_that_was_cut_short_is_compiled_again(keeps, tmp_path, part):
+def test_a_kernel_that_was_cut_short_is_compiled_again(warm, tmp_path, part):
     """Loaded, it ended the process with SIGBUS, each time."""
-    assert doubled(keeps()) == 42.0
-    for path in (tmp_path / "pace" / "kernels").iterdir():
-        path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
     script = (
         "import torch; from pace_envs.kernels import host_kernels; kernels = host_kernels()\n"
         f"kernels.compile([{DOUBLE!r}]); x = torch.tensor(4.0, dtype=torch.float64)\n"
         f"kernels.launch({DOUBLE!r}, 1, 1, [x]); print(float(x))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "8.0\n"), done
+    for _ in range(2):
+        done = warm.run("-c", script, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)})
+        assert (done.returncode, done.stdout) == (0, "8.0\n"), done
+        for path in (tmp_path / "pace" / "kernels").iterdir():
+            path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
 
 
 def test_a_compiler_that_never_ends_leaves_the_simulation_without_kernels(monkeypatch, tmp_path):
