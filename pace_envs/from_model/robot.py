@@ -248,11 +248,16 @@ def _joints_to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
 
 
 def _base_pose(robot: Robot) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Pose of a floating base at home; a fixed one is where the file has it."""
+    """Pose of a floating base at home; a fixed one is where the file has it.
+
+    A keyframe leans as the robot stands. A stand holds the base as the file has its body.
+    """
     model = robot.model
     for j in range(model.njnt):
         if int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE:
-            x, y, z, *turn = robot.home[model.jnt_qposadr[j] : model.jnt_qposadr[j] + 7].tolist()
+            at = model.jnt_qposadr[j]
+            x, y, z = robot.home[at : at + 3].tolist()
+            turn = model.qpos0[at + 3 : at + 7].tolist()
             return (x, y, z), (turn[0], turn[1], turn[2], turn[3])
     return (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
 
@@ -291,7 +296,7 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
         notes.append("speed limit: none")
     notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
-        notes.append("the base is held in the air, and nothing touches")
+        notes.append("the base is held in the air as the file has its body, not as a keyframe leans, and nothing touches")
     return notes
 
 
