@@ -1,7 +1,6 @@
 """Data collection: recordings that replay exactly, encoders as asked for, and a command line that does not lie."""
 
 import csv
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from pace_optim.recording.dataset import make_dataset
 from pace_optim.terminal.cli import run_cli
 
 BENCH = ("--task", "Pace-TestBench-v0")
-SHORT = ("--duration", "2", "--no_plot")
+SHORT = ("--duration", "1", "--no_plot")
 EXACT = 1e-12  # [rad²]
 
 
@@ -145,13 +144,13 @@ def test_noise_has_the_level_asked_for():
 
 
 def test_a_recording_is_as_noisy_as_asked_for(tmp_path):
-    exact = record(tmp_path, *BENCH, *SHORT)
-    noisy = record(tmp_path, *BENCH, *SHORT, "--noise", "1e-3")
+    options = (*BENCH, "--duration", "2", "--no_plot")
+    exact, noisy = record(tmp_path, *options), record(tmp_path, *options, "--noise", "1e-3")
     error = noisy.dof_pos - exact.dof_pos
     assert np.diff(error, axis=0).std() / np.sqrt(2) == pytest.approx(1e-3, rel=0.05)
     assert error.std() == pytest.approx(1e-3, rel=0.1)
-    again = record(tmp_path, *BENCH, *SHORT, "--noise", "1e-3")
-    other = record(tmp_path, *BENCH, *SHORT, "--noise", "1e-3", "--seed", "1")
+    again = record(tmp_path, *options, "--noise", "1e-3")
+    other = record(tmp_path, *options, "--noise", "1e-3", "--seed", "1")
     assert np.array_equal(noisy.dof_pos, again.dof_pos) and not np.array_equal(noisy.dof_pos, other.dof_pos)
 
 
@@ -173,7 +172,7 @@ def test_positions_lie_on_the_encoder_lattice(tmp_path):
 
 
 def test_the_battery_is_written_as_six_recordings(tmp_path, capsys):
-    args = (*BENCH, "--excitation", "battery", "--duration", "2", "--output", str(tmp_path / "b.npz"))
+    args = (*BENCH, "--excitation", "battery", "--duration", "1", "--output", str(tmp_path / "b.npz"))
     assert script("data_collection", *args, "--no_plot") == 0
     parts = ["chirp_large", "chirp_medium", "chirp_small", "staircase", "steps", "triangle"]
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"b_{part}.npz" for part in parts]
@@ -186,7 +185,7 @@ def test_the_battery_is_written_as_six_recordings(tmp_path, capsys):
 
 
 def test_a_plot_lies_beside_the_recording(tmp_path, capsys):
-    record(tmp_path, *BENCH, "--duration", "2")
+    record(tmp_path, *BENCH, "--duration", "1")
     assert f"plot: {tmp_path / 'r.png'}" in capsys.readouterr().out.splitlines()
     assert (tmp_path / "r.png").read_bytes().startswith(b"\x89PNG")
 
@@ -348,9 +347,8 @@ def test_help_shows_an_example(name, capsys):
     assert f"example:\n  scripts/{name}.py" in capsys.readouterr().out
 
 
-def test_scripts_run_from_anywhere(tmp_path):
-    command = [sys.executable, str(ROOT / "scripts" / "data_collection.py"), "--task", "Pace-Testbench-v0"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+def test_scripts_run_from_anywhere(warm, tmp_path):
+    done = warm.run(ROOT / "scripts" / "data_collection.py", "--task", "Pace-Testbench-v0", cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == ""
     assert (
         done.stderr.startswith("error: There is no environment 'Pace-Testbench-v0'.") and done.stderr.count("\n") == 1

@@ -61,12 +61,14 @@ class Silent(ProgressLine):
 def recordings(tmp_path_factory):
     """Files: clean, noisy, one at other gains, one with another load."""
     folder = tmp_path_factory.mktemp("recordings")
+    target = chirp(0.5)
+    short = record(target)
     made = {
         "clean": record(name="clean"),
-        "noisy": record(name="noisy", noise=1e-4),
-        "soft": record(name="soft", drive={"stiffness": 50.0}, noise=1e-4, seed=1),
-        "heavy": record(name="heavy", load=Load(load_mass=1.6), noise=1e-4, seed=2),
-        "wrong": dataclasses.replace(record(name="wrong"), dof_pos=np.roll(record().dof_pos, 5, axis=0)),
+        "noisy": record(target, name="noisy", noise=1e-4),
+        "soft": record(target, name="soft", drive={"stiffness": 50.0}, noise=1e-4, seed=1),
+        "heavy": record(target, name="heavy", load=Load(load_mass=1.6), noise=1e-4, seed=2),
+        "wrong": dataclasses.replace(short, name="wrong", dof_pos=np.roll(short.dof_pos, 5, axis=0)),
     }
     for name, recording in made.items():
         save_recording(folder / f"{name}.npz", recording)

@@ -96,9 +96,9 @@ def test_a_free_swing_keeps_its_energy():
 
 def test_a_free_swing_has_the_period_of_the_closed_form():
     truth = Truth(base=BaseTruth(armature=0.1, viscous_friction=0.0, friction=0.0, delay=0.0))
-    q = positions(truth, [run_of(np.full((4000, 1), 0.02), drive=FREE)])[0].dof_pos[:, 0]
+    q = positions(truth, [run_of(np.full((1000, 1), 0.02), drive=FREE)])[0].dof_pos[:, 0]
     frequency = np.sqrt(GRAVITY / (INERTIA + 0.1))
-    assert q == pytest.approx(0.02 * np.cos(frequency * np.arange(4000) * DT), abs=2e-5)
+    assert q == pytest.approx(0.02 * np.cos(frequency * np.arange(1000) * DT), abs=2e-5)
 
 
 def test_viscous_friction_lets_a_speed_die_out_exponentially():
@@ -130,7 +130,7 @@ def test_a_link_swings_on_behind_a_motor_that_sticks():
 def test_a_finer_step_changes_the_motion_by_less_than_the_noise(name):
     effects = {} if name is None else {name: draw_effect(name, ROBOT, np.random.default_rng(1))}
     truth = Truth(base=BASE, effects=effects)
-    runs = [run_of(chirp(1.5))]
+    runs = [run_of(chirp(0.75))]
     usual, fine = (positions(truth, runs, PlantCfg(noise=0.0, step=step)) for step in (PlantCfg().step, 5e-5))
     assert motion_change(usual, fine) < (1e-4 if name == "backlash" else 3e-5)
 
@@ -170,7 +170,7 @@ def test_coupled_joints_obey_the_friction_law_exactly():
 def test_without_effects_the_model_converges_to_the_plant(delay_mode):
     truth = Truth(base=BASE, delay_mode=delay_mode)
     no_curve = Drive(velocity_limit=np.array([1e6]))  # the model may hold its torque-speed limit over a control step
-    recording = positions(truth, [run_of(chirp(amplitude=0.4), drive=no_curve)])[0]
+    recording = positions(truth, [run_of(chirp(1.0, amplitude=0.4), drive=no_curve)])[0]
     space = ParameterSpace.of(env_cfg().sim2real)
     conformed = conform_recording(recording, joint_order=("servo",), control_dt=DT, accepts_load=True)
     dataset = make_dataset([conformed], train_fraction=1)
@@ -304,7 +304,8 @@ def test_what_the_plant_cannot_do_is_said(changes, message):
 
 
 @pytest.mark.slow
-def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path):
+def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr("pace_optim.data_collection.plant.case.make_suite", partial(make_suite, duration=2.0))
     case = Case(effects=("torque_ripple",), seed=5)
     files, again = write_case(case, tmp_path / "a"), write_case(case, tmp_path / "b")
     assert len(files.train) == 8 and len(files.validation) == 2

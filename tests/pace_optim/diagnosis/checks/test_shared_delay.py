@@ -36,7 +36,7 @@ def legs():
     """A motion of a robot's legs, as it was."""
     cfg = env_cfg(ANYMAL)
     set_physics_dt(cfg, DT / 5)
-    target = legs_chirp(cfg, 4.5)
+    target = legs_chirp(cfg, 2.5)
     target = np.concatenate([np.repeat(target[:1], 20, axis=0), target])
     return [record(factor * target, TRUTH, cfg=cfg, noise=1e-4, seed=i) for i, factor in enumerate((1.0, 0.7))]
 
