@@ -36,8 +36,8 @@ class DriveProgram:
     """What becomes of leaves in a control step, by index."""
     shown: Node
     """What the encoders show before it."""
-    torque: Node
-    """What the motor gives in its first physics step [N m]."""
+    torque: Node | None
+    """What the motor gives in its first physics step [N m]; ``None``: it is not shown."""
     entries: list[int]
     """How many numbers each leaf has."""
     leaves: list[Read]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +65,7 @@ class CompiledRobot:
         try:
             if self._kernel is None:
                 self._kernel = RobotKernel(self._env, self._dataset, kernels, self._course)
-            self._kernel.record()
+            self._kernel.record(torque is not None)
             return self._kernel.positions(at, state, torque) if self._kernel.pays(int(at[-1])) else None
         except CannotCompileError:
             self._refused = True
@@ -106,14 +107,20 @@ class RobotKernel:
         """Whether it is worth compiling for so many control steps more."""
         return self._kernels.pays(self._source.source, steps * self._env.cfg.decimation)
 
-    def record(self) -> None:
-        """Record what the drives do, unless that was recorded with the same flags."""
+    def record(self, with_torques: bool = False) -> None:
+        """Record what the drives do, unless that was recorded with the same flags.
+
+        Args:
+            with_torques: Whether the motors' torques are shown, too.
+        """
         robot = self._env.scene["robot"]
-        flags = [actuator.flags() for actuator in robot.actuators.values()]
+        flags = [with_torques, *(actuator.flags() for actuator in robot.actuators.values())]
         if flags == self._flags:
             return
         self._flags = flags
         self._programs = [record_drive(self._env, self._dataset, each) for each in robot.actuators.values()]
+        if not with_torques:
+            self._programs = [replace(program, torque=None) for program in self._programs]
         self._source = robot_source(
             self._programs,
             robot._layout.qpos_columns,

@@ -48,12 +48,13 @@ those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turn
 the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
 steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);
 the drives' memory and the forces of gravity and motion of each environment; room for what was before a step, and for
-its friction (environments, 5, nv); what is shown (rows, environments, joints), unless it is 0 the motors' torques there
-(the same), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Unless it is 0, the
-motion of a base that moves (commands, physics steps of a control step, recordings, 9), where its specific force was
-measured (recordings, 3), what is added to that (environments, 3), and room to compute with (environments, 12 nbody);
-unless it is 0, positions and speeds at which joints are held (commands, recordings, joints, 2; NaN: free), and what is
-added to them (environments, joints, 2). Then the leaves of each drive, each with the memory of its delays behind it."""
+its friction (environments, 5, nv); what is shown (rows, environments, joints), where they are recorded the motors'
+torques there (the same), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Unless
+it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9), where its specific
+force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with (environments, 12
+nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints, 2; NaN: free), and
+what is added to them (environments, joints, 2). Then the leaves of each drive, each with the memory of its delays
+behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <string.h>\n" + PRELUDE
@@ -223,7 +224,8 @@ class _Drive:
         """
         self.name, self._program, self._series, self._num_joints = name, program, series, num_joints
         tape = program.tape
-        roots = [program.shown, program.torque, *(node for node in tape.nodes if node.operation in ("push", "physics"))]
+        self._shown = {"out": program.shown} | ({} if program.torque is None else {"effort": program.torque})
+        roots = [*self._shown.values(), *(node for node in tape.nodes if node.operation in ("push", "physics"))]
         self._updates, needed = needed_nodes(tape, program.updates, roots)
         changing = changing_nodes(tape, self._updates)
         self._nodes = [node for node in tape.nodes if node.number in needed]
@@ -271,7 +273,7 @@ class _Drive:
         leaf = {node.index: node for node in self._nodes if node.operation == "leaf"}
         uses += [(node, last) for node in self._updates.values()]
         uses += [(leaf[i], last) for i in self._updates]
-        return [*uses, (self._program.shown, 0), (self._program.torque, 0)]
+        return [*uses, *((node, 0) for node in self._shown.values())]
 
     def _to_keep(self) -> list[Node]:
         """Nodes that are used in another part than their own."""
@@ -328,8 +330,7 @@ class _Drive:
                     lines.append(f"{self._memory_of(node)} = {names.of(node)};")
         if part == 0:
             shown = f"(a->slot[k] * a->robots + robot) * {self._num_joints} + {self.name}_C[j]"
-            lines.append(f"if (a->slot[k] >= 0) a->out[{shown}] = {names.of(program.shown)};")
-            lines.append(f"if (a->slot[k] >= 0 && a->effort) a->effort[{shown}] = {names.of(program.torque)};")
+            lines += [f"if (a->slot[k] >= 0) a->{to}[{shown}] = {names.of(node)};" for to, node in self._shown.items()]
         if part + 1 == len(program.written):
             leaf = {node.index: node for node in self._nodes if node.operation == "leaf"}
             lines += [f"const {node.kind} n{self._begin[i]} = {names.of(node)};" for i, node in self._updates.items()]

@@ -296,7 +296,7 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
         notes.append("speed limit: none")
     notes.append(f"control rate: {1 / control_dt:g} Hz; delay: 0 to {1e3 * defaults.LONGEST_DELAY:g} ms (--control_dt)")
     if any(int(kind) == mujoco.mjtJoint.mjJNT_FREE for kind in model.jnt_type):
-        notes.append("the base is held in the air as the file has its body, not as a keyframe leans, and nothing touches")
+        notes.append("the base is held in the air, turned as its body in the file; nothing touches")
     return notes
 
 

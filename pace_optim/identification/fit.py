@@ -66,6 +66,7 @@ def fit(
     Raises:
         ValueError: If anything does not fit; nothing has been written then.
     """
+    RunFolder.refuse_file(settings.log_dir)
     tell, shown = tell if before is None else tell_nobody, set[str]()
 
     def tell_while_reading(text: str) -> None:

@@ -187,8 +187,8 @@ class Optimization:
         """The course on which torques weigh by what they leave on pieces, begun at a normalised vector (size,).
 
         Their noise grows where positions are then followed worse than without them, by more than noise explains: a
-        filter makes errors that are none. A change of parameters is as the square of a torque's weight, and χ² of the
-        positions as the square of that.
+        filter's errors look like errors of the drive. A change of parameters is as the square of a torque's weight, and
+        χ² of the positions as the square of that.
         """
         noise = self._torque_noise(self._in_use.way.pieces, x)
         while (found := self._at_finer_step(x, noise)) is not None:

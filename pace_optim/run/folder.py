@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shlex
 from collections.abc import Sequence
 from datetime import datetime
@@ -66,6 +68,17 @@ class RunFolder:
     def __init__(self, path: Path):
         """Use an existing folder."""
         self.path = path
+
+    @staticmethod
+    def refuse_file(log_dir: str | Path) -> None:
+        """Refuse a place that is no folder, or is below a file, before anything is read.
+
+        Raises:
+            NotADirectoryError: If it is.
+        """
+        path = Path(log_dir).absolute()
+        if not next(each for each in (path, *path.parents) if each.exists()).is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(log_dir))
 
     @classmethod
     def create(cls, log_dir: str | Path, robot_name: str) -> RunFolder:

@@ -34,8 +34,8 @@ def both(problem, values, where=None):
         used = []
         simulate = rollout._compiled.positions
 
-        def positions(at, state=None, simulate=simulate, compiled=compiled, used=used):
-            shown = simulate(at, state) if compiled else None
+        def positions(at, state=None, torque=None, simulate=simulate, compiled=compiled, used=used):
+            shown = simulate(at, state, torque) if compiled else None
             used.append(shown is not None)
             return shown
 

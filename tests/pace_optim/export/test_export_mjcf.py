@@ -227,7 +227,7 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
     expected, _ = identified_motion(result, targets)
     exported = export(result, "mjcf")
     found = replay(fixed_in_the_air(exported.text), names, targets.repeat(4, axis=0), targets[0])[::4]
-    assert drive.implicit == stiff and "make up for" in " ".join(exported.notes)
+    assert drive.implicit == stiff and "compensate for" in " ".join(exported.notes)
     assert np.ptp(expected, axis=0).min() > 0.2 and np.abs(found - expected).max() < error
 
 
