@@ -166,7 +166,7 @@ def joint_alone() -> SimpleNamespace:
     """A short chirp without noise, its problem with a twin of each joint, and the truth. Made once: change nothing."""
     fine = env_cfg()  # what the robot does, not what a coarse step makes of it
     set_physics_dt(fine, DT / 10)
-    recordings = [record(target, CALM, cfg=fine) for target in (chirp(5.0), chirp(4.0, 0.2, 3.0))]
+    recordings = [record(target, CALM, cfg=fine) for target in (chirp(3.0), chirp(2.5, 0.2, 3.0))]
     problem = make_problem(recordings[:1], validation=recordings[1:]).with_physics_dt(DT / 2)
     truth = physical(problem, CALM)
     return SimpleNamespace(

@@ -79,15 +79,11 @@ def test_effects_and_tensors_of_a_user_survive_the_way_back():
         assert all(torch.equal(each.x, torch.full((2, 3), 0.1, dtype=torch.float64)) for each in found)
 
 
-def children() -> list[str]:
-    """Processes of this one."""
-    return [each for task in Path("/proc/self/task").iterdir() for each in (task / "children").read_text().split()]
-
-
 @pytest.mark.parametrize("wrong", ["first", "other"])
 def test_an_error_reaches_the_caller_and_leaves_nothing_behind(wrong):
-    before, collects = os.sched_getaffinity(0), gc.isenabled()
-    here, others = os.getpid(), children()
+    here = os.getpid()
+    children = Path(f"/proc/self/task/{here}/children")
+    before, collects, others = os.sched_getaffinity(0), gc.isenabled(), children.read_text()
 
     def work(own):
         if (os.getpid() == here) == (wrong == "first"):
@@ -97,7 +93,7 @@ def test_an_error_reaches_the_caller_and_leaves_nothing_behind(wrong):
     with pytest.raises(ValueError, match="is wrong"):
         parallel_map(work, "ab", [GAIN, RIPPLE])
     assert os.sched_getaffinity(0) == before and gc.isenabled() == collects
-    assert children() == others
+    assert children.read_text() == others  # no process is left
 
 
 def test_a_process_that_is_killed_is_told():

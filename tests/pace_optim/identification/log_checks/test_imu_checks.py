@@ -14,7 +14,7 @@ from pace_optim.identification.log_checks.checks import explained
 @pytest.fixture(scope="module")
 def view(tmp_path_factory):
     """A trot, as the balance of torques sees it."""
-    problem, _ = walking_problem(tmp_path_factory.mktemp("walk"), duration=2.0)
+    problem, _ = walking_problem(tmp_path_factory.mktemp("walk"), duration=1.5)
     return views_of(problem)[0]
 
 

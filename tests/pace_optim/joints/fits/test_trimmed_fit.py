@@ -52,7 +52,7 @@ def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
 
 
 def test_windows_that_do_not_count_are_as_if_they_were_not_there(bench):
-    kept = torch.ones(10, 1, dtype=torch.bool)
+    kept = torch.ones(round(bench.place[0].stop * DT / 0.5), 1, dtype=torch.bool)
     kept[-1] = False
     without = FITS.over_wide_steps(bench.swinging, away(bench), kept)
     train = bench.swinging.dataset.train.clone()

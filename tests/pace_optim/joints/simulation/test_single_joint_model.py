@@ -76,7 +76,7 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     fine = env_cfg()
     set_physics_dt(fine, 0.00025)
     truth = {**CALM, "encoder_bias": 0.1}
-    target = chirp(2.0)[::3]
+    target = chirp(1.0)[::3]
     held = np.repeat(target, 3, axis=0)[: 3 * len(target) - 2]
     recording = record(held, truth, cfg=fine, load=Load(load_mass=1.0, load_length=0.15), noise=1e-3)
     third = {"time": recording.time[::3], "dof_pos": recording.dof_pos[::3], "des_dof_pos": target}
@@ -99,7 +99,7 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
 
 def test_a_weight_that_is_not_there_pulls_nowhere():
     """Also where the joint is far from the reference along which gravity is linear."""
-    recording = record(chirp(1.5), CALM, cfg=env_cfg())
+    recording = record(chirp(1.0), CALM, cfg=env_cfg())
     whole = make_problem(recording).with_effects(["payload"])
     plain = whole.with_effects(())
     elsewhere = plain.space.from_dict({**CALM, "viscous_friction": 20.0})
@@ -115,7 +115,7 @@ def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_b
     """A knee that is said to have a thirtieth of its friction moves wrongly, and its thigh would with it."""
     cfg, fine = env_cfg(ANYMAL), env_cfg(ANYMAL)
     set_physics_dt(fine, 0.00025)
-    target, names = legs_chirp(cfg, 1.0), cfg.sim2real.joint_order
+    target, names = legs_chirp(cfg, 0.5), cfg.sim2real.joint_order
     truth = {**TRUTH, "friction": {name: 3.0 if name == "LF_KFE" else 0.1 for name in names}}
     problem = make_problem(record(target, truth, cfg=fine, noise=1e-4), cfg=cfg).with_physics_dt(0.00025)
     twins = twin_problem(problem, reference_path(problem, problem.space.from_dict(TRUTH)))
@@ -141,7 +141,7 @@ def test_a_crank_feels_what_follows_it(tmp_path, model):
     cfg = env_cfg(lambda: cfg_from_model(path))
     cfg.scene.robot.init_state.joint_pos = {"crank": 0.8, "(coupler|rocker)": 0.0}
     truth = {"armature": 0.004, "viscous_friction": 0.05, "friction": 0.04, "encoder_bias": 0.0, "delay": 2.0}
-    target = 0.8 + chirp(0.8, 0.5, 4.0, 0.3)
+    target = 0.8 + chirp(0.4, 0.5, 4.0, 0.3)
     whole = make_problem(record(target, truth, cfg=cfg), cfg=cfg).with_physics_dt(0.00025)
     assert not whole.joints_stand_alone
     sought = whole.space.from_dict(truth)
@@ -180,7 +180,7 @@ def test_a_spring_at_a_joint_acts_on_it_alone_too(tmp_path):
     )
     cfg = env_cfg(lambda: cfg_from_model(path))
     truth = {"armature": 0.02, "viscous_friction": 0.1, "friction": 0.1, "encoder_bias": 0.0, "delay": 1.0}
-    whole = make_problem(record(chirp(0.8, 0.5, 4.0, 0.3), truth, cfg=cfg), cfg=cfg).with_physics_dt(0.00025)
+    whole = make_problem(record(chirp(0.4, 0.5, 4.0, 0.3), truth, cfg=cfg), cfg=cfg).with_physics_dt(0.00025)
     sought = whole.space.from_dict(truth)
     for path in (reference_path(whole, sought), measured_path(whole, sought)):
         assert float((moved_by(twin_problem(whole, path), sought) - moved_by(whole, sought)).abs().max()) < 5e-4
