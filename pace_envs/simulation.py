@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -299,8 +299,7 @@ class Simulation:
     def _motor_inertias(self) -> torch.Tensor:
         """Of each entry of M, what it counts in the inertia at each coordinate, diag(R⁻ᵀ M R⁻¹), (nM, nv)."""
         turn = self._joints_per_motor
-        rows = torch.as_tensor(np.repeat(np.arange(self.model.nv), self.model.M_rownnz)).long()
-        columns = torch.as_tensor(self.model.M_colind).long()
+        rows, columns = self._entries_of_inertia
         return turn[rows] * turn[columns] * torch.where(rows == columns, 1.0, 2.0)[:, None]
 
     def _link_place(self, columns: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -360,20 +359,25 @@ class Simulation:
         self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
         drift(self.qpos, self.qvel, 0.5 * h)
         with self._in_joints():
-            if not self.turns_friction:
-                self._step()
-            else:
-                before, _ = self.qvel.clone(), self._outcomes
-                self._step()
-                self._turn_friction(before, drift)
+            outcomes = self._outcomes if self.turns_friction else None  # bound before the step that computes them
+            before = self.qvel.clone()
+            self._step()
+            if outcomes is not None:
+                self._turn_friction(before, outcomes, drift)
         drift(self.qpos, self.qvel, -0.5 * h)
         damping.copy_(whole)
         self.qfrc_applied.copy_(applied)
 
-    def _turn_friction(self, before: torch.Tensor, drift: Drift) -> None:
-        """Let friction turn where the speed passed zero in MuJoCo's step; speeds before it are (num_envs, nv)."""
+    def _turn_friction(self, before: torch.Tensor, outcomes: Mapping[str, torch.Tensor], drift: Drift) -> None:
+        """Let friction turn where the speed passed zero in MuJoCo's step.
+
+        Args:
+            before: Speeds before the step, (num_envs, nv).
+            outcomes: What the step computed.
+            drift: Moves positions.
+        """
         most, weight = self.expand("dof_frictionloss"), self.expand("dof_invweight0")
-        force, free, constraints = (self._outcomes[name] for name in _FRICTION)
+        force, free, constraints = (outcomes[name] for name in _FRICTION)
         impulse = impulses(before, self.qvel, force, most, weight, self.cfg.dt)
         alone = (free == (most > 0.0).sum(dim=1)) & (constraints == free)
         change = self._speeds_of(torch.where(alone[:, None], impulse, 0.0))
@@ -397,12 +401,16 @@ class Simulation:
     @cached_property
     def _place_in_inertia(self) -> torch.Tensor:
         """Where each entry of the inertia matrix is among MuJoCo's, (nv, nv); behind them where it is zero."""
-        model = self.model
+        (rows, columns), model = self._entries_of_inertia, self.model
         place = torch.full((model.nv, model.nv), model.nM)
-        rows = torch.as_tensor(np.repeat(np.arange(model.nv), model.M_rownnz)).long()
-        columns = torch.as_tensor(model.M_colind).long()
         place[rows, columns] = place[columns, rows] = torch.arange(model.nM)
         return place
+
+    @cached_property
+    def _entries_of_inertia(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows and columns of the entries that MuJoCo keeps of the inertia matrix, (nM,) each."""
+        rows = np.repeat(np.arange(self.model.nv), self.model.M_rownnz)
+        return torch.as_tensor(rows).long(), torch.as_tensor(self.model.M_colind).long()
 
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
