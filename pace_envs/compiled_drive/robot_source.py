@@ -43,7 +43,7 @@ ARGUMENTS = {
     "held": "const double* held",
     "shift": "const double* shift",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
+"""What ``simulate`` gets, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
 those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings;
 the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
 steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);

@@ -82,7 +82,7 @@ class InWorld(FakeFits):
 
 
 def base_model(n=1):
-    """The base model of joints that nobody simulates."""
+    """The base model of joints that are not simulated."""
     bounds = torch.ones(n, len(BASE)).double()
     return JointModel(
         effects=(),

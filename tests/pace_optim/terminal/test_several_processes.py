@@ -110,7 +110,7 @@ def test_a_lost_process_ends_the_others_with_one_line(start, bench):
 
 
 @pytest.mark.slow
-def test_a_shared_fit_that_is_resumed_ends_as_one_that_nobody_shared(start, bench, tmp_path):
+def test_a_shared_fit_that_is_resumed_ends_as_one_that_was_not_shared(start, bench, tmp_path):
     common = {"task": BENCH, "data": [bench], "num_envs": 9, "optimizer": "cmaes"}
     alone, _ = fit(FitSettings(**common, max_iteration=4, log_dir=str(tmp_path / "alone")))
     options = ["--task", BENCH, "--data", bench, "--num_envs", "9", "--optimizer", "cmaes"]
