@@ -424,9 +424,7 @@ class Drive:
         expected = (self._num_envs, len(self._joint_names))
         for name, value in given.items():
             is_tensor = isinstance(value, torch.Tensor)
-            if value is None or (not is_tensor and torch.overrides.is_tensor_like(value)):
-                continue  # what is traced may stand for a part of the rows
-            if not is_tensor or value.shape != expected:
+            if value is not None and (not is_tensor or value.shape != expected):
                 found = f"shape {tuple(value.shape)}" if is_tensor else f"type {type(value).__name__}"
                 raise ValueError(
                     f"{name} has {found}, expected a tensor of shape {expected}: a row per environment, a column for "

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators.config import Config
-from pace_envs.fused import Fusion, fusion_for
+from pace_envs.compiler.fusion import Fusion, fusion_for
 from pace_envs.managers import (
     ActionManager,
     ActionTermCfg,

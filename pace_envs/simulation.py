@@ -84,7 +84,7 @@ class SimulationCfg:
     """Whether a step is replayed from a CUDA graph on a GPU; else every kernel is launched by itself."""
 
     fused: bool = True
-    """Whether what is captured of drives and managers becomes a few kernels (:mod:`pace_envs.fused`); else each of
+    """Whether what is captured of drives and managers becomes a few kernels (:mod:`pace_envs.compiler`); else each of
     torch's operations is one."""
 
     class_type: Callable[[SimulationCfg, mujoco.MjSpec, int], Simulation] | None = None

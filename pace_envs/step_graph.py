@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from pace_envs.fused import Fusion
-from pace_envs.kernels.nvrtc import kernels_of
+from pace_envs.compiler.fusion import Fusion
+from pace_envs.compiler.nvrtc import kernels_of
 
 _RUNS_BEFORE = 3
 """Runs before a capture: constants are copied to the GPU, every tensor has found its place, kernels are compiled."""

@@ -13,9 +13,9 @@ from typing import Any
 import mujoco
 import torch
 
+from pace_envs.compiler.fusion import launch_pending
 from pace_envs.constraint_counts import most_constraints, most_contacts
 from pace_envs.devices import find_device
-from pace_envs.fused import launch_pending
 from pace_envs.simulation import EnvIds, Simulation
 
 _INSTALL = 'pip install "pace-mujoco[gpu]"'

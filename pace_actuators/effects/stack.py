@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -133,14 +133,26 @@ class EffectStack:
         for act, view in self._at[stage]:
             act(view)
 
-    def of(self, effects: Sequence[Effect]) -> EffectStack:
-        """Some of its effects, with the same state and the same views of it."""
-        part = copy.copy(self)
-        part.effects = [effect for effect in self.effects if effect in effects]
-        part.cfgs = [cfg for effect, cfg in zip(self.effects, self.cfgs, strict=True) if effect in effects]
-        part._at = {stage: [each for each in acts if each[0].__self__ in effects] for stage, acts in self._at.items()}
-        part._arrange()
-        return part
+    def standing_in(
+        self, twins: Mapping[Effect, Effect], state: DriveState, views: Mapping[Effect, DriveState]
+    ) -> EffectStack:
+        """A stack of copies of some of its effects.
+
+        Args:
+            twins: The copies of effects.
+            state: What they share.
+            views: What each copy sees of that.
+        """
+        stack = copy.copy(self)
+        stack.effects = [twins[effect] for effect in self.effects if effect in twins]
+        stack.cfgs = [cfg for effect, cfg in zip(self.effects, self.cfgs, strict=True) if effect in twins]
+        stack.state, stack._view, stack._num_envs = state, dict(views), len(state.time)
+        own = {
+            stage: [twins[act.__self__] for act, _ in acts if act.__self__ in twins] for stage, acts in self._at.items()
+        }
+        stack._at = {stage: [(getattr(each, stage), views[each]) for each in acting] for stage, acting in own.items()}
+        stack._arrange()
+        return stack
 
     def find(self, name: str) -> Effect:
         """The effect of that name.

@@ -10,8 +10,8 @@ from functools import partial
 import torch
 
 from pace_actuators.effects import Effect
+from pace_envs.compiler import host_kernels, kernels_of
 from pace_envs.devices import find_device
-from pace_envs.kernels import host_kernels, kernels_of
 from pace_optim.joints.fits.block_errors import BlockErrors, block_errors
 from pace_optim.joints.fits.descent import TRIALS, JointDescent
 from pace_optim.joints.fits.fitted import Fitted

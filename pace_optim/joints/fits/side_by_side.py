@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
-from pace_envs.kernels import CannotCompileError
+from pace_envs.compiler import CannotCompileError
 from pace_optim.joints.fits.model import BASE, COLUMN, JointModel
 from pace_optim.joints.simulation.kernel_rollout import Compiler, KernelRollout
 from pace_optim.joints.simulation.problem import TwinProblem

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
-from pace_envs.compiled_drive.drive import commands
-from pace_optim.joints.simulation.kernel_recorder import HELD, Recorded, record
+from pace_envs.compiler.drive_code import Program
+from pace_envs.compiler.joint_source import joint_source
+from pace_envs.compiler.one_joint import commands
+from pace_optim.joints.simulation.kernel_recorder import HELD, record
 from pace_optim.problem.rollout import between_steps
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ _WIDTH = 32
 
 
 class Compiler(Protocol):
-    """Compiles and launches kernels: see :class:`~pace_envs.kernels.Kernels`."""
+    """Compiles and launches kernels: see :class:`~pace_envs.compiler.Kernels`."""
 
     def compile(self, sources: Sequence[str]) -> None:
         """Compile those that are new."""
@@ -37,7 +39,10 @@ class _Group:
     """Joints of a drive in some rows, in all of which the same effects act."""
 
     rows: range
-    recorded: Recorded
+    program: Program
+    source: str
+    leaves: list[int]
+    """Those that it reads."""
     place: torch.Tensor
     """Of each joint's numbers in a series, on the device."""
 
@@ -97,22 +102,22 @@ class KernelRollout:
         wanted = at.to(self._device, torch.int32)
         whole = torch.arange(steps + ahead, dtype=torch.int32, device=self._device)
         own, every = _slots(wanted, steps), _slots(whole, steps + ahead)
-        leaves = self._upload([torch.cat([read().reshape(-1) for read in g.recorded.leaves]) for g in self._groups])
+        leaves = self._upload([torch.cat([g.program.leaves[i]().reshape(-1) for i in g.leaves]) for g in self._groups])
         rings = self._upload(
-            [torch.cat([torch.zeros(1), *(r().reshape(-1) for r in g.recorded.rings)])[1:] for g in self._groups]
+            [torch.cat([torch.zeros(1), *(r().reshape(-1) for r in g.program.rings)])[1:] for g in self._groups]
         )
         outs = []
         with self._side_by_side() as streams:
             for i, group in enumerate(self._groups):
                 slot, last = (every, steps + ahead) if late[i] else (own, steps)
-                series = self._series_of(group.recorded.series, steps + ahead)
+                series = self._series_of(group.program.tape.series, steps + ahead)
                 out = torch.empty(
                     len(slot) if late[i] else len(at), group.count, dtype=torch.float64, device=self._device
                 )
                 outs.append(out)
                 with streams[i % len(streams)]:
                     self._compiler.launch(
-                        group.recorded.source,
+                        group.source,
                         group.count,
                         _WIDTH,
                         [group.count, 1, last, steps + ahead, rollout.dataset.num_recordings * n]
@@ -120,13 +125,13 @@ class KernelRollout:
                     )
         shown = first.to(self._device)
         for group, out, is_late in zip(self._groups, outs, late, strict=True):
-            rows, columns = slice(group.rows.start, group.rows.stop), group.recorded.columns.to(self._device)
+            rows, columns = slice(group.rows.start, group.rows.stop), group.program.columns.to(self._device)
             begin = shown[rows][:, columns]
             seen = out.view(len(out), *begin.shape)
             if is_late:
                 assert lag is not None
                 seen[0] = begin
-                own_lag = lag[:, rows][..., group.recorded.columns].to(self._device)
+                own_lag = lag[:, rows][..., group.program.columns].to(self._device)
                 when = _when(wanted, own_lag, rollout.duration_steps)
                 if offset is not None:
                     recording = torch.arange(group.rows.start, group.rows.stop) % rollout.dataset.num_recordings
@@ -149,11 +154,12 @@ class KernelRollout:
         n, recordings = self._rollout.robot.num_joints, self._rollout.dataset.num_recordings
         for actuator in list(self._rollout.robot.actuators.values()):
             for rows in self._parts:
-                recorded = record(self._rollout, actuator, rows)
+                program = record(self._rollout, actuator, rows)
+                source, leaves = joint_source(program)
                 recording = torch.arange(rows.start, rows.stop) % recordings
-                place = (recording[:, None] * n + recorded.columns).reshape(-1).to(self._device, torch.int32)
-                self._groups.append(_Group(rows=rows, recorded=recorded, place=place))
-        self._compiler.compile([group.recorded.source for group in self._groups])
+                place = (recording[:, None] * n + program.columns).reshape(-1).to(self._device, torch.int32)
+                self._groups.append(_Group(rows=rows, program=program, source=source, leaves=leaves, place=place))
+        self._compiler.compile([group.source for group in self._groups])
 
     def _series_of(self, names: Sequence[str], steps: int) -> torch.Tensor:
         """Series by control step, (names, steps, R n) on the device."""

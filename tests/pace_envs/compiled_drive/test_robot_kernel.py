@@ -12,7 +12,7 @@ from pace_actuators import PaceDCMotor
 from pace_actuators.effects import get_effect, registry
 from pace_actuators.files import OwnFolder
 from pace_envs import set_physics_dt
-from pace_envs.kernels import host
+from pace_envs.compiler import host
 from pace_optim.recording import Load
 
 pytestmark = pytest.mark.skipif(shutil.which("c++") is None, reason="needs a compiler of C++")

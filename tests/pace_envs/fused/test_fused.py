@@ -11,8 +11,8 @@ from without_chance import NUM_ENVS, without_chance
 from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg, get_effect
 from pace_envs import ManagerBasedRLEnv
-from pace_envs.fused import Fusion, fusion_for, launch_pending
-from pace_envs.kernels import host_kernels
+from pace_envs.compiler import host_kernels
+from pace_envs.compiler.fusion import Fusion, fusion_for, launch_pending
 
 pytestmark = pytest.mark.skipif(host_kernels() is None, reason="needs a compiler of C++")
 N = 37

@@ -9,7 +9,7 @@ from recordings import conform, recording, says
 from walking import DT, crawler, walking_problem, write_log
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
-from pace_envs.kernels import host
+from pace_envs.compiler import host
 from pace_optim.estimate.derivatives import colour, stencil
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet

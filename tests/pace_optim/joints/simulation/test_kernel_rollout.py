@@ -13,7 +13,7 @@ from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_p
 
 from pace_actuators.effects import get_effect, registry
 from pace_actuators.files import OwnFolder
-from pace_envs.kernels import CannotCompileError, HostKernels, host, host_kernels, kernels_of
+from pace_envs.compiler import CannotCompileError, HostKernels, host, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.joints.fits.fits import fits_on
 from pace_optim.joints.fits.fitting_cfg import DEFAULT
@@ -210,7 +210,7 @@ def test_kernels_are_kept_in_a_folder_that_is_the_user_s_alone_and_not_compiled_
 def test_a_kernel_that_was_cut_short_is_compiled_again(warm, tmp_path, part):
     """Loaded, it ended the process with SIGBUS, each time."""
     script = (
-        "import torch; from pace_envs.kernels import host_kernels; kernels = host_kernels()\n"
+        "import torch; from pace_envs.compiler import host_kernels; kernels = host_kernels()\n"
         f"kernels.compile([{DOUBLE!r}]); x = torch.tensor(4.0, dtype=torch.float64)\n"
         f"kernels.launch({DOUBLE!r}, 1, 1, [x]); print(float(x))"
     )

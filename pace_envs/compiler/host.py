@@ -17,8 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pace_actuators.files import OwnFolder
-from pace_envs.kernels.arguments import Argument, as_argument
 
 _COMPILERS = ("c++", "g++", "clang++")
 _OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
@@ -34,6 +35,10 @@ _FIRST_S = 30.0
 _DIGEST = hashlib.sha256
 _TEMPORARY: list[tempfile.TemporaryDirectory] = []
 """Folders of this process, removed at its end."""
+
+
+Argument = int | torch.Tensor | ctypes.c_void_p
+"""What a kernel is launched with."""
 
 
 class CannotCompileError(RuntimeError):
@@ -161,6 +166,13 @@ class HostKernels:
                 "compiled kernels, more slowly. Repair it, or put another one first in PATH. [W21]",
                 stacklevel=2,
             )
+
+
+def as_argument(value: Argument) -> ctypes.c_void_p | ctypes.c_int:
+    """Tensors are handed over by address, whole numbers by value."""
+    if isinstance(value, torch.Tensor):
+        return ctypes.c_void_p(value.data_ptr())
+    return ctypes.c_int(value) if isinstance(value, int) else value
 
 
 def _end(process: subprocess.Popen) -> None:

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 
-from pace_envs.fused.memory import Array, Index, Memory, Operation
-from pace_envs.kernels.expressions import PRELUDE
+from pace_envs.compiler.operations import PRELUDE, TYPES
+from pace_envs.compiler.rows import Array, Index, Memory, Mode
+from pace_envs.compiler.tape import Names, Node, Tape
 
-TYPES = {
-    torch.float32: "float",
-    torch.float64: "double",
-    torch.bool: "bool",
-    torch.int64: "long long",
-    torch.int32: "int",
-    torch.uint8: "unsigned char",
-}
 SINGLE_WIDTH = 1024
 """Threads of the one block that goes over all rows."""
 
@@ -59,55 +53,45 @@ class Writer:
 
     def __init__(self) -> None:
         """Begin."""
-        self._lines: list[str] = []
-        self._first: list[str] = []
+        self.tape = Tape()
+        self._totals: list[tuple[str, str, int]] = []  # declaration, name, whether it is one of truths
         self._over_rows: list[str] = []
-        self._after_rows: list[str] = []
-        self._count = 0
-        self._known: dict[tuple[Memory, int, int, torch.dtype], str] = {}
-        self._changed: dict[tuple[Memory, int, int, torch.dtype], str] = {}
+        self._known: dict[tuple[Memory, int, int, torch.dtype], Node] = {}
+        self._changed: dict[tuple[Memory, int, int, torch.dtype], Node] = {}
         self._pointers: dict[tuple[Memory, torch.dtype], tuple[int, int]] = {}
 
     # ------------------------------------------------------------------ for operations
 
-    def value(self, kind: str, expression: str) -> str:
-        """A name for a value."""
-        name = self._name()
-        self._lines.append(f"const {kind} {name} = {expression};")
-        return name
-
-    def load(self, array: Array, index: Index, axis: int | None) -> str:
+    def load(self, array: Array, index: Index, axis: int | None) -> Node:
         """The value of an element."""
         stride, cell = array.row_stride(axis), array.cell(index)
         key = array.memory, stride, cell, array.dtype
         if key not in self._known:
-            self._known[key] = self.value(TYPES[array.dtype], self._place(array, cell, stride))
+            self._known[key] = self.tape.new(self._place(array, cell, stride), kind=TYPES[array.dtype])
         return self._known[key]
 
-    def store(self, array: Array, index: Index, axis: int | None, value: str) -> None:
+    def store(self, array: Array, index: Index, axis: int | None, value: Node) -> None:
         """Keep an element's value; it goes to memory at the end."""
         key = array.memory, array.row_stride(axis), array.cell(index), array.dtype
         self._known[key] = self._changed[key] = value
 
-    def load_at(self, array: Array, place: str, cell: int) -> str:
-        """The value of an element whose place is computed, beside a row's place."""
+    def load_at(self, array: Array, cell: int, stride: int, number: Node, step: int) -> Node:
+        """The value of an element that is so many steps from a row's cell."""
         self._spill(array.memory)
-        return self.value(TYPES[array.dtype], self._place(array, cell, 0, place))
+        return self.tape.new(self._place(array, cell, stride, step), number, kind=TYPES[array.dtype])
 
-    def store_at(self, array: Array, place: str, cell: int, value: str) -> None:
-        """Write an element whose place is computed."""
+    def store_at(self, array: Array, cell: int, stride: int, number: Node, step: int, value: Node) -> None:
+        """Write an element that is so many steps from a row's cell."""
         self._spill(array.memory)
-        self._lines.append(f"{self._place(array, cell, 0, place)} = {value};")
-        self._known = {key: name for key, name in self._known.items() if key[0] is not array.memory}
+        self.tape.new(f"{self._place(array, cell, stride, step)} = {{1}}", number, value, kind="")
+        self._known = {key: node for key, node in self._known.items() if key[0] is not array.memory}
 
-    def reduce(self, kind: str, start: str, array: Array, cells: Sequence[int], stride: int, step: str) -> str:
+    def reduce(self, kind: str, array: Array, cells: Sequence[int], stride: int, step: str) -> Node:
         """A number that is made of all rows' elements; ``step`` takes ``{0}``, what there is, and ``{1}``, the next."""
-        name = self._name()
-        self._first.append(f"{kind} {name} = {start};")
-        for cell in cells:
-            self._over_rows.append(f"{name} = {step.format(name, self._place(array, cell, stride))};")
-        self._after_rows.append(f"{name} = whole<{kind}>({name}, {int('||' in step)});")
-        return name
+        name = f"a{len(self._totals)}"
+        self._totals.append((f"{kind} {name} = ({kind})0;", f"{name} = whole<{kind}>({name}", int("||" in step)))
+        self._over_rows += [f"{name} = {step.format(name, self._place(array, cell, stride))};" for cell in cells]
+        return self.tape.new(name, kind=kind)
 
     # ------------------------------------------------------------------ the whole
 
@@ -116,16 +100,16 @@ class Writer:
         for memory in dict.fromkeys(key[0] for key in self._changed):
             if memory.is_wanted or memory.last_phase > phase:
                 self._spill(memory)
+        names = Names(self.tape.nodes)
         pointers = "".join(f", {TYPES[dtype]}* p{i}" for (_, dtype), (i, _) in self._pointers.items())
-        body = "\n    ".join(self._lines)
+        body = "\n    ".join(names.line(node) for node in self.tape.nodes if node.operation != "constant")
         if phase % 2 == 0:
-            inside = f"  EACH_ROW {{\n    {body}\n  }}"
+            inside = f"EACH_ROW {{\n    {body}\n  }}"
         else:
-            parts = [*self._first]
-            if self._over_rows:
-                parts.append("ALL_ROWS {\n    " + "\n    ".join(self._over_rows) + "\n  }")
-            inside = "  " + "\n  ".join([*parts, *self._after_rows, f"ONCE {{\n    {body}\n  }}"])
-        return f"{_HEAD}KERNEL simulate(int rows{pointers}) {{\n{inside}\n}}\n"
+            rows = ["ALL_ROWS {\n    " + "\n    ".join(self._over_rows) + "\n  }"] if self._over_rows else []
+            first, last = [each for each, *_ in self._totals], [f"{end}, {is_any});" for _, end, is_any in self._totals]
+            inside = "\n  ".join([*first, *rows, *last, f"ONCE {{\n    {body}\n  }}"])
+        return f"{_HEAD}KERNEL simulate(int rows{pointers}) {{\n  {inside}\n}}\n"
 
     def arguments(self) -> list[Any]:
         """Where the pointers go to."""
@@ -136,21 +120,48 @@ class Writer:
 
     # ------------------------------------------------------------------ inside
 
-    def _name(self) -> str:
-        self._count += 1
-        return f"v{self._count}"
-
-    def _place(self, array: Array, cell: int, stride: int, more: str = "") -> str:
+    def _place(self, array: Array, cell: int, stride: int, step: int | None = None) -> str:
         number, first = self._pointers.setdefault((array.memory, array.dtype), (len(self._pointers), cell))
         row = f" + (long long)r * {stride}" if stride else ""
-        return f"p{number}[{cell - first}{row}{more and f' + {more}'}]"
+        return f"p{number}[{cell - first}{row}{'' if step is None else f' + {{0}} * {step}'}]"
 
     def _spill(self, memory: Memory) -> None:
         """Write to memory what has changed."""
         for key in [key for key in self._changed if key[0] is memory]:
             _, stride, cell, dtype = key
-            array = Array(memory, dtype, (), (), 0)
-            self._lines.append(f"{self._place(array, cell, stride)} = {self._changed.pop(key)};")
+            place = self._place(Array(memory, dtype, (), (), 0), cell, stride)
+            self.tape.new(f"{place} = {{0}}", self._changed.pop(key), kind="")
+
+
+@dataclass
+class Operation:
+    """Something to do in a kernel."""
+
+    is_single: bool
+    """Whether it is done once, and not for each row."""
+    emit: Callable[[Writer], None]
+    """Writes it."""
+    reads: list[tuple[Array, Mode]]
+    writes: list[tuple[Array, Mode]]
+    phase: int = field(default=0)
+
+    @property
+    def touched(self) -> list[tuple[Array, Mode]]:
+        """What it reads and writes."""
+        return [*self.reads, *self.writes]
+
+    def find_phase(self) -> None:
+        """The first phase after all that it depends on: even phases have a thread for each row, odd ones are single."""
+        phase = 0
+        for array, mode in self.reads:
+            phase = max(phase, array.memory.earliest(mode, writes=False))
+        for array, mode in self.writes:
+            phase = max(phase, array.memory.earliest(mode, writes=True))
+        self.phase = phase + (phase % 2 != self.is_single)
+        for array, mode in self.reads:
+            array.memory.note(mode, False, self.phase)
+        for array, mode in self.writes:
+            array.memory.note(mode, True, self.phase)
 
 
 def kernels(operations: Sequence[Operation]) -> list[tuple[int, str, list[Any]]]:

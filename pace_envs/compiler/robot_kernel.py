@@ -15,12 +15,12 @@ import numpy as np
 import torch
 
 from pace_envs.articulation import Articulation
-from pace_envs.compiled_drive.drive import Commands, commands
-from pace_envs.compiled_drive.robot import DriveProgram, record_drive
-from pace_envs.compiled_drive.robot_source import ARGUMENTS, RobotSource, robot_source
-from pace_envs.compiled_drive.tape import NotTraceableError
-from pace_envs.kernels import CannotCompileError
-from pace_envs.kernels.host import HostKernels, mujoco_kernels
+from pace_envs.compiler.drive_code import Program
+from pace_envs.compiler.host import CannotCompileError, HostKernels, mujoco_kernels
+from pace_envs.compiler.one_joint import Commands, commands
+from pace_envs.compiler.robot import record_drive
+from pace_envs.compiler.robot_source import ARGUMENTS, RobotSource, robot_source
+from pace_envs.compiler.tape import NotTraceableError
 from pace_envs.manager_based_env import ManagerBasedEnv
 from pace_envs.simulation import Simulation, available_processors
 
@@ -97,7 +97,7 @@ class RobotKernel:
             raise NotTraceableError("a simulation of the user's own")
         self._env, self._dataset, self._kernels, self._course = env, dataset, kernels, course
         self._flags: object = None
-        self._programs: list[DriveProgram] = []
+        self._programs: list[Program] = []
         self._source: RobotSource
         self._series: torch.Tensor
         self._batch: _Batch | None = None
@@ -187,7 +187,7 @@ class RobotKernel:
         return tensors["out"]
 
 
-def _leaves_of(program: DriveProgram, used: Sequence[int]) -> torch.Tensor:
+def _leaves_of(program: Program, used: Sequence[int]) -> torch.Tensor:
     """The first numbers of a drive: of the leaves that are read, then the memory of its delays."""
     reads = [*(program.leaves[i] for i in used), *program.rings]
     return torch.cat([torch.zeros(0, dtype=torch.float64), *(read().double().reshape(-1) for read in reads)])

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
-
-if TYPE_CHECKING:
-    from pace_envs.fused.writer import Writer
 
 Mode = tuple[object, ...]
 """How an operation goes through memory: one place per row, with its stride, or the same for all rows."""
@@ -100,51 +97,73 @@ class Array:
         return ("rows", stride, self.dtype) if stride else ("shared", self.dtype)
 
 
-@dataclass
-class Operation:
-    """Something to do in a kernel."""
+class RowSpace:
+    """The tensors of all rows on a device, while operations on them are put off."""
 
-    is_single: bool
-    """Whether it is done once, and not for each row."""
-    emit: Callable[[Writer], None]
-    """Writes it."""
-    reads: list[tuple[Array, Mode]]
-    writes: list[tuple[Array, Mode]]
-    phase: int = field(default=0)
+    def __init__(self, rows: int, device: torch.device):
+        """Know none.
 
-    @property
-    def touched(self) -> list[tuple[Array, Mode]]:
-        """What it reads and writes."""
-        return [*self.reads, *self.writes]
+        Args:
+            rows: Number of environments.
+            device: Of their tensors.
+        """
+        self.rows, self.device = rows, device
+        self.memories: dict[int, Memory] = {}
+        self._every_row: dict[int, torch.UntypedStorage] = {}
+        self._constants: dict[int, tuple[torch.UntypedStorage, float]] = {}
 
-    def find_phase(self) -> None:
-        """The first phase after all that it depends on: even phases have a thread for each row, odd ones are single."""
-        phase = 0
-        for array, mode in self.reads:
-            phase = max(phase, array.memory.earliest(mode, writes=False))
-        for array, mode in self.writes:
-            phase = max(phase, array.memory.earliest(mode, writes=True))
-        self.phase = phase + (phase % 2 != self.is_single)
-        for array, mode in self.reads:
-            array.memory.note(mode, False, self.phase)
-        for array, mode in self.writes:
-            array.memory.note(mode, True, self.phase)
+    def array(self, tensor: torch.Tensor, is_own: bool = False) -> Array:
+        """A tensor as kernels see it."""
+        storage = tensor.untyped_storage()
+        key = storage.data_ptr()  # the same memory may have been handed to torch more than once
+        if key not in self.memories:
+            self.memories[key] = Memory(storage, is_own)
+        return Array(
+            self.memories[key], tensor.dtype, tuple(tensor.shape), tensor.stride(), int(tensor.storage_offset())
+        )
 
+    def count(self, tensor: torch.Tensor) -> int:
+        """Elements of a row."""
+        return tensor.numel() if self.axis(tensor) is None else tensor.numel() // self.rows
 
-def row_axis(shape: tuple[int, ...], rows: int) -> int | None:
-    """The axis that has a place for each row, counted from the right; ``None`` where there is none."""
-    return next((i - len(shape) for i, size in enumerate(shape) if size == rows), None)
+    def axis(self, tensor: torch.Tensor | Array) -> int | None:
+        """The axis that has a place for each row, counted from the right; ``None`` where there is none."""
+        shape = tensor.shape
+        return next((i - len(shape) for i, size in enumerate(shape) if size == self.rows), None)
+
+    def note_every_row(self, index: torch.Tensor) -> None:
+        """These are the indices of all rows, in order."""
+        storage = index.untyped_storage()
+        self._every_row[storage.data_ptr()] = storage
+
+    def is_every_row(self, index: Any) -> bool:
+        """Whether indices are those of all rows, in order."""
+        return (
+            isinstance(index, torch.Tensor)
+            and index.numel() == self.rows
+            and index.untyped_storage().data_ptr() in self._every_row
+        )
+
+    def note_constant(self, tensor: torch.Tensor, value: float) -> None:
+        """A tensor without dimensions is made of a number."""
+        self._constants[tensor.data_ptr()] = tensor.untyped_storage(), value
+
+    def constant(self, tensor: torch.Tensor) -> float | None:
+        """The number that a tensor without dimensions was made of; ``None`` where that is not known."""
+        known = self._constants.get(tensor.untyped_storage().data_ptr()) if tensor.ndim == 0 else None
+        return None if known is None else known[1]
+
+    def forget(self, tensor: torch.Tensor) -> None:
+        """It is written to: it is no more what it was."""
+        self._every_row.pop(tensor.untyped_storage().data_ptr(), None)
+        self._constants.pop(tensor.untyped_storage().data_ptr(), None)
+
+    def forget_all(self) -> None:
+        """All is done."""
+        self.memories, self._every_row, self._constants = {}, {}, {}
 
 
 def elements(shape: tuple[int, ...], axis: int | None) -> Iterator[Index]:
     """All indices of a row (0 along its axis)."""
     skipped = None if axis is None else len(shape) + axis
     return product(*(range(1 if i == skipped else size) for i, size in enumerate(shape)))
-
-
-def count(shape: tuple[int, ...], axis: int | None) -> int:
-    """How many of them there are."""
-    result = 1
-    for i, size in enumerate(shape):
-        result *= 1 if axis is not None and i == len(shape) + axis else size
-    return result

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from pace_envs.kernels.arguments import Argument, as_argument
+from pace_envs.compiler.host import Argument, as_argument
 
 _OPTIONS = ("--fmad=false", "-default-device")
 """A multiplication and an addition are rounded one by one, as on a processor."""

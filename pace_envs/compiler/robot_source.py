@@ -1,0 +1,264 @@
+"""The programs of a robot's drives, written as C around MuJoCo's step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+import torch
+
+from pace_envs.compiler.drive_code import DriveCode, Program
+from pace_envs.compiler.operations import PRELUDE
+from pace_envs.compiler.robot import STATE, WRITTEN
+from pace_envs.compiler.tape import Node, NotTraceableError
+from pace_envs.coulomb import SOURCE as TURN_FRICTION
+from pace_envs.motor_coordinates import MotorCoordinates
+from pace_envs.moving_frame import COLUMNS, SOURCE
+
+ARGUMENTS = {
+    "step": "void (*step)(const mjModel*, mjData*)",
+    "step1": "void (*step1)(const mjModel*, mjData*)",
+    "step2": "void (*step2)(const mjModel*, mjData*)",
+    "drift": "Drift drift",
+    "solve": "Solve solve",
+    "robots": "long long robots",
+    "recordings": "long long recordings",
+    "first": "long long first",
+    "last": "long long last",
+    "end": "long long end",
+    "commands": "long long commands",
+    "slot": "const long long* slot",
+    "series": "const double* series",
+    "memory": "double* memory",
+    "bias": "double* bias",
+    "before": "double* before",
+    "out": "double* out",
+    "state": "double* state",
+    "motion": "const double* motion",
+    "point": "const double* point",
+    "push": "const double* push",
+    "room": "double* room",
+    "held": "const double* held",
+    "shift": "const double* shift",
+}
+"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
+those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings;
+the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
+steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);
+the drives' memory and the forces of gravity and motion of each environment; room for what was before a step, and for
+its friction (environments, 5, nv); what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions
+and speeds there (rows, environments, nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps
+of a control step, recordings, 9), where its specific force was measured (recordings, 3), what is added to that
+(environments, 3), and room to compute with (environments, 12 nbody); unless it is 0, positions and speeds at which
+joints are held (commands, recordings, joints, 2; NaN: free), and what is added to them (environments, joints, 2). Then
+the leaves of each drive, each with the memory of its delays behind it."""
+
+_WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
+_BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <string.h>\n" + PRELUDE
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSource:
+    """A source, and what it needs."""
+
+    source: str
+    """With the function ``simulate``, which MuJoCo's batch applies to each environment."""
+    memory: int
+    """Numbers that an environment keeps from step to step."""
+    series: tuple[str, ...]
+    """Names of the series that it reads, in order."""
+    leaves: tuple[tuple[int, ...], ...]
+    """For each drive, the leaves that it reads, in order."""
+
+
+def robot_source(
+    programs: Sequence[Program],
+    qpos: torch.Tensor,
+    dof: torch.Tensor,
+    num_joints: int,
+    version: str,
+    coordinates: MotorCoordinates | None = None,
+) -> RobotSource:
+    """C of all drives of a robot.
+
+    Args:
+        programs: Of its drives.
+        qpos: Where each joint's position is in MuJoCo's arrays, (n,).
+        dof: Where its speed is, (n,).
+        num_joints: Of a recording.
+        version: MuJoCo's, whose structures are used.
+        coordinates: Of motors that move several joints; ``None``: there are none.
+    """
+    turns = "" if coordinates is None else coordinates.c_source()
+    there, back = ("to_joints(m, d);", "to_motors(m, d);") if turns else ("", "")
+    series = tuple(dict.fromkeys(name for program in programs for name in program.tape.series))
+    drives = [_Drive(i, program, series, num_joints) for i, program in enumerate(programs)]
+    *begins, memory = accumulate((drive.memory for drive in drives), initial=0)
+    parts, names = len(programs[0].written), [drive.name for drive in drives]
+    loop = []
+    for part in range(parts):
+        loop += ["hold(d, robot, k, a);", "keep(m, d, robot, k, a);"] if part == 0 else []
+        loop += [f"{name}_{part}(x, robot, m, d, k, a);" for name in names]
+        loop += ["if (k == a->end) break;"] if part == 0 else []
+        loop += [f"advance(m, d, robot, k, {part}, a);"] if part + 1 < parts else []
+    functions = "\n".join(drive.functions(at, qpos, dof) for drive, at in zip(drives, begins, strict=True))
+    begin = "\n    ".join(f"{name}_begin(x, robot, m, d, 0, a);" for name in names)
+    steps = "\n    ".join(loop)
+    arguments = ";\n  ".join(ARGUMENTS.values())
+    text = f"""// MuJoCo {version}
+{_BEGIN}
+{TURN_FRICTION}
+typedef struct {{
+  {arguments};
+  const double* leaves[{len(names)}];
+}} Arguments;
+static void keep(const mjModel* m, const mjData* d, long long robot, long long k, const Arguments* a) {{
+  if (!a->state || a->slot[k] < 0) return;
+  double* kept = a->state + (a->slot[k] * a->robots + robot) * (m->nq + m->nv);
+  memcpy(kept, d->qpos, m->nq * sizeof(double));
+  memcpy(kept + m->nq, d->qvel, m->nv * sizeof(double));
+}}
+static const int Q[{num_joints}] = {{{", ".join(map(str, qpos.tolist()))}}};
+static const int V[{num_joints}] = {{{", ".join(map(str, dof.tolist()))}}};
+static long long row(long long robot, long long k, long long parts, long long part, const Arguments* a) {{
+  return ((k < a->commands ? k : a->commands - 1) * parts + part) * a->recordings + robot % a->recordings;
+}}
+static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
+  if (!a->held) return;
+  const double* held = a->held + row(robot, k, 1, 0, a) * {2 * num_joints};
+  const double* shift = a->shift + robot * {2 * num_joints};
+  for (int j = 0; j < {num_joints}; ++j, held += 2, shift += 2) {{
+    if (held[0] != held[0]) continue;
+    d->qpos[Q[j]] = held[0] + shift[0];
+    d->qvel[V[j]] = held[1] + shift[1];
+  }}
+}}
+{SOURCE}
+{turns}
+static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
+  {there}
+  double* before = a->before + (5 * robot + 2) * m->nv;
+  memcpy(before, d->qvel, m->nv * sizeof(double));
+  if (!a->motion) {{
+    a->step(m, d);
+    if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
+    {back}
+    return;
+  }}
+  double motion[{COLUMNS}];
+  memcpy(motion, a->motion + row(robot, k, {parts - 1}, part, a) * {COLUMNS}, sizeof motion);
+  for (int i = 0; i < 6; ++i) motion[{COLUMNS - 6} + i] += a->push[robot * 6 + i];
+  a->step1(m, d);
+  bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
+  a->step2(m, d);
+  if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
+  {back}
+}}
+static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
+  if (!a->drift) {{
+    step(m, d, robot, k, part, a);
+    return;
+  }}
+  const int n = m->nv;
+  const double h = m->opt.timestep;
+  double *applied = a->before + 5 * robot * n, *damping = applied + n;
+  memcpy(applied, d->qfrc_applied, n * sizeof(double));
+  memcpy(damping, m->dof_damping, n * sizeof(double));
+  for (int i = 0; i < n; ++i) {{
+    m->dof_damping[i] = 0.5 * damping[i];
+    d->qfrc_applied[i] -= m->dof_damping[i] * d->qvel[i];
+  }}
+  a->drift(m, d->qpos, d->qvel, 0.5 * h);
+  step(m, d, robot, k, part, a);
+  a->drift(m, d->qpos, d->qvel, -0.5 * h);
+  memcpy(m->dof_damping, damping, n * sizeof(double));
+  memcpy(d->qfrc_applied, applied, n * sizeof(double));
+}}
+{functions}
+extern "C" void simulate(const mjModel* model, mjData* d, int robot, void* arguments) {{
+  mjModel* m = (mjModel*)model;
+  const Arguments* a = (const Arguments*)arguments;
+  double* x = a->memory + robot * {max(1, memory)}LL;
+  double* bias = a->bias + (long long)robot * m->nv;
+  memcpy(d->qfrc_bias, bias, m->nv * sizeof(double));
+  if (a->first == 1) {{
+    {begin}
+  }}
+  for (long long k = a->first; k < a->last; ++k) {{
+    {steps}
+  }}
+  memcpy(bias, d->qfrc_bias, m->nv * sizeof(double));
+}}
+"""
+    return RobotSource(source=text, memory=memory, series=series, leaves=tuple(drive.used for drive in drives))
+
+
+class _Drive:
+    """Writes one drive's functions; what it keeps is one structure for each joint."""
+
+    def __init__(self, number: int, program: Program, series: Sequence[str], num_joints: int):
+        """Lay out its memory.
+
+        Args:
+            number: Of the drive.
+            program: What it does.
+            series: All that there are.
+            num_joints: Of a recording.
+        """
+        self.name = f"d{number}"
+        self._number, self._program, self._series, self._num_joints = number, program, series, num_joints
+        self._code = DriveCode(program, "own->", f"{self.name}_")
+        self.used = tuple(self._code.used)
+        """The leaves that it reads, in order."""
+        self.memory = len(program.columns) * self._code.size()
+        """Numbers that it keeps."""
+
+    def functions(self, begin: int, qpos: torch.Tensor, dof: torch.Tensor) -> str:
+        """Its beginning, and each part of a control step that ends with a step of MuJoCo or the next control step.
+
+        Args:
+            begin: Where its memory begins.
+            qpos: Where each joint's position is, (n,).
+            dof: Where its speed is, (n,).
+        """
+        code, columns = self._code, self._program.columns
+        places = {"Q": qpos[columns], "V": dof[columns], "C": columns}
+        tables = [
+            f"static const int {self.name}_{key}[{len(columns)}] = {{{', '.join(map(str, values.tolist()))}}};"
+            for key, values in places.items()
+        ]
+        kept = f"typedef struct {{ {' '.join(code.memory())} }} {self.name}_Own;"
+        functions = [self._function(part, begin) for part in range(-1, code.last + 1)]
+        return "\n".join([*tables, *(f"static {knots}" for knots in code.knots), kept, *functions])
+
+    def _function(self, part: int, begin: int) -> str:
+        code, joints = self._code, len(self._program.columns)
+        place = f"(a->slot[k] * a->robots + robot) * {self._num_joints} + {self.name}_C[j]"
+        shown = f"if (a->slot[k] >= 0) a->out[{place}] = {code.of(self._program.shown)};"
+        body = "\n    ".join(code.begin() if part < 0 else code.part(part, self._special, shown))
+        return f"""static void {self.name}_{"begin" if part < 0 else part}(
+    double* x, long long robot, mjModel* m, mjData* d, long long k, const Arguments* a) {{
+  const long long count = a->robots * {joints};
+  const double *leaves = a->leaves[{self._number}], *rings = leaves + {code.first_ring} * count;
+  const double* s = a->series + row(robot, k, 1, 0, a) * {self._num_joints};
+  for (int j = 0; j < {joints}; ++j) {{
+    {self.name}_Own* own = ({self.name}_Own*)(x + {begin}) + j;
+    const long long e = robot * {joints} + j;
+    {body}
+  }}
+}}"""
+
+    def _special(self, node: Node) -> str:
+        if node.operation == "series":
+            i = self._series.index(self._program.tape.series[node.index])
+            return f"s[{i} * a->commands * a->recordings * {self._num_joints} + {self.name}_C[j]]"
+        if node.operation == "physics":
+            written = self._program.written[node.index].items()
+            return " ".join(
+                f"{_WHERE[name]}->{name}[{self.name}_V[j]] = {self._code.of(value)};" for name, value in written
+            )
+        name = (*STATE, *WRITTEN)[node.index]
+        if name not in STATE:
+            raise NotTraceableError(f"MuJoCo's {name}, which is read")
+        return f"d->{name}[{self.name}_{'Q' if name == 'qpos' else 'V'}[j]]"
