@@ -169,8 +169,11 @@ class JointTracer(Tracer):
         left = self._left.setdefault((node.kind, ndim), [])
         if not left:
             with torch._C._DisableTorchDispatch():
-                left += torch.empty(_AT_ONCE, *(1,) * ndim, dtype=_DTYPES[node.kind]).unbind()
-        return self._known(left.pop(), node)
+                self._kept.append(torch.empty(_AT_ONCE, *(1,) * ndim, dtype=_DTYPES[node.kind]))
+                left += self._kept[-1].unbind()
+        tensor = left.pop()
+        self._nodes[tensor.data_ptr()] = node
+        return tensor
 
     def _known(self, tensor: torch.Tensor, node: Node) -> torch.Tensor:
         self._kept.append(tensor)

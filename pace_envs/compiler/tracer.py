@@ -32,7 +32,7 @@ class Tracer(TorchDispatchMode):
             return func(*args, **kwargs)  # the same memory
         tensors = tensors_in((*args, *kwargs.values()))
         if changes:
-            self.will_change([args[i] if i < len(args) else kwargs[key] for i, key in changes])
+            self.will_change([args[i] if i < len(args) else kwargs.get(key) for i, key in changes])
         if not tensors or "empty" in name:
             return self.made(func, name, args, kwargs)
         if self.knows(tensors):
