@@ -434,7 +434,7 @@ class OneJoint:
         leaves = {node.index: node for node in self.tracer.tape.nodes if node.operation == "leaf"}
         for index, after in self._after:
             if not isinstance(value := after(), torch.Tensor):
-                raise NotTraceableError("a tensor that is none any more")
+                raise NotTraceableError("a tensor that a step replaced by something else")
             node = self.tracer.node(value, leaves[index].kind)
             if updates.setdefault(index, node) is not node:
                 raise NotTraceableError("tensors that shared their memory and do not any more")
