@@ -80,9 +80,9 @@ COMPARED = {
     "le": "({0} <= {1})",
     "gt": "({0} > {1})",
     "ge": "({0} >= {1})",
-    "isinf": "isinf({0})",
-    "isnan": "isnan({0})",
-    "isfinite": "isfinite({0})",
+    "isinf": "({0} == INF || {0} == -INF)",
+    "isnan": "({0} != {0})",
+    "isfinite": "({0} - {0} == 0)",
     "logical_and": "({0} != 0 && {1} != 0)",
     "logical_or": "({0} != 0 || {1} != 0)",
     "logical_xor": "(({0} != 0) != ({1} != 0))",
@@ -100,6 +100,10 @@ BITS = {
 TERNARY = {"where": "({0} ? {1} : {2})", "lerp": "between({0}, {1}, {2})"}
 """Of three; the first of a choice is true or false."""
 
+_OF_WHOLE = {"abs": "({0} < 0 ? -{0} : {0})", "fmod": "({0} % {1})", "remainder": "(({0} % {1} + {1}) % {1})"}
+"""What is another form with whole numbers."""
+_OF_REAL = frozenset(("addcdiv", "addcmul", "ceil", "floor", "fmax", "fmin", "lerp", "nan_to_num", "round", "trunc"))
+"""What is done with floating-point numbers alone: a GPU's functions take no others."""
 _FORMS = {**UNARY, **BINARY, **BITS, **COMPARED, **TERNARY}
 _OPERANDS = {name: 1 + max(i for i in range(3) if f"{{{i}}}" in form) for name, form in _FORMS.items()}
 _MADE = {"zero": 0.0, "zeros_like": 0.0, "new_zeros": 0.0, "ones_like": 1.0}
@@ -134,13 +138,13 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
         options: By name.
         dtype: Type of the result.
     """
-    form = _FORMS.get(name)
+    form, is_real = _FORMS.get(name), dtype.is_floating_point
+    if name in _OF_REAL and not is_real:
+        return None
     if form is not None:
         if options.get("rounding_mode") is not None or len(arguments) < _OPERANDS[name]:
             return None
-        if name == "abs" and not dtype.is_floating_point:
-            form = "({0} < 0 ? -{0} : {0})"
-        return arguments[: _OPERANDS[name]], form
+        return arguments[: _OPERANDS[name]], form if is_real else _OF_WHOLE.get(name, form)
     kind = TYPES[dtype]
     if name in _MADE:
         return [_MADE[name]], "{0}"
@@ -151,7 +155,7 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
         if alpha == 1:
             return arguments[:2], {"add": "({0} + {1})", "sub": "({0} - {1})", "rsub": "({1} - {0})"}[name]
         scale = literal(alpha if name == "add" else -alpha, kind)
-        return (arguments[:2], f"fused({scale}, {{1}}, {{0}})") if name != "rsub" and dtype.is_floating_point else None
+        return (arguments[:2], f"fused({scale}, {{1}}, {{0}})") if name != "rsub" and is_real else None
     if name in ("addcmul", "addcdiv"):
         value, sign = options.get("value", 1), "*" if name == "addcmul" else "/"
         if value == 1 and sign == "*":
@@ -168,6 +172,8 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
         exponent = math.nan if isinstance(arguments[1], torch.Tensor) else arguments[1]
         if exponent in (1, 2, 3):
             return arguments[:1], f"({' * '.join(['{0}'] * int(exponent))})"
+        if not is_real:
+            return None
         return (arguments[:1], "sqrt({0})") if exponent == 0.5 else (arguments[:2], "pow({0}, {1})")
     if name == "nan_to_num":
         nan, most, least = [*arguments[1:], None, None, None][:3]

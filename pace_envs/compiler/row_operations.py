@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
-from itertools import accumulate, product
+from itertools import accumulate, count, product
 from math import prod
 from typing import Any
 
@@ -58,14 +58,16 @@ def on_elements(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[st
         return None
     kinds = ["bool" if i == 0 and name in ("where", "masked_fill") else TYPES[dtype] for i in range(len(values))]
     tensors = [each for each in operands if isinstance(each, torch.Tensor)]
+    numbers = [None if isinstance(each, torch.Tensor) else each for each in operands]  # what waits holds no tensor:
+    made = "bool" if compared else TYPES[dtype]  # a result that somebody holds is written to memory
 
     def element(tape: Tape, load: Load, index: Index) -> Node:
-        loaded = iter(range(len(tensors)))
+        source = count()
         nodes = [
-            tape.cast(load(next(loaded), index), kind) if isinstance(each, torch.Tensor) else tape.constant(each, kind)
-            for each, kind in zip(operands, kinds, strict=True)
+            tape.cast(load(next(source), index), kind) if number is None else tape.constant(number, kind)
+            for number, kind in zip(numbers, kinds, strict=True)
         ]
-        return tape.add(form, *nodes, kind="bool" if compared else TYPES[dtype])
+        return tape.add(form, *nodes, kind=made)
 
     return _mapped(space, result, tensors, element)
 
@@ -185,11 +187,12 @@ def _reduced(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, 
     keeps = bool(rest[1] if len(rest) > 1 else kwargs.get("keepdim", False))
     truths = name in ("any", "all")
     kind = "bool" if truths else TYPES.get(result.dtype, "")
-    total = prod(shape[d] for d in dims)
+    total, axis = prod(shape[d] for d in dims), space.axis(source)
+    sizes = [1 if axis is not None and d == axis + len(shape) else size for d, size in enumerate(shape)]
 
     def parts(index: Index) -> list[Index]:
         kept = iter(i for d, i in enumerate(index) if not (keeps and d in dims))
-        return list(product(*(range(shape[d]) if d in dims else (next(kept),) for d in range(len(shape)))))
+        return list(product(*(range(size) if d in dims else (next(kept),) for d, size in enumerate(sizes))))
 
     def finished(tape: Tape, node: Node) -> Node:
         if is_norm:
@@ -204,7 +207,6 @@ def _reduced(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, 
             loaded = [tape.add("({0} * {0})", each, kind=kind) for each in loaded]
         return finished(tape, reduce(lambda a, b: tape.add(step, a, b, kind=kind), loaded))
 
-    axis = space.axis(source)
     if axis is None or axis + len(shape) not in dims:
         return _mapped(space, result, [source], element, aligned=False)
     if is_norm or name == "all" or not _takes(space, result, source) or space.axis(result):
@@ -214,7 +216,7 @@ def _reduced(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, 
 
     def emit(writer: Writer) -> None:
         for index in elements(to.shape, None):
-            cells = [from_.cell(each) for each in parts(index) if each[axis] == 0]
+            cells = [from_.cell(each) for each in parts(index)]
             node = finished(writer.tape, writer.reduce(kind, from_, cells, from_.row_stride(axis), over))
             writer.store(to, index, None, writer.tape.cast(node, TYPES[to.dtype]))
 
@@ -235,7 +237,7 @@ def _joined(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, A
     def element(tape: Tape, load: Load, index: Index) -> Node:
         if name == "stack":
             return load(index[dim], index[:dim] + index[dim + 1 :])
-        source = max(i for i in range(len(sources)) if begins[i] <= index[dim])
+        source = max(i for i, begin in enumerate(begins[:-1]) if begin <= index[dim])
         return load(source, (*index[:dim], index[dim] - begins[source], *index[dim + 1 :]))
 
     return _mapped(space, result, sources, element, aligned=False)
@@ -260,10 +262,12 @@ def _crossed(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, 
     if kwargs.get("dim", -1) not in (-1, 1) or any(tuple(each.shape) != wanted for each in (result, *args[:2])):
         return None
 
+    kind = TYPES.get(result.dtype, "")
+
     def element(tape: Tape, load: Load, index: Index) -> Node:
         i, j = ((index[1] + k) % 3 for k in (1, 2))
         numbers = [load(0, (0, i)), load(1, (0, j)), load(0, (0, j)), load(1, (0, i))]
-        return tape.add("({0} * {1} - {2} * {3})", *numbers, kind=TYPES[result.dtype])
+        return tape.add("({0} * {1} - {2} * {3})", *numbers, kind=kind)
 
     return _mapped(space, result, args[:2], element)
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_envs.compiler.robot_kernel import CompiledRobot
+from pace_envs.compiled_drive.robot_kernel import CompiledRobot
 from pace_envs.moving_frame import Course
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops

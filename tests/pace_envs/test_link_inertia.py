@@ -191,7 +191,7 @@ def test_candidates_have_links_of_their_own_and_the_compiled_kernel_agrees_with_
     several[1, problem.space["link_mass"]] = 1.1
     several[2, problem.space["link_com_x"]] = 0.03
     compiled = problem.evaluator().residuals(several).error
-    monkeypatch.setattr("pace_envs.compiler.robot_kernel.CompiledRobot.positions", lambda *_: None)
+    monkeypatch.setattr("pace_envs.compiled_drive.robot_kernel.CompiledRobot.positions", lambda *_: None)
     python = problem.evaluator().residuals(several).error
     assert torch.allclose(compiled, python, rtol=0.0, atol=1e-14)
     assert float((python[1] - python[0]).abs().max()) > 1e-3 < float((python[2] - python[0]).abs().max())

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from pace_actuators import PaceDCMotor
-from pace_envs.compiler.drive_code import Program
-from pace_envs.compiler.one_joint import OneJoint, position_term
+from pace_envs.compiled_drive.drive_code import Program
+from pace_envs.compiled_drive.one_joint import OneJoint, position_term
 from pace_optim.joints.simulation.simulation import TwinSimulation
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
-from pace_envs.compiler.drive_code import Program
-from pace_envs.compiler.joint_source import joint_source
-from pace_envs.compiler.one_joint import commands
+from pace_envs.compiled_drive.drive_code import Program
+from pace_envs.compiled_drive.joint_source import joint_source
+from pace_envs.compiled_drive.one_joint import commands
 from pace_optim.joints.simulation.kernel_recorder import HELD, record
 from pace_optim.problem.rollout import between_steps
 

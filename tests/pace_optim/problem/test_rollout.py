@@ -101,7 +101,7 @@ def unlike_recordings():
 
 def test_each_recording_is_simulated_with_its_own_facts(monkeypatch):
     # drives that pay to be compiled round the last digit otherwise, and here only some do
-    monkeypatch.setattr("pace_envs.compiler.robot_kernel.CompiledRobot.positions", lambda *_: None)
+    monkeypatch.setattr("pace_envs.compiled_drive.robot_kernel.CompiledRobot.positions", lambda *_: None)
     recordings = unlike_recordings()
     problem = make_problem(recordings)
     other = {**TRUTH, "armature": 0.15, "friction": 0.1}

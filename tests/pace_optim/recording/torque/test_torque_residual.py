@@ -87,7 +87,7 @@ def test_compiled_and_stepped_torques_are_those_of_the_law(run, monkeypatch):
         return [each[:, 0] for each in rollout.positions_and_torques(at, torques)]
 
     shown, compiled = simulated()
-    monkeypatch.setattr("pace_envs.compiler.robot_kernel.CompiledRobot.positions", lambda *_: None)
+    monkeypatch.setattr("pace_envs.compiled_drive.robot_kernel.CompiledRobot.positions", lambda *_: None)
     assert torch.allclose(compiled, simulated()[1], rtol=0.0, atol=1e-9)
     (recording,), bias = problem.dataset.recordings, physical[problem.space["encoder_bias"]]
     kp, kd = recording.drive.stiffness[0], recording.drive.damping[0]

@@ -24,8 +24,9 @@ class Program:
     """What is written into MuJoCo's fields before each physics step, and after the last."""
     updates: Mapping[int, Node]
     """What becomes of leaves in a control step, by index."""
-    shown: Node
-    """What the encoders show before it."""
+    shown: Mapping[str, Node]
+    """By the array that gets it: what the encoders show before it (``"out"``); the motors' torques in its first physics
+    step [N m] (``"effort"``), if they are wanted."""
     entries: Sequence[int]
     """How many numbers each leaf has."""
     leaves: Sequence[Read]
@@ -53,7 +54,7 @@ class DriveCode(Names):
         """
         self._program, self._own, self._prefix = program, own, prefix
         self.tape = tape = program.tape
-        roots = [program.shown, *(node for node in tape.nodes if node.operation in ("push", "physics"))]
+        roots = [*program.shown.values(), *(node for node in tape.nodes if node.operation in ("push", "physics"))]
         self._updates, needed = _needed_nodes(program.updates, roots)
         super().__init__([node for node in tape.nodes if node.number in needed])
         self.used = list(dict.fromkeys(node.index for node in self.nodes if node.operation in ("leaf", "table")))
@@ -104,13 +105,13 @@ class DriveCode(Names):
             offset += ring.length
         return lines
 
-    def part(self, part: int, special: Special, shown: str = "") -> list[str]:
+    def part(self, part: int, special: Special, shown: Sequence[str]) -> list[str]:
         """What a part does.
 
         Args:
             part: Its number.
             special: Writes what series and MuJoCo's fields are, and what MuJoCo is given.
-            shown: Shows what the encoders show, in the first part.
+            shown: Writes what is shown, in the first part.
         """
         lines = []
         for node in self.nodes:
@@ -124,7 +125,7 @@ class DriveCode(Names):
                 lines.append(special(node))
             else:
                 lines.append(self._made(node, special(node) if node.operation in ("series", "field") else None))
-        lines += [shown] if part == 0 else []
+        lines += shown if part == 0 else []
         if part == self.last:
             lines += [f"const {node.kind} n{i} = {self.of(node)};" for i, node in self._updates.items()]
             lines += [f"{self.of(self._leaf[i])} = n{i};" for i in self._updates]
@@ -162,7 +163,7 @@ class DriveCode(Names):
     def _to_keep(self) -> dict[Node, None]:
         uses = [(each, self._part[node.number]) for node in self.nodes for each in node.arguments]
         uses += [(node, self.last) for node in self._updates.values()]
-        uses.append((self._program.shown, 0))
+        uses += [(node, 0) for node in self._program.shown.values()]
         kept = {node: None for node, part in uses if self._part[node.number] != part and node.operation != "constant"}
         return dict.fromkeys(self._leaf[i] for i in self._updates) | kept
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,11 +14,11 @@ import numpy as np
 import torch
 
 from pace_envs.articulation import Articulation
-from pace_envs.compiler.drive_code import Program
+from pace_envs.compiled_drive.drive_code import Program
+from pace_envs.compiled_drive.one_joint import Commands, commands
+from pace_envs.compiled_drive.robot import record_drive
+from pace_envs.compiled_drive.robot_source import ARGUMENTS, RobotSource, robot_source
 from pace_envs.compiler.host import CannotCompileError, HostKernels, mujoco_kernels
-from pace_envs.compiler.one_joint import Commands, commands
-from pace_envs.compiler.robot import record_drive
-from pace_envs.compiler.robot_source import ARGUMENTS, RobotSource, robot_source
 from pace_envs.compiler.tape import NotTraceableError
 from pace_envs.manager_based_env import ManagerBasedEnv
 from pace_envs.simulation import Simulation, available_processors
@@ -118,9 +117,8 @@ class RobotKernel:
         if flags == self._flags:
             return
         self._flags = flags
-        self._programs = [record_drive(self._env, self._dataset, each) for each in robot.actuators.values()]
-        if not with_torques:
-            self._programs = [replace(program, torque=None) for program in self._programs]
+        drives = robot.actuators.values()
+        self._programs = [record_drive(self._env, self._dataset, each, with_torques) for each in drives]
         self._source = robot_source(
             self._programs,
             robot._layout.qpos_columns,

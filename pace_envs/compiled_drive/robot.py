@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from pace_actuators import PaceDCMotor
-from pace_envs.compiler.drive_code import Program
-from pace_envs.compiler.one_joint import Commands, JointTracer, OneJoint, position_term
+from pace_envs.compiled_drive.drive_code import Program
+from pace_envs.compiled_drive.one_joint import Commands, JointTracer, OneJoint, position_term
 from pace_envs.compiler.tape import Node, NotTraceableError
 from pace_envs.simulation import Simulation
 
@@ -21,13 +21,14 @@ WRITTEN = ("qvel", "qfrc_applied", "dof_armature", "dof_frictionloss", "dof_damp
 """Fields of MuJoCo's data and model that they write before a physics step."""
 
 
-def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor) -> Program:
+def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor, with_torques: bool) -> Program:
     """What a control step does to the joints of a drive, in all environments.
 
     Args:
         env: The environment; it has made a control step.
         dataset: The recordings whose commands it follows.
         actuator: One of its robot's drives.
+        with_torques: Whether the motors' torques are shown, too.
 
     Raises:
         NotTraceableError: If a kernel cannot do it.
@@ -43,7 +44,7 @@ def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor)
     with joint.noting():
         sim = _Physics(joint.tracer, env.sim)
         joint.in_robot(sim, dataset)
-        shown = joint.control_step(env.cfg.decimation, dataset)
+        shown = joint.control_step(env.cfg.decimation, dataset, with_torques)
         sim.end()
         program = joint.program(shown, sim.written)
     return program

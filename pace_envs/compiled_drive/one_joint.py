@@ -15,7 +15,7 @@ from pace_actuators import PaceDCMotor
 from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.effects import Effect, EffectStack
 from pace_actuators.effects.drive_state import DriveState
-from pace_envs.compiler.drive_code import Program, Read
+from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import TYPES, UNARY, is_compared, rule
 from pace_envs.compiler.tape import Node, NotTraceableError, Ring, Tape
 from pace_envs.compiler.tracer import Tracer, tensors_in
@@ -36,7 +36,7 @@ _AT_ONCE = 64
 
 
 class Commands(Protocol):
-    """What R recordings tell a robot of n joints in T control steps."""
+    """What a robot of n joints follows: R recordings of T control steps."""
 
     @property
     def num_recordings(self) -> int:
@@ -344,18 +344,25 @@ class OneJoint:
         self.robot = robot
         return robot
 
-    def control_step(self, decimation: int, commands: Commands) -> Node:
-        """Let the robot do a control step; returns what the encoder shows before it.
+    def control_step(self, decimation: int, commands: Commands, with_torques: bool = False) -> dict[str, Node]:
+        """Let the robot do a control step; returns what is shown of it (``Program.shown``).
+
+        Args:
+            decimation: Physics steps of a control step.
+            commands: What the robot follows.
+            with_torques: Whether the motor's torque is shown, too.
 
         Raises:
             NotTraceableError: If something counts steps in Python.
         """
         before = self.drive.flags()
-        shown = self.tracer.node(self.robot.sensed_joint_pos())
+        shown = {"out": self.tracer.node(self.robot.sensed_joint_pos())}
         if commands.torque_enable is not None:
             self.drive.set_torque_enable(self.series("torque_enable"))
         for _ in range(decimation):
             self.robot.write_data_to_sim()
+            if with_torques:
+                shown.setdefault("effort", self.tracer.node(self.drive.motor_effort))
             self.robot._sim.step()
             self.robot.update()
         if self.drive.flags() != before:
@@ -400,11 +407,11 @@ class OneJoint:
         if value.ndim == 2:
             self._after.append((index, lambda: holder[key]))
 
-    def program(self, shown: Node, written: Sequence[Mapping[str, Node]] = ()) -> Program:
+    def program(self, shown: Mapping[str, Node], written: Sequence[Mapping[str, Node]] = ()) -> Program:
         """What was noted.
 
         Args:
-            shown: What the encoder showed before it.
+            shown: What is shown of it.
             written: What was written into MuJoCo's fields before each physics step, and after the last.
 
         Raises:
@@ -502,7 +509,7 @@ class OneJoint:
 
 
 def commands(env: ManagerBasedEnv, dataset: Commands, name: str) -> torch.Tensor:
-    """A series of the recordings by control step, (T, R, n): the position targets, what else is told, or the switch."""
+    """A series of the recordings by control step, (T, R, n): targets, added torques, or the switch."""
     if name == "command":
         term = position_term(env)
         term.process_actions(dataset.command)

@@ -8,9 +8,9 @@ from itertools import accumulate
 
 import torch
 
-from pace_envs.compiler.drive_code import DriveCode, Program
+from pace_envs.compiled_drive.drive_code import DriveCode, Program
+from pace_envs.compiled_drive.robot import STATE, WRITTEN
 from pace_envs.compiler.operations import PRELUDE
-from pace_envs.compiler.robot import STATE, WRITTEN
 from pace_envs.compiler.tape import Node, NotTraceableError
 from pace_envs.coulomb import SOURCE as TURN_FRICTION
 from pace_envs.motor_coordinates import MotorCoordinates
@@ -34,6 +34,7 @@ ARGUMENTS = {
     "bias": "double* bias",
     "before": "double* before",
     "out": "double* out",
+    "effort": "double* effort",
     "state": "double* state",
     "motion": "const double* motion",
     "point": "const double* point",
@@ -42,17 +43,18 @@ ARGUMENTS = {
     "held": "const double* held",
     "shift": "const double* shift",
 }
-"""What ``simulate`` is told, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
+"""What ``simulate`` gets, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
 those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings;
 the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
 steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);
 the drives' memory and the forces of gravity and motion of each environment; room for what was before a step, and for
-its friction (environments, 5, nv); what is shown (rows, environments, joints), and unless it is 0 MuJoCo's positions
-and speeds there (rows, environments, nq + nv). Unless it is 0, the motion of a base that moves (commands, physics steps
-of a control step, recordings, 9), where its specific force was measured (recordings, 3), what is added to that
-(environments, 3), and room to compute with (environments, 12 nbody); unless it is 0, positions and speeds at which
-joints are held (commands, recordings, joints, 2; NaN: free), and what is added to them (environments, joints, 2). Then
-the leaves of each drive, each with the memory of its delays behind it."""
+its friction (environments, 5, nv); what is shown (rows, environments, joints), where they are recorded the motors'
+torques there (the same), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Unless
+it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9), where its specific
+force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with (environments, 12
+nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints, 2; NaN: free), and
+what is added to them (environments, joints, 2). Then the leaves of each drive, each with the memory of its delays
+behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <string.h>\n" + PRELUDE
@@ -88,7 +90,7 @@ def robot_source(
         dof: Where its speed is, (n,).
         num_joints: Of a recording.
         version: MuJoCo's, whose structures are used.
-        coordinates: Of motors that move several joints; ``None``: there are none.
+        coordinates: Of motors that move several joints, if any do.
     """
     turns = "" if coordinates is None else coordinates.c_source()
     there, back = ("to_joints(m, d);", "to_motors(m, d);") if turns else ("", "")
@@ -235,7 +237,8 @@ class _Drive:
     def _function(self, part: int, begin: int) -> str:
         code, joints = self._code, len(self._program.columns)
         place = f"(a->slot[k] * a->robots + robot) * {self._num_joints} + {self.name}_C[j]"
-        shown = f"if (a->slot[k] >= 0) a->out[{place}] = {code.of(self._program.shown)};"
+        results = self._program.shown.items()
+        shown = [f"if (a->slot[k] >= 0) a->{to}[{place}] = {code.of(node)};" for to, node in results]
         body = "\n    ".join(code.begin() if part < 0 else code.part(part, self._special, shown))
         return f"""static void {self.name}_{"begin" if part < 0 else part}(
     double* x, long long robot, mjModel* m, mjData* d, long long k, const Arguments* a) {{

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pace_envs.compiler.drive_code import DriveCode, Program
+from pace_envs.compiled_drive.drive_code import DriveCode, Program
 from pace_envs.compiler.operations import PRELUDE
 
 _ARGUMENTS = (
@@ -37,7 +37,7 @@ def joint_source(program: Program) -> tuple[str, list[int]]:
     """
     code = DriveCode(program)
     count, size = len(program.tape.series), "(long long)steps * stride"
-    shown = f"if (slot[k] >= 0) out[(long long)slot[k] * count + e] = {code.of(program.shown)};"
+    shown = f"if (slot[k] >= 0) out[(long long)slot[k] * count + e] = {code.of(program.shown['out'])};"
     before = [
         *code.knots,
         *code.begin(),
@@ -47,7 +47,7 @@ def joint_source(program: Program) -> tuple[str, list[int]]:
     inside = [
         "const long long ahead = k + 1 < last ? stride : 0;",
         *(f"const double t{i} = s[{i} * {size} + ahead];" for i in range(count)),
-        *code.part(0, lambda node: f"s{node.index}", shown),
+        *code.part(0, lambda node: f"s{node.index}", [shown]),
         *(f"s{i} = t{i};" for i in range(count)),
         "s += ahead;",
     ]
