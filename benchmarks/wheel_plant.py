@@ -69,7 +69,8 @@ class Drives:
         """What a fit should find."""
         groups = ("armature", "viscous_friction", "friction", "encoder_bias")
         values = {group: dict(zip(self.joints, _plain(getattr(self, group)), strict=True)) for group in groups}
-        return {**values, "delay_s": self.delay, "hidden": self.hidden, "hidden_on": list(self.hidden_on)}
+        delay = self.delay - 0.5 * STEP  # the integrator applies a torque half a step early
+        return {**values, "delay_s": delay, "hidden": self.hidden, "hidden_on": list(self.hidden_on)}
 
 
 def _plain(values: np.ndarray) -> list[float]:

@@ -49,9 +49,8 @@ class LeastSquaresCfg:
     """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
 
     near_enough: float = 2e-3
-    """Derivatives of a longer physics step lead beside the minimum. They have done their part when an iteration lowers
-    the score by less than this part of it. A smooth simulation stops there, as the error bars' own derivatives take the
-    rest. A rough one goes on with those of its own step."""
+    """A descent by derivatives of a longer physics step ends when an iteration lowers the score by less than this part
+    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives of its own step."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""

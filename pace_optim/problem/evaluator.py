@@ -181,7 +181,11 @@ class Evaluator:
         return self._rollouts[num_candidates]
 
     def look_around(
-        self, physical: torch.Tensor, where: torch.Tensor | None = None, own_step: bool = False
+        self,
+        physical: torch.Tensor,
+        where: torch.Tensor | None = None,
+        own_step: bool = False,
+        initial_offset: torch.Tensor | None = None,
     ) -> tuple[Residuals, Residuals]:
         """The residuals of the first candidate (m = 1), and those of all whose differences count.
 
@@ -191,14 +195,15 @@ class Evaluator:
             physical: Physical parameters, (m, size).
             where: As for :meth:`residuals`.
             own_step: Whether they are not.
+            initial_offset: As for :meth:`residuals`; none for the first candidate.
         """
         if self._nearby is not None and not own_step:
             here = self.residuals(physical[:1], where)
             self._nearby.phases, self._nearby._phases_at = self.phases, self._phases_at
-            every = self._nearby.residuals(physical, where)
+            every = self._nearby.residuals(physical, where, initial_offset)
             if bool(every.error[0].isfinite().all()):
                 return here, every
-        every = self.residuals(physical, where)
+        every = self.residuals(physical, where, initial_offset)
         return every.rows(0, 1), every
 
     def residuals(

@@ -59,8 +59,7 @@ class ProgressLine:
             + ("" if spread is None else f"  spread {spread:.2g}")
             + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s"
         )
-        if self._live or elapsed - self._last_line >= self._between or done == total:
-            self._run(text)
+        self._run(text, now=self._live or elapsed - self._last_line >= self._between or done == total)
 
     def say(self, text: str) -> None:
         """Show a step that has no counter."""

@@ -66,7 +66,8 @@ def assess(
 ) -> Assessment:
     """Error bars at x from the training samples, and x's residuals on all samples.
 
-    Where a descent ended by derivatives of a longer physics step, x goes on to the minimum by these of the fit's own.
+    Derivatives take the physics step that those of the descent took. Where that is longer than the fit's own, the
+    descent ended early, and x goes on to the minimum here.
 
     Args:
         problem: What was fitted.
@@ -78,14 +79,17 @@ def assess(
     """
     training = training or problem.training_evaluator()
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
+    own_step = ended is not None and ended.own_step
     by_longer = ended if ended is not None and ended.stop_reason and training.looks_coarser else None
     for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
         around = stencil(x, colouring, hessian, noise, score)
         shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
-        every = training.residuals(problem.space.to_physical(probes.vectors), initial_offset=probes.offset)
-        there, noise, score = around.jacobian(every), around.noise(every), float(every.rows(0, 1).score[0])
+        here, every = training.look_around(
+            problem.space.to_physical(probes.vectors), own_step=own_step, initial_offset=probes.offset
+        )
+        there, noise, score = replace(around.jacobian(every), residuals=here), around.noise(every), float(here.score[0])
         blind, initial = hessian is None, probes.initial(every.error)
         if by_longer is not None:
             x, there = _gone_on(training, by_longer, x, there)

@@ -75,10 +75,14 @@ def _free_errors(error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor,
     return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
 
 
-def _free_blocks(samples: Sequence[int], control_dt: float, cfg: FittingCfg) -> int:
-    """How many blocks the free time of the median joint makes, of those that have any."""
-    usual = float(np.median([count for count in samples if count] or [0])) * control_dt
+def _free_blocks(usual: float, cfg: FittingCfg) -> int:
+    """How many blocks the free time of the median joint makes [s]."""
     return max(1, int(usual / min(cfg.block_s, max(cfg.swing_s, usual / cfg.blocks)) + 1e-9))
+
+
+def _usual_time(samples: Sequence[int], control_dt: float) -> float:
+    """How long the median joint is free, of those that ever are [s]."""
+    return float(np.median([count for count in samples if count] or [0])) * control_dt
 
 
 def check_long_enough(
@@ -98,25 +102,30 @@ def check_long_enough(
     """
     if free is not None:
         samples = (free & where[..., None]).sum(dim=(0, 1)).tolist()
-        if _free_blocks(samples, control_dt, cfg) < fewest:
+        usual = _usual_time(samples, control_dt)
+        if _free_blocks(usual, cfg) < fewest:
             raise ValueError(
-                f"In what was kept for validation, legs swing for {max(samples) * control_dt:.2g} s each, too short to "
+                f"In what was kept for validation, the median joint swings for {usual:.2g} s, too short to "
                 f"judge a model by; expected {fewest * cfg.swing_s:g} s or more. Walk for longer, or fit again with "
                 "further recordings as --validation."
             )
         return
-    if len(_blocks(where, control_dt, cfg)) < fewest:
+    if (count := len(_blocks(where, control_dt, cfg))) < fewest:
         raise ValueError(
-            f"What was kept for validation lasts {sum(_spans(where)) * control_dt:.2g} s, too short to judge a model "
-            f"by; expected {fewest * cfg.shortest_s:g} s or more. Record for longer, or fit again with further "
+            f"What was kept for validation has {count} pieces of {_block_length(where, control_dt, cfg):.2g} s, too "
+            f"few to judge a model by; expected {fewest} or more. Record for longer, or fit again with further "
             "recordings as --validation."
         )
 
 
+def _block_length(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> float:
+    """[s]."""
+    return min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
+
+
 def _blocks(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> list[tuple[int, torch.Tensor]]:
     """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
-    length = min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
-    steps = max(1, round(length / control_dt))
+    steps = max(1, round(_block_length(where, control_dt, cfg) / control_dt))
     blocks = []
     for r in range(where.shape[1]):
         at = where[:, r].nonzero()[:, 0]

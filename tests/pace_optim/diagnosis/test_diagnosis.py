@@ -152,14 +152,12 @@ def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
     where[:200, 0] = where[100:300:2, 1] = True
     check_long_enough(where, 0.0025, 4)
     where[100:, 0] = False
-    with pytest.raises(
-        ValueError, match=r"lasts 0\.75 s, .* expected 1 s or more\. Record for longer, or .*--validation"
-    ):
+    with pytest.raises(ValueError, match=r"has 3 pieces of 0\.25 s, .* expected 4 or more\. Record for .*--validation"):
         check_long_enough(where, 0.0025, 4)
     run = hidden_run(tmp_path, None, duration=2.5)
     data = run.problem.dataset
     short = replace(data, train=data.train | (torch.arange(len(data.train)) > 40)[:, None])
-    with pytest.raises(ValueError, match="too short to judge"):
+    with pytest.raises(ValueError, match="too few to judge"):
         search_effects(replace(run.problem, dataset=short), torch.zeros(5), [GAIN], 1)
 
 
