@@ -65,6 +65,16 @@ def test_elements_rows_and_sums_over_them(fusion):
     both(fusion, function, numbers(N, 4), numbers(N, 5), numbers(N) > 0.0, numbers(4))
 
 
+def test_what_only_leads_to_a_result_is_not_written_to_memory(fusion, monkeypatch):
+    sources, compiled = [], fusion._compiler.compile
+    monkeypatch.setattr(fusion._compiler, "compile", lambda each: (sources.extend(each), compiled(each)))
+    x = numbers(N, 3)
+    with fusion:
+        y = torch.cat([(x * 2.0 + 1.0).abs().sqrt(), torch.linalg.cross(x, x + 1.0)], dim=1).sum(dim=1)
+    (source,) = sources
+    assert source.partition("simulate(")[2].count("] = ") == 1 and y.shape == (N,)
+
+
 def test_what_all_rows_make_comes_back_to_each(fusion):
     def function(totals, done, level):
         mean = torch.where(done, totals, 0.0).sum(dim=1) / done.sum()
