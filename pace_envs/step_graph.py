@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -88,7 +89,7 @@ class StepGraph:
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
             self._graph.register_generator_state(self._generator)
-            with torch.cuda.graph(self._graph, capture_error_mode="relaxed"), self._fused:
+            with _no_collection(), torch.cuda.graph(self._graph, capture_error_mode="relaxed"), self._fused:
                 results = {name: value.contiguous() for name, value in self._function().items()}
                 self._homes.settle()
             self._names, self._copies = list(results), Copies(list(results.values()))
@@ -199,6 +200,18 @@ def _set(holder: dict[str, Any], name: str, value: Any) -> None:
 def _is_same(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Whether two tensors show the same memory."""
     return a.data_ptr() == b.data_ptr() and a.shape == b.shape and a.stride() == b.stride() and a.dtype == b.dtype
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Python collects no garbage meanwhile: a capture ends where memory of the GPU is given back."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 @contextlib.contextmanager

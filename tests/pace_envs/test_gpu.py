@@ -179,6 +179,26 @@ def test_a_reward_that_waits_for_the_gpu_is_told_and_runs_without_a_graph():
 
 
 @on_gpu
+def test_memory_that_is_garbage_stays_while_a_step_is_captured():
+    warp = pytest.importorskip("mujoco_warp").wp
+    unused, captures = [warp.zeros(8, device="cuda:0")], []
+
+    def makes_garbage(env: ManagerBasedRLEnv) -> torch.Tensor:
+        if torch.cuda.is_current_stream_capturing():
+            captures.append(len(unused))
+            circle: list = [unused.pop()] if unused else []
+            circle.append(circle)
+            del circle
+            [[] for _ in range(100_000)]  # enough for Python to collect what it finds
+        return env.sim.qpos[:, 0] * 0.0
+
+    env = _with_terms_of_ones_own(True, makes_garbage)
+    for _ in range(8):
+        env.step(torch.zeros(8, 12, device="cuda:0"))
+    assert captures and env._graphs["step"].is_captured
+
+
+@on_gpu
 def test_draws_from_a_graph_are_new_every_step_and_repeat_with_the_seed():
     env = _env("Pace-AnymalD-Velocity-v0", "cuda:0", num_envs=64)
     action = torch.zeros(64, 12, device="cuda:0")
