@@ -138,7 +138,8 @@ def conform_all(
         ValueError: As for :func:`read_logs`.
     """
     robot, known = env.scene["robot"], known_robot(env)
-    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
+    sim2real, model = env.cfg.sim2real, env.sim.model  # type: ignore[attr-defined]
+    undriven = {model.joint(j).name for j in range(model.njnt)}.difference(known.joint_names)
 
     def conformed(recording: Recording) -> list[Recording]:
         return [
@@ -150,6 +151,7 @@ def conform_all(
                 joint_types=robot.joint_types,
                 load_bodies=robot.body_names,
                 accepts_load=sim2real.apply_load is not None,
+                undriven=undriven,
             )
             for part in split_at_gaps(recording)
         ]

@@ -33,6 +33,7 @@ def conform_recording(
     joint_types: Sequence[JointType] = (),
     load_bodies: Collection[str] = (),
     accepts_load: bool = False,
+    undriven: Collection[str] = (),
 ) -> Recording:
     """Return the recording with columns in `joint_order` and samples on the grid of the control.
 
@@ -54,6 +55,7 @@ def conform_recording(
         joint_types: Whether each joint of `joint_order` turns or slides; none: all turn.
         load_bodies: Bodies that `added_mass` may name.
         accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
+        undriven: Joints of the model that no drive moves.
 
     Raises:
         ValueError: If the recording does not fit the robot or its time base cannot be used.
@@ -63,7 +65,7 @@ def conform_recording(
     if len(set(joint_order)) != len(joint_order):
         raise ValueError(f"joint_order names a joint twice: {listed(joint_order)}. Name each joint once.")
     check_load(recording, load_bodies, accepts_load)
-    columns, notes = column_order(recording, joint_order)
+    columns, notes = column_order(recording, joint_order, undriven)
     recording = with_columns(recording, columns, tuple(joint_order))
     if not recording.is_commanded.all():
         refuse_uncommanded(recording, joint_order)

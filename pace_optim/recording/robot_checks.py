@@ -19,8 +19,10 @@ _T = TypeVar("_T")
 _DEGREES = "The values look like degrees: multiply them by pi/180."
 
 
-def column_order(recording: Recording, joint_order: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Return the column of each joint of `joint_order`, and notes."""
+def column_order(
+    recording: Recording, joint_order: Sequence[str], undriven: Collection[str] = ()
+) -> tuple[list[int], list[str]]:
+    """Return the column of each joint of `joint_order`, and notes; `undriven` joints of the model have no drive."""
     names, source = recording.joint_names, recording.label
     if not names:
         if recording.num_joints != len(joint_order):
@@ -35,7 +37,12 @@ def column_order(recording: Recording, joint_order: Sequence[str]) -> tuple[list
     unknown = [name for name in names if name not in joint_order]
     missing = [name for name in joint_order if name not in names]
     if unknown or missing:
-        found = [f"unknown joint '{name}'{did_you_mean(name, missing)}" for name in unknown[:3]]
+        found = [
+            f"the joint '{name}' has no drive in the model: give it a transmission (URDF) or an actuator (MJCF)."
+            if name in undriven
+            else f"unknown joint '{name}'{did_you_mean(name, missing)}"
+            for name in unknown[:3]
+        ]
         found += [f"no column for {listed(missing)}."] if missing else []
         raise ValueError(
             f"{source}: {' '.join(found)} The recording has {len(names)} joints ({listed(names)}), the robot "

@@ -331,6 +331,11 @@ DEGREES = 180.0 / np.pi
     ("changes", "arguments", "words"),
     [
         ({}, {"joint_order": ("hip", "knie", "ankle")}, ["unknown joint 'knee', did you mean 'knie'?"]),
+        (
+            {},
+            {"joint_order": ("hip", "ankle"), "undriven": {"knee"}},
+            ["the joint 'knee' has no drive in the model: give it a transmission (URDF) or an actuator (MJCF)."],
+        ),
         ({}, {"joint_order": ("hip", "knee")}, ["'ankle'", "3 joints", "the robot has 2"]),
         ({}, {"joint_order": (*JOINTS, "toe")}, ["no column for toe", "3 joints", "the robot has 4"]),
         ({"joint_names": ()}, {"joint_order": ("hip", "knee")}, ["3 joints", "2 (hip, knee)"]),
