@@ -69,7 +69,9 @@ class Drives:
         """What a fit should find."""
         groups = ("armature", "viscous_friction", "friction", "encoder_bias")
         values = {group: dict(zip(self.joints, _plain(getattr(self, group)), strict=True)) for group in groups}
-        delay = self.delay - 0.5 * STEP  # the integrator applies a torque half a step early
+        arrivals = round(self.delay / STEP) + np.arange(LOOP_STEPS) * round(1 / (self.rate * STEP))
+        wait = float(np.mean(-arrivals % LOOP_STEPS))  # until the loop takes a command
+        delay = self.delay + (wait - 0.5) * STEP  # the integrator applies a torque half a step early
         return {**values, "delay_s": delay, "hidden": self.hidden, "hidden_on": list(self.hidden_on)}
 
 
