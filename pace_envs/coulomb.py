@@ -2,13 +2,18 @@
 
 MuJoCo's friction acts against the speed at the end of a step: where a joint turns back, it turns a part of the step too
 early. That makes an error of the first order in the step, always to the same side. With v and v₊ the speed before and
-after MuJoCo's step of length h, f the friction in it, and 1/w the inertia that the joint feels (``dof_invweight0``),
+after MuJoCo's step of length h, f the friction in it, and w = (M⁻¹)ᵢᵢ,
 
     p = v₊ - v - h w f        what all else pushes
     v₊' = turned(v, p, h w F)
-    Δ = M⁻¹ (v₊' - v₊) / w    the impulse by which the frictions differ, passed on to all joints
+    v₊ += M⁻¹ eᵢ (v₊' - v₊) / w,  f += (v₊' - v₊) / (h w)
 
-A free step has no more constraints than frictions. Where a contact, a limit or an equality acts, nothing is changed.
+joint after joint until none changes: a joint that turns pushes those that stick, and their friction holds against it
+(projected Gauss-Seidel; Stewart and Trinkle, Int. J. Numer. Methods Eng. 39, 1996, solve the same for a whole step).
+
+A free step has no more constraints than frictions. Where a contact, a limit or an equality acts, nothing is changed. A
+GPU takes the first of these steps alone, for all joints at once, with the w of the model's posture
+(``dof_invweight0``).
 """
 
 from __future__ import annotations
@@ -17,6 +22,8 @@ import torch
 
 NOTABLE = 1e-6
 """Of what friction can take from a speed in a step: a smaller change of it is rounding."""
+SWEEPS = 50
+"""Over all joints, at most; a few settle them."""
 
 SOURCE = f"""
 static double turned(double speed, double pushed, double stop) {{
@@ -27,30 +34,44 @@ static double turned(double speed, double pushed, double stop) {{
 }}
 typedef void (*Solve)(const mjModel*, mjData*, mjtNum*, const mjtNum*, int);
 typedef void (*Drift)(const mjModel*, mjtNum*, const mjtNum*, mjtNum);
-static void turn_friction(const mjModel* m, mjData* d, const double* before, double* room, Solve solve, Drift drift) {{
+static double off(double before, double speed, double force, double w, double h, double most) {{
+  const double stop = h * w * most, step = turned(before, speed - before - h * w * force, stop) - speed;
+  return fabs(step) > {NOTABLE} * stop ? step : 0.0;
+}}
+static void turn_friction(const mjModel* m, mjData* d, const double* before, Solve solve, Drift drift) {{
   const int n = m->nv;
-  const double h = m->opt.timestep;
-  double *impulse = room, *change = room + n;
-  int rows = 0, notable = 0;
+  const double h = m->opt.timestep, *most = m->dof_frictionloss, *at_home = m->dof_invweight0;
+  int rows = 0, turns = 0;
   for (int i = 0; i < n; ++i) {{
-    const double most = m->dof_frictionloss[i], w = m->dof_invweight0[i], stop = h * w * most;
-    impulse[i] = 0.0;
-    if (most <= 0.0) continue;
+    if (most[i] <= 0.0) continue;
     ++rows;
-    if (w <= 0.0) continue;
-    const double pushed = d->qvel[i] - before[i] - h * w * d->qfrc_constraint[i];
-    const double step = turned(before[i], pushed, stop) - d->qvel[i];
-    if (fabs(step) <= {NOTABLE} * stop) continue;
-    impulse[i] = step / w;
-    notable = 1;
+    if (at_home[i] > 0.0 && off(before[i], d->qvel[i], d->qfrc_constraint[i], at_home[i], h, most[i])) turns = 1;
   }}
-  if (!notable || d->nf != rows || d->nefc != rows) return;
-  solve(m, d, change, impulse, 1);
-  for (int i = 0; i < n; ++i) d->qvel[i] += change[i];
+  if (!turns || d->nf != rows || d->nefc != rows) return;
+  double* inverse = (double*)calloc((2 * n + 3) * n, sizeof(double));
+  double *unit = inverse + n * n, *speed = unit + n * n, *force = speed + n, *change = force + n;
+  for (int i = 0; i < n; ++i) unit[i * n + i] = 1.0;
+  solve(m, d, inverse, unit, n);
+  memcpy(speed, d->qvel, n * sizeof(double));
+  memcpy(force, d->qfrc_constraint, n * sizeof(double));
+  for (int sweep = 0; turns && sweep < {SWEEPS}; ++sweep) {{
+    turns = 0;
+    for (int i = 0; i < n; ++i) {{
+      const double *row = inverse + i * n, w = row[i];
+      const double step = most[i] > 0.0 ? off(before[i], speed[i], force[i], w, h, most[i]) : 0.0;
+      if (step == 0.0) continue;
+      turns = 1;
+      force[i] += step / (h * w);
+      for (int j = 0; j < n; ++j) speed[j] += row[j] * (step / w);
+    }}
+  }}
+  for (int i = 0; i < n; ++i) change[i] = speed[i] - d->qvel[i];
+  memcpy(d->qvel, speed, n * sizeof(double));
   drift(m, d->qpos, change, h);
+  free(inverse);
 }}
 """
-"""The same in C, after MuJoCo's step: ``before`` are the speeds before it, ``room`` has 2 nv numbers."""
+"""The same in C, after MuJoCo's step: ``before`` are the speeds before it."""
 
 
 def turned(speed: torch.Tensor, pushed: torch.Tensor, stop: torch.Tensor) -> torch.Tensor:
@@ -75,16 +96,48 @@ def impulses(
     weight: torch.Tensor,
     step: float,
 ) -> torch.Tensor:
-    """By what friction differs over a step, (num_envs, nv) [N m s]; zero where it does not.
+    """By what the friction of each joint alone differs over a step, (num_envs, nv) [N m s]; zero where it does not.
 
     Args:
         before: Speeds before MuJoCo's step, (num_envs, nv).
         after: Speeds after it.
         force: Its friction.
         most: Coulomb friction F.
-        weight: ``dof_invweight0``.
+        weight: Each joint's w.
         step: h [s].
     """
     stop = step * weight * most
     change = turned(before, after - before - step * weight * force, stop) - after
-    return torch.where(change.abs() > NOTABLE * stop, change / weight, 0.0) * (most > 0.0)
+    return torch.where((change.abs() > NOTABLE * stop) & (most > 0.0), change / weight, 0.0)
+
+
+def settled(
+    before: torch.Tensor,
+    after: torch.Tensor,
+    force: torch.Tensor,
+    most: torch.Tensor,
+    inverse: torch.Tensor,
+    step: float,
+) -> torch.Tensor:
+    """Speeds after a step in which the frictions of all joints have turned, (num_envs, nv).
+
+    Args:
+        before: As for :func:`impulses`.
+        after: As for it.
+        force: As for it.
+        most: As for it.
+        inverse: M⁻¹, (num_envs, nv, nv).
+        step: h [s].
+    """
+    speed, force, turns = after.clone(), force.clone(), True
+    for _ in range(SWEEPS):
+        if not turns:
+            break
+        turns = False
+        for i in range(speed.shape[1]):
+            impulse = impulses(before[:, i], speed[:, i], force[:, i], most[:, i], inverse[:, i, i], step)
+            if bool(impulse.any()):
+                turns = True
+                force[:, i] += impulse / step
+                speed += inverse[:, i] * impulse[:, None]
+    return speed

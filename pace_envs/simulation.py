@@ -17,7 +17,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
-from pace_envs.coulomb import impulses
+from pace_envs.coulomb import impulses, settled
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
@@ -380,17 +380,26 @@ class Simulation:
         force, free, constraints = (outcomes[name] for name in _FRICTION)
         impulse = impulses(before, self.qvel, force, most, weight, self.cfg.dt)
         alone = (free == (most > 0.0).sum(dim=1)) & (constraints == free)
-        change = self._speeds_of(torch.where(alone[:, None], impulse, 0.0))
+        change = self._change_of_speeds(torch.where(alone[:, None], impulse, 0.0), before, force, most)
         self.qvel += change
         drift(self.qpos, change, self.cfg.dt)
 
-    def _speeds_of(self, impulse: torch.Tensor) -> torch.Tensor:
-        """How impulses change the speeds, M⁻¹ of the step's middle applied to (num_envs, nv)."""
-        hit = impulse.any(dim=1).nonzero()[:, 0]
-        change = torch.zeros_like(impulse)
+    def _change_of_speeds(
+        self, impulse: torch.Tensor, before: torch.Tensor, force: torch.Tensor, most: torch.Tensor
+    ) -> torch.Tensor:
+        """How the speeds change where frictions turn, by M⁻¹ of the step's middle, (num_envs, nv).
+
+        Args:
+            impulse: By what each friction alone differs, (num_envs, nv); zero where none turns.
+            before: Speeds before the step.
+            force: Friction in it.
+            most: Coulomb friction.
+        """
+        hit, change = impulse.any(dim=1).nonzero()[:, 0], torch.zeros_like(impulse)
         if len(hit):
             entries = torch.nn.functional.pad(self._outcomes["M"][hit], (0, 1))
-            change[hit] = torch.linalg.solve(entries[:, self._place_in_inertia], impulse[hit])
+            inverse, after = torch.linalg.inv(entries[:, self._place_in_inertia]), self.qvel[hit]
+            change[hit] = settled(before[hit], after, force[hit], most[hit], inverse, self.cfg.dt) - after
         return change
 
     @cached_property

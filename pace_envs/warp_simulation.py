@@ -68,7 +68,7 @@ class WarpSimulation(Simulation):
         fields = ("qfrc_constraint", "nf", "nefc")
         return {field: self._warp.to_torch(getattr(self.data, field)) for field in fields}
 
-    def _speeds_of(self, impulse: torch.Tensor) -> torch.Tensor:
+    def _change_of_speeds(self, impulse: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
         self._impulse.copy_(impulse)
         self._run("solve_m")
         return self._response
