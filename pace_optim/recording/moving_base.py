@@ -108,6 +108,18 @@ class Carried:
         return torch.where(self.free[..., None], torch.nan, self.measured).contiguous()
 
 
+def read_earlier(frame: np.ndarray, delay: float, dt: float) -> np.ndarray:
+    """What an IMU shows that is read too late, put where it belongs, (T, 6).
+
+    Args:
+        frame: As logged, (T, 6).
+        delay: How much too late [s].
+        dt: Between samples [s].
+    """
+    at = np.arange(len(frame))
+    return np.stack([np.interp(at + delay / dt, at, column) for column in frame.T], axis=1)
+
+
 def force_noise(force: np.ndarray, dt: float) -> np.ndarray:
     """How well samples determine a specific force, (T, 3) [m/s²].
 
@@ -141,6 +153,19 @@ def free_phases(standing: np.ndarray, dt: float) -> np.ndarray:
         last = end - (margin if end < len(standing) else 0)
         if last - first >= shortest:
             result[first:last] = True
+    return result
+
+
+def part_of_phase(free: np.ndarray) -> np.ndarray:
+    """How much of a free phase has passed, 0 to 1; NaN where there is none, (T,).
+
+    Args:
+        free: (T,) bool.
+    """
+    result = np.full(len(free), np.nan)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(int)))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        result[first:end] = (np.arange(first, end) - first + 0.5) / (end - first)
     return result
 
 
