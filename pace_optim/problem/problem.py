@@ -26,6 +26,7 @@ from pace_optim.problem.base_path import BasePath, base_path
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
+    loop_dt,
     of_joints,
     set_control_step,
     set_drive_rate,
@@ -235,7 +236,7 @@ class Problem:
     @property
     def loop_dt(self) -> float:
         """Shortest time between two runs of the drives' loops [s]; 0: one runs continuously."""
-        return _loop_dt(self.plain_cfg, self.control_dt)
+        return loop_dt(self.plain_cfg, self.control_dt)
 
     @property
     def assumes_loop_rate(self) -> bool:
@@ -520,11 +521,6 @@ def _posed(
     )
 
 
-def _loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
-    drives = cfg.scene.robot.actuators.values()
-    return min(0.0 if drive.implicit else drive.drive_dt or control_dt for drive in drives)
-
-
 def _assumed_loop(
     facts: Facts, cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], unknown: Sequence[str]
 ) -> float | None:
@@ -535,7 +531,7 @@ def _assumed_loop(
     """
     gains = not cfg.sim2real.assumed_gains or any(r.drive.stiffness is not None for r in recordings)
     assumed = is_model_file(facts.task) and facts.drive_dt is None and (gains or "stiffness" in unknown)
-    return _loop_dt(cfg, facts.control_dt) if assumed else None
+    return loop_dt(cfg, facts.control_dt) if assumed else None
 
 
 def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:

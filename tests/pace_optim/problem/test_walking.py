@@ -206,6 +206,9 @@ def test_the_frame_turns_by_the_slope_of_the_gyroscope():
     motion = carried.motion(2, 0.5)
     assert motion[0, :, 0, 0].tolist() == [0.25, 0.75] and motion[0, :, 0, 3].tolist() == [2.0, 2.0]
     assert motion[0, :, 0, 8].tolist() == [9.25, 9.75] and motion[2, :, 0, 3].tolist() == [0.0, 0.0]
+    # drives that hold their torques for a control step: the force of a sample is that of the step before it
+    held = carried.motion(2, 0.5, 0.5)
+    assert held[0, :, 0, 8].tolist() == [9.75, 10.25] and held[..., :6].equal(motion[..., :6])
 
 
 @pytest.fixture(scope="module")
