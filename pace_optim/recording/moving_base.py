@@ -165,7 +165,7 @@ def free_phases(standing: np.ndarray, dt: float) -> np.ndarray:
 
 
 def part_of_phase(free: np.ndarray) -> np.ndarray:
-    """How much of a free phase has passed, 0 to 1; NaN where there is none, (T,).
+    """How much of a free phase has passed, 0 to 1; NaN elsewhere, (T,).
 
     Args:
         free: (T,) bool.
