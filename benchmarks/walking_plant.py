@@ -83,6 +83,30 @@ def gait(seed: int) -> Callable[[float], np.ndarray]:
 
 
 @dataclass(kw_only=True)
+class Hidden:
+    """What drives have beside friction and inertia: a number, or one for each joint."""
+
+    gain: np.ndarray | float = 1.0
+    """Of the torque."""
+    lag: np.ndarray | float = 0.0
+    """Time constant of the torque [s]."""
+    ripple: np.ndarray | float = 0.0
+    """Amplitude of a torque that repeats over the joint's turn [N m]."""
+    periods: np.ndarray | float = 1.0
+    """How often it does so in a turn."""
+    spring: np.ndarray | float = 0.0
+    """Stiffness of a spring [N m/rad] ..."""
+    rest: np.ndarray | float = 0.0
+    """... and where it rests [rad]."""
+    gap: np.ndarray | float = 0.0
+    """Of a gear [rad]."""
+
+
+_GEAR = 3000.0, 0.5
+"""Stiffness [N m/rad] and damping [N m s/rad] of a gear with a gap."""
+
+
+@dataclass(kw_only=True)
 class Plant:
     """A robot, its drives as they are, and how its base moves."""
 
@@ -101,8 +125,10 @@ class Plant:
     delay: int = 2
     """Of commands [control steps]."""
     effort_limit: float = 89.0
-    spring: np.ndarray | float = 0.0
-    """Stiffness of a spring towards 0 at each joint [N m/rad]."""
+    hidden: Hidden = field(default_factory=Hidden)
+    """What no fit is told of."""
+    imu: tuple[str, tuple[float, float, float]] | None = None
+    """Body and place of the IMU [m]; ``None``: the site ``imu``."""
     tilt: float = np.radians(5)
     """Of the pendulum at the beginning [rad]."""
     noise: tuple[float, float, float] = (1e-4, 2e-3, 0.03)
@@ -111,7 +137,11 @@ class Plant:
 
     def model(self) -> mujoco.MjModel:
         """Compile it."""
-        spec = mujoco.MjSpec.from_string(self.xml)
+        spec = (
+            mujoco.MjSpec.from_string(self.xml)
+            if self.xml.lstrip().startswith("<")
+            else mujoco.MjSpec.from_file(self.xml)
+        )
         spec.option.timestep = STEP
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         for element in [*spec.actuators, *spec.keys, *spec.sensors]:
@@ -122,18 +152,33 @@ class Plant:
             spec.delete(root)
             if self.swing:
                 base.add_joint(name="rope", type=mujoco.mjtJoint.mjJNT_BALL, pos=[0, 0, self.swing])
+        if self.imu is not None:
+            spec.body(self.imu[0]).add_site(name="imu", pos=self.imu[1])
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity = 0, int(geom.name in self.feet.values())
         if self.feet:
             spec.worldbody.add_geom(
                 name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], contype=1, conaffinity=1
             )
         else:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        gaps = np.broadcast_to(self.hidden.gap, len(self.joints))
         for i, name in enumerate(self.joints):
             joint = spec.joint(name)
             joint.armature, joint.frictionloss = self.truth["armature"][i], self.truth["friction"][i]
             joint.damping[0] = self.truth["viscous_friction"][i]
             joint.solref_friction = [2 * STEP, 1.0]
             joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
+            if gaps[i]:
+                joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
+                half = 0.5 * gaps[i]
+                gear = spec.add_tendon(
+                    name=f"{name}_gear",
+                    stiffness=[_GEAR[0], 0, 0],
+                    damping=[_GEAR[1], 0, 0],
+                    springlength=[-half, half],
+                )
+                gear.wrap_joint(f"{name}_gap", 1.0)
         for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
             spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
         return spec.compile()
@@ -164,7 +209,9 @@ class Plant:
             log[key] = np.zeros((count, size))
         if feet:
             log["contact"], log["feet"] = np.zeros((count, len(feet)), dtype=bool), list(self.feet)
-        targets = [self.targets(0.0)] * self.delay
+        targets, given = [self.targets(0.0)] * self.delay, np.zeros(n)
+        lag = np.broadcast_to(self.hidden.lag, n)
+        follows = np.where(lag > 0, -np.expm1(-STEP / np.maximum(lag, 1e-9)), 1.0)
         for k in range(count):
             mujoco.mj_forward(model, data)
             sigma = self.noise
@@ -179,8 +226,11 @@ class Plant:
             torque = self.kp * (targets[k] - data.qpos[q]) - self.kd * data.qvel[v]
             held = np.clip(torque, -self.effort_limit, self.effort_limit)
             for _ in range(parts):
-                data.qfrc_applied[v] = held - self.spring * data.qpos[q]
+                given += follows * (held - given)
+                data.qfrc_applied[v] = self._torque(given, data.qpos[q])
                 mujoco.mj_step(model, data)
+        if self.imu is not None:
+            log["imu"] = json.dumps({"body": self.imu[0], "pos": self.imu[1]})
         return {
             **log,
             "joint_names": list(self.joints),
@@ -190,6 +240,11 @@ class Plant:
             "saturation_effort": np.inf,  # no torque-speed line
             "velocity_limit": np.inf,
         }
+
+    def _torque(self, given: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """What the drives give, with what is hidden, (n,) [N m]."""
+        own = self.hidden
+        return own.gain * given + own.ripple * np.sin(own.periods * position) - own.spring * (position - own.rest)
 
 
 def drawn(n: int, seed: int, scale: float = 1.0) -> dict[str, np.ndarray]:

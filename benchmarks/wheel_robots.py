@@ -172,14 +172,14 @@ def run_case(robot: Robot, hidden: str, args: argparse.Namespace) -> dict:
             *args.fit_options,
         ),
     ]
-    code, output, row["wall_s"], row["processor_s"] = _call(list(map(str, command)), runs / "output.log", args)
+    code, output, row["wall_s"], row["processor_s"] = call(list(map(str, command)), runs / "output.log", args)
     row["exit"] = code
     if code is None:
-        row |= {"verdict": "time limit", "message": _last_line(output)}
+        row |= {"verdict": "time limit", "message": last_line(output)}
     elif code != 0:
         row |= {
             "verdict": "refused" if code == 2 and "Traceback" not in output else "crash",
-            "message": _last_line(output),
+            "message": last_line(output),
         }
     folder = next(iter(re.findall(r"^run: (.*)$", output, re.M)[::-1]), None)
     results = [Path(folder) / "result.json"] if folder else sorted(runs.rglob("result.json"))
@@ -200,7 +200,7 @@ def moved_by(link: str, plant: Plant) -> str:
     return plant.model.joint(int(plant.model.body_jntadr[root])).name if plant.model.body_jntnum[root] else ""
 
 
-def _call(command: list[str], file: Path, args: argparse.Namespace) -> tuple[int | None, str, float, float]:
+def call(command: list[str], file: Path, args: argparse.Namespace) -> tuple[int | None, str, float, float]:
     """Run a command; returns its exit code (none: ended at a limit), output, wall and processor time [s]."""
 
     def limited() -> None:
@@ -247,7 +247,8 @@ def _end(child: subprocess.Popen) -> None:
             return
 
 
-def _last_line(output: str) -> str:
+def last_line(output: str) -> str:
+    """What a command said at its end: its error, if it has one."""
     lines = [line.strip() for line in re.split(r"[\r\n]+", output) if line.strip()]
     if "Traceback" in output:
         places = re.findall(r'File "[^"]*/([\w/]+\.py)", line (\d+)', output)
@@ -365,7 +366,7 @@ def main() -> None:
     parser.add_argument("--fit_options", nargs="*", default=[], help="more options of fit, without their dashes")
     parser.add_argument("--processor_limit", type=int, default=300, help="processor time of one fit [s]")
     parser.add_argument("--time_limit", type=float, default=1800.0, help="wall time of one fit [s]")
-    parser.add_argument("--label", default=_commit(), help="of the results (default: the commit)")
+    parser.add_argument("--label", default=commit(), help="of the results (default: the commit)")
     parser.add_argument("--again", action="store_true", help="repeat what is done")
     parser.add_argument("--logs_only", action="store_true", help="make the logs and stop")
     parser.add_argument("--table", action="store_true", help="print the table of what is done and stop")
@@ -403,7 +404,8 @@ def main() -> None:
     print(table([done[robot.name, hidden] for robot, hidden in cases if (robot.name, hidden) in done]))
 
 
-def _commit() -> str:
+def commit() -> str:
+    """Short name of the commit."""
     found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     return found.stdout.strip() or "unversioned"
 

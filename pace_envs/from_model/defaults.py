@@ -38,7 +38,11 @@ TOP_FREQUENCY = 10.0
 
 SLIDE_LENGTH = 0.1
 """Metres of a slide that count as a radian of a hinge, in the values above."""
-PHYSICS_STEPS = 4
-"""Physics steps in a control step of a fit: what is left of their error is below an encoder's noise."""
-FINEST_STEP = 0.0005
-"""Physics steps are no finer than that for it [s]."""
+
+_PHYSICS_STEPS, _FINEST_STEP = 4, 0.0005
+"""Physics steps in a control step, and the least time of one [s]."""
+
+
+def physics_steps(control_dt: float) -> int:
+    """Physics steps in a control step [s] of a fit: what is left of their error is below an encoder's noise."""
+    return max(1, min(_PHYSICS_STEPS, round(control_dt / _FINEST_STEP)))

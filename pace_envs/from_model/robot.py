@@ -157,7 +157,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             },
             slide_joints=tuple(joint.name for joint in joints if joint.is_slide),
             assumed_gains=tuple(joint.name for joint in joints if not has_gains(joint)),
-            physics_steps=max(1, min(defaults.PHYSICS_STEPS, round(control_dt / defaults.FINEST_STEP))),
+            physics_steps=defaults.physics_steps(control_dt),
             notes=robot.notes,
         ),
     )

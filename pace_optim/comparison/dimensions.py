@@ -1,4 +1,4 @@
-"""What the error is laid out against: speed, direction, reversals, position, load, acceleration, time."""
+"""What the error is laid out against: speed, direction, reversals, position, load, acceleration, gait, time."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ _POSITION_BINS = 8
 _NEXT_SPEED = 1.3
 """An edge of speed is at least this many times the one below."""
 _TIME_BINS = 10
+_QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
+SWING = "swing"
+"""Name of the dimension that is how much of a swing has passed."""
 _LEAST_PER_BIN = 0.005
 """A bin with less of the time than this says nothing."""
 
@@ -48,6 +51,7 @@ def dimensions_of(
     loads: Sequence[np.ndarray] | None,
     enabled: Sequence[np.ndarray] | None = None,
     joint_type: JointType = "hinge",
+    swings: Sequence[np.ndarray] | None = None,
 ) -> list:
     """Every dimension of one joint over all its recordings, whose samples follow each other.
 
@@ -57,6 +61,7 @@ def dimensions_of(
         loads: Load torque in each recording, (K_r,) [N m], if known.
         enabled: Whether the drive gave torque in each recording, (K_r,) bool; ``None``: always.
         joint_type: Whether it turns or slides.
+        swings: How much of its swing a joint of a walking robot has behind it, (K_r,); ``None``: nothing walks.
     """
     speed = np.concatenate([motion.speed for motion in motions])
     acceleration = np.concatenate([motion.acceleration for motion in motions])
@@ -83,6 +88,11 @@ def dimensions_of(
             "load force" if joint_type == "slide" else "load torque",
             units_for("N m", types),
             np.concatenate(loads),
+        )
+    if swings is not None:
+        behind = np.nan_to_num(np.concatenate(swings))
+        result.append(
+            Dimension(name=SWING, title="part of the swing", unit="", edges=_QUARTERS, bin=_index(behind, _QUARTERS))
         )
     if enabled is not None:
         on = np.concatenate(enabled).astype(float)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -142,9 +142,12 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
         loads if len(loads) == len(tracks) else None,
         [t.enabled for t in tracks],
         joint_type=joint_type,
+        swings=None if any(t.swing is None for t in tracks) else [t.swing[:, j] for t in tracks if t.swing is not None],
     )
-    error = np.concatenate([t.error[:, j] for t in tracks])
-    sigma = np.concatenate([np.full(len(t.time), f.sigma) for t, f in zip(tracks, floors, strict=True)])
+    kept = [t.counts[:, j] for t in tracks]
+    dimensions = [replace(d, bin=d.bin[np.concatenate(kept)]) for d in dimensions]
+    error = np.concatenate([t.error[own, j] for t, own in zip(tracks, kept, strict=True)])
+    sigma = np.concatenate([np.full(own.sum(), f.sigma) for own, f in zip(kept, floors, strict=True)])
     layouts = [lay_out(error, sigma, d.bin, d.num_bins) for d in dimensions]
     edges = band_edges(max(len(t.time) * t.dt for t in tracks), min(t.dt for t in tracks))
     powers = [_spectra(t, j, f.sigma, edges) for t, f in zip(tracks, floors, strict=True)]
@@ -165,10 +168,10 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
         "where": _where(dimensions, layouts) | {"frequency": _band_content(edges, pooled, octaves)},
         "recordings": [],
     }
-    ends = np.cumsum([0, *(len(t.time) for t in tracks)])
+    ends = np.cumsum([0, *(own.sum() for own in kept)])
     for r, (track, own_floor, motion) in enumerate(zip(tracks, floors, motions, strict=True)):
         part = slice(ends[r], ends[r + 1])
-        e = track.error[:, j]
+        whole, e = track.error[:, j], error[part]
         own = [lay_out(e, sigma[part], d.bin[part], d.num_bins) for d in dimensions]
         position = track.measured[:, j]
         content["recordings"].append(
@@ -180,10 +183,10 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
                 "lattice": own_floor.lattice,
                 "share_above_floor": share_above(rms(e) or 0.0, own_floor.sigma),
                 "where": _where(dimensions, own) | {"frequency": _band_content(edges, powers[r], octaves)},
-                "response": response(track.target[:, j], position, position + e, track.dt),
-                "hysteresis": hysteresis(motion, track.target[:, j] - position, e),
+                "response": response(track.target[:, j], position, position + whole, track.dt),
+                "hysteresis": hysteresis(motion, track.target[:, j] - position, whole),
                 "whiteness": whiteness(e, track.dt),
-                "over_time": over_time(track.time, e),
+                "over_time": over_time(track.time, whole),
             }
         )
     return JointComparison(content=content, places=told)
@@ -206,7 +209,10 @@ def rmse_by_part(tracks: Sequence[Track], j: int | None = None) -> dict[str, flo
     column = slice(None) if j is None else j
     result = {}
     for part in ("train", "validation"):
-        errors = [t.error[t.train if part == "train" else ~t.train][:, column].ravel() for t in tracks]
+        errors = []
+        for track in tracks:
+            own = track.train if part == "train" else ~track.train
+            errors.append(track.error[own][:, column][track.counts[own][:, column]])
         if (value := rms(np.concatenate(errors))) is not None:
             result[part] = value
     return result
@@ -246,7 +252,7 @@ def _spectra(track: Track, j: int, sigma: float, edges: np.ndarray) -> dict[str,
     count = len(track.time)
     error = band_power(track.error[:, j], track.dt, edges)
     lines = np.histogram(np.fft.rfftfreq(count, track.dt), bins=[*edges[:-1], np.inf])[0]
-    noise = count * sigma**2 * lines / lines.sum()
+    noise = track.counts[:, j].sum() * sigma**2 * lines / lines.sum()
     position = track.measured[:, j]
     return {
         "error": error,

@@ -15,6 +15,7 @@ from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Drive, Recording
+from pace_optim.recording.moving_base import part_of_phase
 from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
@@ -46,6 +47,17 @@ class Track:
     """Whether the drive gives torque, (K,) bool."""
     group: int
     """Recordings of one group repeat each other: same commands, drive and load."""
+    swing: np.ndarray | None = None
+    """How much of its swing each joint has behind it, 0 to 1, (K, n); NaN where the ground holds it. ``None``: the base
+    rests."""
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Where joints are compared, (K, n) bool: where they are free; everywhere if they never are."""
+        if self.swing is None:
+            return np.ones(self.error.shape, dtype=bool)
+        free = ~np.isnan(self.swing)
+        return free | ~free.any(axis=0)
 
     @property
     def dt(self) -> float:
@@ -134,6 +146,7 @@ def load_tracks(
             load=None if loads is None else loads[r],
             enabled=_enabled(entry),
             group=groups[r],
+            swing=None if problem is None else _swing(problem, r, len(entry["time"])),
         )
         for r, entry in enumerate(content["recordings"])
     )
@@ -145,6 +158,15 @@ def load_tracks(
         tracks=tracks,
         notes=tuple(notes),
     )
+
+
+def _swing(problem: Problem, r: int, count: int) -> np.ndarray | None:
+    """How much of its swing each joint of a recording has behind it, (count, n); ``None``: its base rests."""
+    recording, carried = problem.dataset.recordings[r], problem.dataset.carried
+    if carried is None or not recording.base_moves:
+        return None
+    parts = np.stack([part_of_phase(free) for free in carried.free[:, r].numpy().T], axis=1)
+    return parts[recording.sample_steps[:count]]
 
 
 def _check_finite(source: Path, content: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pace_actuators.text import short_duration
 
-from .dimensions import Dimension
+from .dimensions import SWING, Dimension
 from .regions import Region
 
 _OF = {
@@ -35,6 +35,8 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
         return "on the way up (q grows)" if region.first else "on the way down (q falls)"
     if dimension.name == "drive":
         return "while the drive is on" if region.first else "while the drive is off"
+    if dimension.name == SWING:
+        return _of_swing(low, high)
     if dimension.name == "since_reversal":
         return _after_reversal(low, high)
     if dimension.name == "time":
@@ -63,6 +65,12 @@ def _between(low: float | None, high: float | None, unit: str, above: str = "abo
     if high is None:
         return f"{above} {_number(low)} {unit}"
     return f"between {_number(low)} and {_number(high)} {unit}"
+
+
+def _of_swing(low: float | None, high: float | None) -> str:
+    if low is None or high is None:
+        return f"in the {'first' if low is None else 'last'} {percent(high or 1 - (low or 0.0))} of each swing"
+    return f"between {percent(low)} and {percent(high)} of each swing"
 
 
 def _after_reversal(low: float | None, high: float | None) -> str:

@@ -90,6 +90,12 @@ def set_drive_step(cfg: PaceSim2realEnvCfg, env: ManagerBasedRLEnv | None = None
     return cfg.sim.dt / steps if steps > 1 else None
 
 
+def loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
+    """Shortest time between two runs of the drives' loops [s]; 0: one runs continuously."""
+    drives = cfg.scene.robot.actuators.values()
+    return min(0.0 if drive.implicit else drive.drive_dt or control_dt for drive in drives)
+
+
 def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list[str]:
     """Whether the drives' loops are stable at their steps with the gains of each recording.
 

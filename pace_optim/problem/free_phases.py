@@ -55,6 +55,8 @@ _ALIKE = 0.85
 """w: part of the variance of the force's error that lasts ..."""
 _LASTS = 10.0
 """... m: for so many control steps."""
+_GROUP = 4
+"""Control steps whose part that lasts is taken for one."""
 _DISTURBED = 8.0
 """Times the usual mean square of a leg's phases from which one is disturbed."""
 PUSH = 0.1
@@ -237,11 +239,33 @@ class PhaseProbes:
         return cls(shift=shift, push=push)
 
 
-def _correlated(count: int) -> torch.Tensor:
-    """Root of the correlation of the force's errors in so many control steps, R = rootᵀ root, (count, count)."""
-    apart = (torch.arange(count)[:, None] - torch.arange(count)).abs().double()
-    correlation = _ALIKE * torch.exp(-apart / _LASTS) + (1 - _ALIKE) * torch.eye(count, dtype=torch.float64)
-    return torch.linalg.cholesky(correlation).T
+def _lasting(white: torch.Tensor) -> torch.Tensor:
+    """What the part of the force's error that lasts does, a root of its covariance, (3 groups, count joints).
+
+    Args:
+        white: What the force's error in each control step does, (3, steps, count joints).
+    """
+    groups = torch.nn.functional.pad(white, (0, 0, 0, -white.shape[1] % _GROUP))
+    groups = groups.unflatten(1, (-1, _GROUP)).sum(dim=2)
+    at = _GROUP * torch.arange(groups.shape[1], dtype=white.dtype)
+    root = torch.linalg.cholesky(_ALIKE * torch.exp(-(at[:, None] - at).abs() / _LASTS))
+    return (root.T @ groups).flatten(0, 1)
+
+
+def _felt(kick: torch.Tensor, history: int, count: int) -> torch.Tensor:
+    """What a push in each control step does later, (6, steps, count joints).
+
+    Args:
+        kick: What one does in the steps after it, (6, steps, joints).
+        history: Steps before the first of ``count``.
+        count: Steps at which it is felt; a push in the last of them is not.
+    """
+    steps, (axes, known, joints) = history + count - 1, kick.shape
+    padded = kick.new_zeros(axes, count - 1 + max(known, history + count - 1), joints)
+    padded[:, count - 1 : count - 1 + known] = kick  # the row of a step is that of the one after it, a step later
+    row, column = padded.stride(1), padded.stride(2)
+    rows = padded.as_strided((axes, steps, count, joints), (padded.stride(0), row, row, column))
+    return rows.flip(1).flatten(2)
 
 
 def _white(series: torch.Tensor) -> torch.Tensor:
@@ -291,23 +315,20 @@ def free_phases(
         rows = [kind * depth + i for kind in range(2) for i in range(len(joints))]
         scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
         begun = scale[:, None, None] * change[rows][:, block.first : block.end, r][..., joints] / sigma
-        columns = [begun.flatten(1)]
         response = change[2 * depth :, block.begin : block.end, r][..., joints] / (PUSH * sigma)
         kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
-        steps = torch.arange(block.first - min(block.first - block.begin, 2 * _BLOCK), block.end - 1)
-        behind = torch.arange(block.first, block.end)[:, None] - steps - 1
-        felt = ((behind >= 0) & (behind < kick.shape[1]))[None, :, :, None]
-        felt = torch.where(felt, kick[:, behind.clamp(0, kick.shape[1] - 1)], 0.0)  # (6, count, steps, joints)
-        felt = felt.transpose(1, 2).flatten(2)  # (6, steps, count joints)
+        history = min(block.first - block.begin, 2 * _BLOCK)
+        steps = torch.arange(block.first - history, block.end - 1)
+        felt = _felt(kick, history, block.end - block.first)
         white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
-        own = torch.cat([*columns, white.flatten(0, 1)])
-        covariances.append(torch.eye(own.shape[1], dtype=change.dtype) + own.T @ own)
+        pushed = white.flatten(0, 1)
+        begun, pushed = begun.flatten(1), pushed.T @ pushed
+        own = torch.eye(pushed.shape[1], dtype=change.dtype) + begun.T @ begun
+        covariances.append(own + pushed)
         turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
-        pushed = _correlated(len(steps)) @ white
         late = _LATE / control_dt * (felt * slope[steps, r].T[:, :, None]).sum(dim=1)
-        columns += [late, turned.flatten(0, 1), pushed.flatten(0, 1)]
-        every = torch.cat(columns)
-        expected.append(torch.eye(every.shape[1], dtype=change.dtype) + every.T @ every)
+        every = torch.cat([late, turned.flatten(0, 1), _lasting(white)])
+        expected.append(own + (1 - _ALIKE) * pushed + every.T @ every)
     wide = _disturbed(blocks, expected, error, noise)
     covariances = [factor * each for factor, each in zip(wide, covariances, strict=True)]
     expected = [factor * each for factor, each in zip(wide, expected, strict=True)]

@@ -118,9 +118,7 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
     names, result = list(robot.joint_names), []
     trees = [[names.index(name) for name in tree] for tree in independent_trees(env)]
     for foot in feet:
-        own = _chain(model, foot, names) or [
-            j for j, name in enumerate(names) if re.match(re.escape(foot) + r"(?![A-Za-z0-9])", name, re.IGNORECASE)
-        ]
+        own = chain_of_foot(model, foot, names)
         if not own:
             known = [model.body(b).name for b in range(1, model.nbody)]
             raise ValueError(
@@ -129,6 +127,12 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
             )
         result.append(sorted({j for tree in trees if set(tree) & set(own) for j in tree}))
     return result
+
+
+def chain_of_foot(model: mujoco.MjModel, foot: str, joints: Sequence[str]) -> list[int]:
+    """Joints of the leg of a foot, by index; none where the model has no such foot."""
+    begins = re.compile(re.escape(foot) + r"(?![A-Za-z0-9])", re.IGNORECASE)
+    return _chain(model, foot, joints) or [j for j, name in enumerate(joints) if begins.match(name)]
 
 
 def _chain(model: mujoco.MjModel, name: str, joints: Sequence[str]) -> list[int]:

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,14 +17,16 @@ from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
-from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT
+from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT, physics_steps
 from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
+from pace_optim.problem.base_path import BasePath, base_path
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
+    loop_dt,
     of_joints,
     set_control_step,
     set_drive_rate,
@@ -83,6 +86,8 @@ class Problem:
     """Whether the control step is that of the log's commands, as nothing states one."""
     assumed_loop: float | None = None
     """Assumed period of the drives' loops [s]; 0: continuous. ``None``: it is stated."""
+    imu_delays: Mapping[str, float] = field(default_factory=dict)
+    """How much later than encoders IMUs are read [s], by recording; the dataset has them in time."""
     torque_notes: tuple[str, ...] = ()
     """Which measured torques are followed and which are not, in sentences."""
 
@@ -221,10 +226,17 @@ class Problem:
         values = torch.tensor([noise.get(joint, 0.0) for joint in self.joint_names], dtype=torch.float64)
         return replace(self, dataset=replace(self.dataset, torques=torques.with_noise(values)))
 
+    def with_imu_delays(self, delays: Mapping[str, float]) -> Problem:
+        """The same with IMUs that are read later than encoders by so much [s], by the name of whole recordings."""
+        if not delays:
+            return self
+        every = {name: self.imu_delays.get(name, 0.0) + delay for name, delay in delays.items()}
+        return replace(self, dataset=self.dataset.with_imu_delays(delays), imu_delays={**self.imu_delays, **every})
+
     @property
     def loop_dt(self) -> float:
         """Shortest time between two runs of the drives' loops [s]; 0: one runs continuously."""
-        return _loop_dt(self.plain_cfg, self.control_dt)
+        return loop_dt(self.plain_cfg, self.control_dt)
 
     @property
     def assumes_loop_rate(self) -> bool:
@@ -241,6 +253,16 @@ class Problem:
         if self.coarsest_dt > self.physics_dt:
             nearby = Evaluator(self.with_physics_dt(self.coarsest_dt).make_env, data, self.space, self.trees)
         return Evaluator(self.make_env, data, self.space, self.trees, nearby=nearby)
+
+    @cached_property
+    def base_paths(self) -> list[BasePath | None]:
+        """How the base of each recording went; ``None``: it rests."""
+        if self.dataset.carried is None:
+            return [None] * self.dataset.num_recordings
+        env = self.make_env(1)
+        paths = [base_path(recording, env.sim.model, self.joint_names) for recording in self.dataset.recordings]
+        env.close()
+        return paths
 
     def on_pieces(self, share: float) -> Problem:
         """The same, trained on windows of what the recordings train on, a share of each."""
@@ -426,11 +448,13 @@ def _posed(
     """The problem that logs pose; what they say of bounds, limits and starts is written into the configuration."""
     cfg: PaceSim2realEnvCfg = env.cfg  # type: ignore[assignment]
     sim2real, robot, control_dt = cfg.sim2real, env.scene["robot"], facts.control_dt
-    physics_dt = set_drive_step(cfg, env) if facts.physics_dt is None else facts.physics_dt
     sim2real.slide_joints = robot.slide_joints
     sim2real.links = sought_links(env.sim.model, robot.joint_names, links)
     groups = [conform_all(group, env, control_dt, strict=strict, tell=tell) for group in logs.groups]
     groups = [[on_moving_base(recording, env) for recording in group] for group in groups]
+    if any(recording.base_moves for group in groups for recording in group):
+        sim2real.physics_steps = max(sim2real.physics_steps, physics_steps(control_dt))
+    physics_dt = set_drive_step(cfg, env) if facts.physics_dt is None else facts.physics_dt
     groups = [[without_loops_of_torques(env, recording) for recording in group] for group in groups]
     sim2real.joint_ranges = _ranges(env, groups[0])
     sim2real.joint_efforts = drive_reach(env, groups[0])
@@ -497,11 +521,6 @@ def _posed(
     )
 
 
-def _loop_dt(cfg: PaceSim2realEnvCfg, control_dt: float) -> float:
-    drives = cfg.scene.robot.actuators.values()
-    return min(0.0 if drive.implicit else drive.drive_dt or control_dt for drive in drives)
-
-
 def _assumed_loop(
     facts: Facts, cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], unknown: Sequence[str]
 ) -> float | None:
@@ -512,7 +531,7 @@ def _assumed_loop(
     """
     gains = not cfg.sim2real.assumed_gains or any(r.drive.stiffness is not None for r in recordings)
     assumed = is_model_file(facts.task) and facts.drive_dt is None and (gains or "stiffness" in unknown)
-    return _loop_dt(cfg, facts.control_dt) if assumed else None
+    return loop_dt(cfg, facts.control_dt) if assumed else None
 
 
 def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:

@@ -13,6 +13,7 @@ import torch
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_envs.compiled_drive.robot_kernel import CompiledRobot
 from pace_envs.moving_frame import Course
+from pace_optim.problem.drive_steps import loop_dt
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.dataset import Dataset, Torques, Work
@@ -402,8 +403,9 @@ class Rollout:
             raise ValueError(
                 "The base moves in these recordings, which is simulated on the processor alone: use --device cpu."
             )
+        held = loop_dt(self.env.cfg, self.env.step_dt)  # type: ignore[arg-type]
         return Course(
-            motion=carried.motion(self.env.cfg.decimation, self.env.step_dt),
+            motion=carried.motion(self.env.cfg.decimation, self.env.step_dt, held),
             point=carried.point,
             held=carried.held(),
             shift=torch.zeros(self.env.num_envs, self.robot.num_joints, 2, dtype=self.env.dtype),

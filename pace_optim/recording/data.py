@@ -156,8 +156,8 @@ class Recording:
 
     @property
     def base_moves(self) -> bool:
-        """Whether it says how the base moves."""
-        return self.base_ang_vel is not None and self.base_lin_acc is not None
+        """Whether the base moves, once conformed."""
+        return self.frame is not None and bool(np.ptp(self.frame, axis=0).any())
 
     @property
     def num_samples(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ import torch
 
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
-from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion
+from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion, read_earlier
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
@@ -256,6 +256,16 @@ class Dataset:
             work=None if self.work is None else self.work.on_joints(chosen),
             torques=None,
         )
+
+    def with_imu_delays(self, delays: Mapping[str, float]) -> Dataset:
+        """The same with IMUs that are read later than encoders by so much [s], by the name of whole recordings."""
+        every = tuple(
+            recording
+            if recording.frame is None or not (delay := delays.get(recording.part_of or recording.name, 0.0))
+            else replace(recording, frame=read_earlier(recording.frame, delay, recording.control_dt))
+            for recording in self.recordings
+        )
+        return replace(self, recordings=every, carried=_carried(every, len(self.measured)))
 
     def trained(self) -> list[int]:
         """Indices of the recordings that have samples to train on."""

@@ -87,25 +87,45 @@ class Carried:
             force_std=self.force_std,
         )
 
-    def motion(self, parts: int, control_dt: float) -> torch.Tensor:
+    def motion(self, parts: int, control_dt: float, loop_dt: float = 0.0) -> torch.Tensor:
         """Of the frame in the middle of each physics step, (T, parts, R, 9).
 
         Straight between control steps. The angular acceleration is the slope, so that its noise adds up to that of the
-        gyroscope and no more.
+        gyroscope and no more. The force jumps when drives change their torques, and an accelerometer shows it as it was
+        until then. So what it shows is the mean force of half of the loops' period before.
 
         Args:
             parts: Physics steps in a control step.
             control_dt: [s].
+            loop_dt: Time for which drives hold their torques [s].
         """
-        following = torch.cat([self.base[1:], self.base[-1:]])
+        last, late = len(self.base) - 1, 0.5 * loop_dt / control_dt
         share = (torch.arange(parts, dtype=self.base.dtype) + 0.5) / parts
-        between = torch.lerp(self.base[:, None], following[:, None], share[None, :, None, None])
-        turning = ((following - self.base)[..., :3] / control_dt)[:, None].expand_as(between[..., :3])
-        return torch.cat([between[..., :3], turning, between[..., 3:]], dim=-1).contiguous()
+        following = torch.cat([self.base[1:], self.base[-1:]])
+        turned = torch.lerp(self.base[:, None, :, :3], following[:, None, :, :3], share[None, :, None, None])
+        turning = ((following - self.base)[..., :3] / control_dt)[:, None].expand_as(turned)
+        at = (torch.arange(last + 1)[:, None] + share + late).clamp(max=last)
+        low = at.floor().long().clamp(max=max(0, last - 1))
+        pushed = torch.lerp(
+            self.base[low][..., 3:], self.base[(low + 1).clamp(max=last)][..., 3:], (at - low)[..., None, None]
+        )
+        return torch.cat([turned, turning, pushed], dim=-1).contiguous()
 
     def held(self) -> torch.Tensor:
         """Positions and speeds at which joints are held, (T, R, n, 2); NaN where they are free."""
         return torch.where(self.free[..., None], torch.nan, self.measured).contiguous()
+
+
+def read_earlier(frame: np.ndarray, delay: float, dt: float) -> np.ndarray:
+    """What an IMU shows that is read too late, put where it belongs, (T, 6).
+
+    Args:
+        frame: As logged, (T, 6).
+        delay: How much too late [s].
+        dt: Between samples [s].
+    """
+    at = np.arange(len(frame))
+    return np.stack([np.interp(at + delay / dt, at, column) for column in frame.T], axis=1)
 
 
 def force_noise(force: np.ndarray, dt: float) -> np.ndarray:
@@ -141,6 +161,19 @@ def free_phases(standing: np.ndarray, dt: float) -> np.ndarray:
         last = end - (margin if end < len(standing) else 0)
         if last - first >= shortest:
             result[first:last] = True
+    return result
+
+
+def part_of_phase(free: np.ndarray) -> np.ndarray:
+    """How much of a free phase has passed, 0 to 1; NaN elsewhere, (T,).
+
+    Args:
+        free: (T,) bool.
+    """
+    result = np.full(len(free), np.nan)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(int)))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        result[first:end] = (np.arange(first, end) - first + 0.5) / (end - first)
     return result
 
 

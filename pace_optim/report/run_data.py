@@ -37,6 +37,12 @@ class RecordingData:
     """Simulated less measured, (K, n) [rad]."""
     train: np.ndarray
     """Whether a sample was trained on, (K,) bool."""
+    base: np.ndarray | None = None
+    """Position [m] and quaternion of a base that moves, (K, 7)."""
+    standing: np.ndarray | None = None
+    """Which of its feet touch the ground, (K, feet) bool."""
+    feet: tuple[Mapping[str, Any], ...] = ()
+    """``body`` and ``pos`` [m] of each foot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,6 +166,9 @@ def _recording(content: dict[str, Any]) -> RecordingData:
         measured=measured,
         error=np.asarray(content["sim_dof_pos"]) - measured,
         train=np.asarray(content["train"]).astype(bool),
+        base=None if "base" not in content else np.asarray(content["base"]),
+        standing=None if "base" not in content else np.asarray(content["standing"]).astype(bool),
+        feet=tuple(content.get("feet", ())),
     )
 
 

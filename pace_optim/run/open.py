@@ -105,8 +105,9 @@ class Run:
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
         path = self.folder / "result.json"
-        if problem.torque_noise and path.is_file():
-            problem = problem.with_torque_noise(FitResult.load(path).torque_noise)
+        if path.is_file():
+            result = FitResult.load(path)
+            problem = problem.with_torque_noise(result.torque_noise).with_imu_delays(result.imu_delays)
         if data:  # other recordings have other bounds; the run's values must be within
             problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)

@@ -67,6 +67,8 @@ class FitResult(DriveResult):
     """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]."""
     torque_noise: dict[str, float] = field(default_factory=dict)
     """Standard deviation of the noise that they are weighed by, by joint [N m]; empty: it follows none."""
+    imu_delays: dict[str, float] = field(default_factory=dict)
+    """How much later than encoders the IMU of a base that moves is read, by recording [s]: the fit reads it earlier."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
@@ -285,6 +287,7 @@ def make_result(
             "validation": torque_rmse(residuals, data.torques, validation, problem.joint_names),
         },
         torque_noise=problem.torque_noise,
+        imu_delays=dict(problem.imu_delays),
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
         findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),

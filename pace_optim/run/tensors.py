@@ -60,6 +60,17 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
         flags = entry[name] if name == "train" else entry.get(name, entry["train"])
         if not (isinstance(flags, torch.Tensor) and flags.dtype == torch.bool and flags.shape == time.shape):
             refuse(where, f"{name} is no series of true and false of shape {tuple(time.shape)}", _ANEW)
+    if "base" in entry:
+        _dict(entry, where, ("standing", "feet"))
+        feet, standing = entry["feet"], entry["standing"]
+        if not (
+            isinstance(feet, list) and all(isinstance(foot, dict) and {"body", "pos"} <= set(foot) for foot in feet)
+        ):
+            refuse(where, "feet is no list of bodies and places", _ANEW)
+        if not _is_series(entry["base"], 2) or tuple(entry["base"].shape) != (len(time), 7):
+            refuse(where, f"base is no series of finite numbers of shape {(len(time), 7)}", _ANEW)
+        if not (isinstance(standing, torch.Tensor) and tuple(standing.shape) == (len(time), len(feet))):
+            refuse(where, f"standing is no series of shape {(len(time), len(feet))}", _ANEW)
 
 
 def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:

@@ -57,11 +57,13 @@ def judge(
         cfg: What is asked.
     """
     ratio = math.sqrt(float(before.mse[joint]) / max(float(after.mse[joint]), 1e-300))
-    logs = (before.square[:, joint].clamp(min=1e-30) / after.square[:, joint].clamp(min=1e-30)).log()
+    known = ~before.square[:, joint].isnan()
+    old, new = before.square[known, joint], after.square[known, joint]
+    logs = (old.clamp(min=1e-30) / new.clamp(min=1e-30)).log()
     count = len(logs)
     if count < cfg.fewest:
         return Judgement(ratio=ratio, t=0.0, significant=False)
-    falls = (before.square[:, joint] - after.square[:, joint]) / before.mse[joint]
+    falls = (old - new) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
     threshold = float(stats.t.isf(cfg.level / (2 * max(1, tried)), count - 1))

@@ -14,10 +14,13 @@ from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_unc
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, Step
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
+from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
 _MOST_LOOKS, _MOST_STEPS = 3, 10
 """After the first look, and with the derivatives of one."""
+_LATE = 1e-4
+"""Standard deviation of the time from a row of a walk's log to the forces that act on its joints [s]."""
 _INITIAL_STEP = 1e-5
 """Change of the first position for its derivative [rad]; more where the simulation's own noise is more than that."""
 
@@ -113,7 +116,8 @@ def _assessment(
     """Error bars from derivatives at x or near it."""
     middle = None
     if training.phases is not None and there.residuals.weight is not None:
-        middle = _middle_of_swings(there, training.phases, training.dataset.train)
+        late = _late_forces(there, training, problem.space, x)
+        middle = _middle_of_swings(there, training.phases, training.dataset.train) + np.outer(late, late)
     uncertainty = estimate_uncertainty(there, problem.space, x, initial.derivatives, initial.joints, held, middle)
     physical = problem.space.to_physical(x)
     evaluator.look_at_phases(physical, anew=True)
@@ -166,6 +170,35 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
         larger = max(1.0, float(error.square().sum() / spread.diagonal().sum()))
         total[np.ix_(entries, entries)] += larger * (own @ spread @ own.T).numpy()
     return total
+
+
+def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace, x: torch.Tensor) -> np.ndarray:
+    """Jᵀc, (size,), with c how residuals change if forces act later than a walk's rows say, by :data:`_LATE`.
+
+    A joint that feels kp (q* - q) - (kd + d) q̇ of a time τ ago moves, to first order, as one with the parameters
+
+        d - kp τ        a - (kd + d) τ        delay + τ
+
+    of which no log shows τ. A simulator whose step h is semi-implicit logs positions that are h / 2 ahead.
+
+    Args:
+        jacobian: On the training samples.
+        evaluator: Simulates these recordings.
+        space: The parameters.
+        x: Normalised, (size,).
+    """
+    rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
+    change, viscous = torch.zeros_like(jacobian.residuals.error[0]), space["viscous_friction"]
+    for r in range(jacobian.residuals.num_recordings):
+        kp, kd = torch.zeros(2, rollout.robot.num_joints, dtype=torch.float64)
+        for drive in rollout.robot.actuators.values():
+            kp[drive.joint_indices], kd[drive.joint_indices] = drive.stiffness[r].double(), drive.damping[r].double()
+        move = torch.zeros(space.size, dtype=torch.float64)
+        move[viscous], move[space["armature"]] = -kp * _LATE, -(kd + physical[viscous]) * _LATE
+        move[space["delay"]] = _LATE / rollout.env.step_dt
+        columns = jacobian.residuals.columns_of(r)
+        change[:, columns] = jacobian.times(torch.where(slope > 0, move / slope, 0.0))[:, columns]
+    return (jacobian.transposed_times(change) * jacobian.residuals.where.sum()).numpy()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -243,8 +276,16 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
         if residuals.weight is not None:
             error = error / residuals.weight[at, r].clamp(min=1.0)
         on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
+        path, base = problem.base_paths[r], {}
+        if path is not None:
+            base = {
+                "base": torch.as_tensor(path.pose)[: len(measured)],
+                "standing": torch.as_tensor(path.standing)[: len(measured)],
+                "feet": [{"body": body, "pos": place} for body, place in path.feet],
+            }
         result.append(
-            {
+            base
+            | {
                 "name": recording.name,
                 "time": torch.as_tensor(recording.time)[: len(measured)],
                 "des_dof_pos": torch.as_tensor(recording.sampled_command)[: len(measured)],

@@ -8,8 +8,8 @@ does. Changes add up: two joints may both be reversed.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,8 @@ class Finding:
     text: str
     stops: bool
     """Whether no fit of the log can be right."""
+    imu_delays: Mapping[str, float] = field(default_factory=dict)
+    """How much later than the encoders IMUs are read [s], by recording."""
 
     @property
     def sentence(self) -> str:
@@ -445,10 +447,10 @@ def _of_base(view: View, evidence: Evidence) -> list[Finding]:
         change = Change(
             joints=tuple(evidence.balance),
             view=found[0],
-            text=f"the IMU is {1e3 * found[1]:.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
-            "Correct its time stamps.",
+            text=f"the IMU is {1e3 * abs(found[1]):.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
+            "It is shifted by that for the fit. Correct its time stamps.",
         )
-        result.append(_finding(_LATE_IMU, change))
+        result.append(replace(_finding(_LATE_IMU, change), imu_delays={view.name: found[1]}))
     for joints, text in stuck_contacts(view, lambda: evidence.doubted):
         result.append(_finding(_CONTACTS, Change(joints=tuple(joints), view=view, text=text)))
     return result
@@ -671,11 +673,18 @@ def check_log(problem: Problem) -> list[Finding]:
     for view in views:
         for finding in explained(view):
             merged.setdefault((finding.check, finding.joints), []).append(finding)
-    return [replace(each[0], recordings=tuple(f.recordings[0] for f in each)) for each in merged.values()]
+    return [
+        replace(
+            each[0],
+            recordings=tuple(f.recordings[0] for f in each),
+            imu_delays={name: delay for f in each for name, delay in f.imu_delays.items()},
+        )
+        for each in merged.values()
+    ]
 
 
 def checked(problem: Problem, trust: bool = False) -> Problem:
-    """The problem with what is wrong with its log among its contradictions.
+    """The problem with what is wrong with its log among its contradictions, and with IMUs that are late in time.
 
     Args:
         problem: What is to be fitted.
@@ -687,4 +696,15 @@ def checked(problem: Problem, trust: bool = False) -> Problem:
     found = check_log(problem)
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:
         raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
-    return replace(problem, contradictions=(*problem.contradictions, *(f"{each.sentence} [W3]" for each in found)))
+    said = tuple(f"{each.sentence} [W3]" for each in found)
+    problem = problem.with_imu_delays(_delays_of_whole(problem, found))
+    return replace(problem, contradictions=(*problem.contradictions, *said))
+
+
+def _delays_of_whole(problem: Problem, found: Iterable[Finding]) -> dict[str, float]:
+    """How late IMUs are, by whole recording: the median of those of its parts, if more than half of them show one."""
+    shown = {name: delay for each in found for name, delay in each.imu_delays.items()}
+    parts: dict[str, list[float]] = {}
+    for recording in problem.dataset.recordings:
+        parts.setdefault(recording.part_of or recording.name, []).append(shown.get(recording.name, 0.0))
+    return {name: delay for name, delays in parts.items() if (delay := float(np.median(delays)))}

@@ -16,14 +16,15 @@ class BlockErrors:
     """Mean square errors of n joints in B blocks of validation, of one second where there are enough."""
 
     square: torch.Tensor
-    """(B, n) [rad²]."""
+    """(B, n) [rad²]; not a number where a joint has fewer blocks."""
     weight: torch.Tensor
     """Samples of each block, (B,)."""
 
     @property
     def mse(self) -> torch.Tensor:
         """Of each joint, (n,) [rad²]."""
-        return (self.square * self.weight[:, None]).sum(dim=0) / self.weight.sum()
+        known = ~self.square.isnan()
+        return (self.square.nan_to_num() * self.weight[:, None]).sum(dim=0) / (known * self.weight[:, None]).sum(dim=0)
 
     def on_joints(self, joints: torch.Tensor) -> BlockErrors:
         """Those of some joints, (n,) bool."""
@@ -54,7 +55,7 @@ def block_errors(
         cfg: How long blocks are.
     """
     if weight is not None:
-        return _free_errors(error, where, weight, cfg)
+        return _free_errors(error, where, weight, control_dt, cfg)
     blocks = _blocks(where, control_dt, cfg)
     return BlockErrors(
         square=torch.stack([error[own, r].double().square().mean(dim=0) for r, own in blocks]),
@@ -62,8 +63,13 @@ def block_errors(
     )
 
 
-def _free_errors(error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, cfg: FittingCfg) -> BlockErrors:
-    """Errors of joints that are free at times: the free time of each, in as many blocks; 1 where it has none."""
+def _free_errors(
+    error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
+) -> BlockErrors:
+    """Errors of joints that are free at times: the free time of each, in so many blocks or fewer; 1 where it has none.
+
+    A leg that hardly swings has few blocks: samples of one swing are alike.
+    """
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
     count = cfg.blocks  # for all joints: models are compared block by block
     square = torch.ones(count, len(own), dtype=torch.float64)
@@ -71,7 +77,9 @@ def _free_errors(error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor,
         if len(places):
             r, k = places.T
             errors = (error[k, r, j] / weight[k, r, j]).double().square()
-            square[:, j] = torch.stack([part.mean() for part in errors.tensor_split(count)])
+            own_count = min(count, max(1, int(len(places) * control_dt / cfg.swing_s + 1e-9)))
+            square[:own_count, j] = torch.stack([part.mean() for part in errors.tensor_split(own_count)])
+            square[own_count:, j] = torch.nan
     return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
 
 

@@ -55,7 +55,7 @@ class FittingCfg:
     """Length of a block of held-out samples [s]; shorter where that gives fewer than ``blocks``, ..."""
     shortest_s: float = 0.25
     """but never below this: in less time neighbours are alike."""
-    swing_s: float = 0.1
+    swing_s: float = 0.05
     """The same of the time in which joints of a robot that walks are free: each phase begins anew."""
     blocks: int = 6
     """Blocks wanted."""

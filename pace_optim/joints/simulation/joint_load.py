@@ -68,7 +68,9 @@ class Motion:
     """Where its specific force acts, (R, 3) [m]."""
 
     @classmethod
-    def between(cls, qpos: torch.Tensor, qvel: torch.Tensor, dt: float, carried: Carried | None = None) -> Motion:
+    def between(
+        cls, qpos: torch.Tensor, qvel: torch.Tensor, dt: float, carried: Carried | None = None, loop_dt: float = 0.0
+    ) -> Motion:
         """The motion between control steps, of positions (T, R, nq) and speeds (T, R, nv) at them.
 
         Args:
@@ -76,9 +78,10 @@ class Motion:
             qvel: Speeds.
             dt: Control step [s].
             carried: How the base moves; ``None``: it rests.
+            loop_dt: Time for which drives hold their torques [s].
         """
         middle, speed = 0.5 * (qpos[:-1] + qpos[1:]), 0.5 * (qvel[:-1] + qvel[1:])
-        frame = None if carried is None else carried.motion(1, dt)[: len(middle), 0]
+        frame = None if carried is None else carried.motion(1, dt, loop_dt)[: len(middle), 0]
         point = None if carried is None else carried.point
         return cls(qpos=middle, qvel=speed, qacc=(qvel[1:] - qvel[:-1]) / dt, frame=frame, point=point)
 

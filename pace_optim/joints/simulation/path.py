@@ -232,7 +232,7 @@ def _along(
 ) -> ReferencePath:
     """What each joint feels along a motion of all, (T, R, nq) and (T, R, nv); closes the rollout's environment."""
     carried = problem.dataset.carried
-    motion = Motion.between(positions, speeds, problem.control_dt, carried)
+    motion = Motion.between(positions, speeds, problem.control_dt, carried, problem.loop_dt)
     phases = None
     if carried is not None:
         evaluator = problem.evaluator()

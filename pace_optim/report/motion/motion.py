@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,6 +33,12 @@ class Motion:
     """Measured joint positions, encoder bias taken off, (K, m) [rad or m]."""
     simulated: np.ndarray
     """Simulated joint positions, (K, m) [rad or m]."""
+    base: np.ndarray | None = None
+    """Position [m] and quaternion of a base that moves, (K, 7)."""
+    standing: np.ndarray | None = None
+    """Which of its feet touch the ground, (K, feet) bool."""
+    feet: tuple[Mapping[str, Any], ...] = ()
+    """``body``, by index, and ``pos`` [m] of each foot."""
 
 
 def motions_of(
@@ -77,7 +84,15 @@ def _motion(
         whole = np.tile(home, (len(kept), 1))
         whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] - bias))
         positions.append(_closed(model, columns, whole) if model.neq else whole)
-    return Motion(name=recording.name, time=time[kept], measured=positions[0], simulated=positions[1])
+    return Motion(
+        name=recording.name,
+        time=time[kept],
+        measured=positions[0],
+        simulated=positions[1],
+        base=None if recording.base is None else recording.base[kept],
+        standing=None if recording.standing is None else recording.standing[kept],
+        feet=tuple({**foot, "body": int(model.body(foot["body"]).id)} for foot in recording.feet),
+    )
 
 
 def _columns(model: mujoco.MjModel, joint_names: Sequence[str]) -> np.ndarray:

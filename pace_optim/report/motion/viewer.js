@@ -29,9 +29,11 @@
     return [...columns[0], 0, ...columns[1], 0, ...columns[2], 0, ...pos, 1];
   };
 
+  const WORLD = { pos: [0, 0, 0], quat: [1, 0, 0, 0] };
+
   /** Forward kinematics: every body's pose from the positions of hinge and slide joints (MuJoCo's order of frames). */
-  function poses(scene, at) {
-    const result = [{ pos: [0, 0, 0], quat: [1, 0, 0, 0] }];
+  function poses(scene, at, base) {
+    const result = [base ?? WORLD];
     scene.bodies.forEach((body, b) => {
       if (b === 0) return;
       const parent = result[body.parent];
@@ -148,9 +150,9 @@
       return { ...of, scale, shape: buffer(name, SHAPES[name]) };
     });
 
-    function draw(robot, colourOf) {
-      for (const piece of pieces) {
-        const body = robot[piece.body], quat = multiply(body.quat, piece.quat);
+    function draw(robot, colourOf, shown = pieces) {
+      for (const piece of shown) {
+        const body = piece.body ? robot[piece.body] : WORLD, quat = multiply(body.quat, piece.quat);
         const pos = add(body.pos, rotate(body.quat, piece.pos));
         gl.bindBuffer(gl.ARRAY_BUFFER, piece.shape.vbo);
         gl.vertexAttribPointer(position, 3, gl.FLOAT, false, 24, 0);
@@ -163,7 +165,10 @@
       }
     }
 
-    return (camera, simulated, measured, colourOf) => {
+    const ball = buffer("sphere", SHAPES.sphere), tile = buffer("box", SHAPES.box);
+    const mark = (shape, pos, scale, colour) => draw([], () => colour, [{ body: 0, pos, quat: WORLD.quat, scale, shape }]);
+
+    return (camera, simulated, measured, colourOf, marks = { feet: [], tiles: [] }) => {
       const width = Math.round(canvas.clientWidth * devicePixelRatio), height = Math.round(canvas.clientHeight * devicePixelRatio);
       if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
       gl.viewport(0, 0, width, height);
@@ -173,7 +178,9 @@
       gl.uniformMatrix4fv(uniforms.camera, false, camera(width / Math.max(1, height)));
       gl.disable(gl.BLEND);
       gl.depthMask(true);
+      for (const [pos, size, colour] of marks.tiles) mark(tile, pos, size, colour);
       draw(simulated, colourOf);
+      for (const [pos, size, colour] of marks.feet) mark(ball, pos, [size, size, size], colour);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       gl.depthMask(false);
@@ -184,11 +191,11 @@
 
   /** Looks at the middle of the robot from a distance; drag turns, the wheel comes closer, z points up. */
   function makeCamera(scene) {
-    const view = { azimuth: -0.9, elevation: 0.35, distance: 1.5 * scene.size };
+    const view = { azimuth: -0.9, elevation: 0.35, distance: 1.5 * scene.size, center: scene.center };
     view.matrix = (aspect) => {
       const [ca, sa, ce, se] = [Math.cos(view.azimuth), Math.sin(view.azimuth), Math.cos(view.elevation), Math.sin(view.elevation)];
       const back = [ce * ca, ce * sa, se], right = [-sa, ca, 0], up = [-se * ca, -se * sa, ce];
-      const eye = back.map((x, i) => scene.center[i] + x * view.distance);
+      const eye = back.map((x, i) => view.center[i] + x * view.distance);
       const f = 1 / Math.tan(0.35), near = view.distance / 50, far = view.distance * 20;
       const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
       const rows = [right, up, back].map((axis) => [...axis, -dot(axis, eye)]);
@@ -215,6 +222,7 @@
     const m = scene.joints.length, count = content.recordings.length;
     const recordings = content.recordings.map((recording) => ({
       ...recording, time: decode(recording.time), measured: decode(recording.measured), simulated: decode(recording.simulated),
+      base: recording.base && decode(recording.base), standing: recording.base && decode(recording.standing),
     }));
     const render = makeRenderer(canvas, scene);
     if (!render) {
@@ -226,8 +234,8 @@
     const camera = makeCamera(scene);
     const state = { at: 0, playing: false, last: 0 };
 
-    /** Position of joint j at time t, linear between pictures. */
-    function sample(recording, series, j, t) {
+    /** Column j of a series at time t, linear between pictures; m columns are those of joints. */
+    function sample(recording, series, j, t, columns = m) {
       const time = recording.time;
       let low = 0, high = time.length - 1;
       while (high - low > 1) {
@@ -236,15 +244,41 @@
         else high = middle;
       }
       const share = high === low ? 0 : Math.min(1, Math.max(0, (t - time[low]) / (time[high] - time[low])));
-      return series[low * m + j] * (1 - share) + series[high * m + j] * share;
+      return series[low * columns + j] * (1 - share) + series[high * columns + j] * share;
+    }
+
+    /** Where a base that moves is at time t. */
+    function baseAt(recording, t) {
+      if (!recording.base) return undefined;
+      const row = [0, 1, 2, 3, 4, 5, 6].map((j) => sample(recording, recording.base, j, t, 7)), size = Math.hypot(...row.slice(3));
+      return { pos: row.slice(0, 3), quat: row.slice(3).map((x) => x / size) };
+    }
+    /** Feet, and the ground's tiles around them. */
+    function marksAt(recording, robot, t) {
+      if (!recording.base) return undefined;
+      const radius = 0.03 * scene.size, edge = 0.4 * scene.size, middle = recording.where.pos.map((x) => Math.round(x / edge));
+      const feet = recording.feet.map((foot, f) => [
+        add(robot[foot.body].pos, rotate(robot[foot.body].quat, foot.pos)), radius,
+        sample(recording, recording.standing, f, t, recording.feet.length) > 0.5 ? [0.2, 0.6, 0.3, 1] : [0.95, 0.6, 0.2, 1],
+      ]);
+      const tiles = [];
+      if (feet.length)
+        for (let i = -3; i <= 3; i++)
+          for (let j = -3; j <= 3; j++)
+            if ((i + j + middle[0] + middle[1]) % 2 === 0)
+              tiles.push([[(middle[0] + i) * edge, (middle[1] + j) * edge, -radius - 0.01 * edge], [edge / 2, edge / 2, 0.01 * edge], [0.8, 0.81, 0.83, 1]]);
+      return { feet, tiles };
     }
 
     function draw() {
-      const recording = chosen(), t = state.at, times = Number(find("exaggerate").value);
+      const recording = chosen(), t = state.at, times = Number(find("exaggerate").value), base = baseAt(recording, t);
+      recording.where = base;
+      camera.center = base ? add(base.pos, rotate(base.quat, scene.center)) : scene.center;
       const measured = (j) => sample(recording, recording.measured, j, t);
       const error = (j) => sample(recording, recording.simulated, j, t) - measured(j);
       const share = scene.bodies.map((body) => Math.max(0, ...body.joints.map((j) => Math.abs(error(j)) / content.scale[j])));
-      render(camera.matrix, poses(scene, (j) => measured(j) + times * error(j)), poses(scene, measured), (piece) => [...heat(share[piece.body]), 1]);
+      const ghost = poses(scene, measured, base);
+      render(camera.matrix, poses(scene, (j) => measured(j) + times * error(j), base), ghost, (piece) => [...heat(share[piece.body]), 1], marksAt(recording, ghost, t));
       const worst = scene.joints.map((_, j) => Math.abs(error(j)) / content.scale[j]).reduce((a, x, j, all) => (x > all[a] ? j : a), 0);
       const factor = scene.joints[worst].type === "slide" ? [1e3, "mm"] : [1e3, "mrad"];
       element.querySelector(".replay-note").textContent =
@@ -288,7 +322,7 @@
       draw();
     }, { passive: false });
     new ResizeObserver(draw).observe(canvas);
-    element.replay = { joints: (which, t) => scene.joints.map((_, j) => sample(chosen(), chosen()[which], j, t)), seek: (t) => { state.at = t; draw(); }, poses: (which, t) => poses(scene, (j) => sample(chosen(), chosen()[which], j, t)), state };
+    element.replay = { joints: (which, t) => scene.joints.map((_, j) => sample(chosen(), chosen()[which], j, t)), seek: (t) => { state.at = t; draw(); }, poses: (which, t) => poses(scene, (j) => sample(chosen(), chosen()[which], j, t), baseAt(chosen(), t)), state };
     open();
   }
   for (const element of document.querySelectorAll(".replay")) makeReplay(element);

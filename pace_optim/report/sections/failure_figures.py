@@ -116,7 +116,7 @@ def _where(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
     traces: list[dict[str, Any]] = []
     layout: dict[str, dict[str, Any]] = {}
     for i, name in enumerate(_PANELS):
-        panel = where.get(name)
+        panel = where.get("swing" if name == "time" and "swing" in where else name)
         key = "" if i == 0 else str(i + 1)
         if panel is None:
             traces += [{"x": [], "y": []}] * 2
@@ -131,7 +131,9 @@ def _where(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
         inner = [b for b in range(len(edges)) if edges[b] is not None]
         texts = [_tick(edges[b]) for b in inner]
         layout[f"xaxis{key}"] = {"tickvals": inner, "ticktext": texts, "range": [-0.05, len(at) + 0.05]}
-        layout[f"xaxis{key}"] |= {"title": {"text": f"{panel['title']} [{unit}]", "font": {"size": 12}, "standoff": 4}}
+        layout[f"xaxis{key}"] |= {
+            "title": {"text": panel["title"] + f" [{unit}]" * bool(unit), "font": {"size": 12}, "standoff": 4}
+        }
     return {"text": joint["sentence"] + " (Over all recordings.)" * (len(joint["recordings"]) > 1)} | {
         "traces": traces,
         "layout": layout,

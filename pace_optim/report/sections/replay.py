@@ -19,6 +19,10 @@ _RECORDINGS_ON_PAGE = 8
 """Those with the largest errors; each takes some 8 bytes a joint and picture."""
 _SPEEDS = (("real time", 1.0), ("1/4", 0.25), ("1/10", 0.1), ("1/50", 0.02))
 _EXAGGERATIONS = (1, 5, 20, 100)
+_OF_BASE = (
+    " The base moves as its IMU and the feet that stand show. A green foot stands, and its leg is not simulated. An "
+    "orange foot swings."
+)
 
 
 def replay(run: RunData) -> Section | None:
@@ -33,7 +37,8 @@ def replay(run: RunData) -> Section | None:
     return Section(
         id="replay",
         title="Replay",
-        lead="Blue: measured. Solid: simulated, coloured by its error. Drag to turn, wheel to come closer.",
+        lead="Blue: measured. Solid: simulated, coloured by its error. Drag to turn, wheel to come closer."
+        + (_OF_BASE if any(motion.base is not None for motion in motions) else ""),
         html=viewer(model, motions, None if run.model_file is None else looks_of(run.model_file)),
     )
 
@@ -70,7 +75,11 @@ def _scale(motions: Sequence[Motion]) -> list[float]:
 
 
 def _encode(motion: Motion) -> dict[str, Any]:
-    return {
+    base: dict[str, Any] = {}
+    if motion.base is not None and motion.standing is not None:
+        standing = motion.standing.astype(float)
+        base = {"base": _base64(motion.base), "standing": _base64(standing), "feet": list(motion.feet)}
+    return base | {
         "name": motion.name,
         "time": _base64(motion.time),
         "measured": _base64(motion.measured),

@@ -1,5 +1,7 @@
 """Where an error sits is found on data whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problems import BENCH, env_cfg, make_problem, record
@@ -52,6 +54,17 @@ def reversal_error(position=CHIRP, lasting=0.05):
     """2 mrad for 50 ms after each turn, in the new direction."""
     motion = motion_of(position, DT, 0.0)
     return np.where(motion.since_reversal < lasting, 2e-3 * motion.direction, 0.0)
+
+
+def test_of_a_leg_that_walks_only_swings_count_and_the_error_is_laid_out_over_them():
+    swing = np.where(TIME % 1 < 0.2, (TIME % 1) / 0.2, np.nan)
+    late = track(np.where(swing > 0.5, 2e-3, 0.0))
+    late = replace(late, error=np.where(np.isnan(swing), 0.0, late.error[:, 0])[:, None], swing=swing[:, None])
+    content = compare_joint("hip", 0, [late]).content
+    assert content["rmse"]["train"] == pytest.approx(2e-3 / np.sqrt(2), rel=0.01)
+    assert content["where"]["swing"]["time"] == pytest.approx([0.25] * 4, abs=0.01)
+    assert content["where"]["swing"]["error"] == pytest.approx([0, 0, 0.5, 0.5], abs=0.01)
+    assert any("in the last 50 % of each swing" in place["sentence"] for place in content["places"])
 
 
 # ---------------------------------------------------------------- noise

@@ -147,6 +147,16 @@ def test_blocks_of_short_recordings_are_shorter(seconds, count, weight):
     assert blocks.weight.tolist() == [weight] * count
 
 
+def test_a_leg_that_hardly_swings_has_too_few_blocks_to_judge_by():
+    where, weight = torch.ones(2000, 1, dtype=torch.bool), torch.zeros(2000, 1, 2)
+    weight[100:340, 0, 0] = weight[100:144, 0, 1] = 2.0  # 0.6 s, and one swing of 0.11 s
+    before, after = (block_errors(torch.full((2000, 1, 2), e), where, 0.0025, weight=weight) for e in (2e-2, 2e-3))
+    assert before.square[:, 0] == pytest.approx(torch.full((6,), 1e-4).double())
+    assert before.square[:, 1].isnan().tolist() == [False] * 2 + [True] * 4
+    assert before.mse == pytest.approx(torch.full((2,), 1e-4).double())
+    assert [judge(before, after, joint, 29, True).significant for joint in (0, 1)] == [True, False]
+
+
 def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
     where = torch.zeros(400, 2, dtype=torch.bool)
     where[:200, 0] = where[100:300:2, 1] = True

@@ -11,11 +11,14 @@ from walking import DT, crawler, walking_problem, write_log
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.compiler import host
 from pace_optim.estimate.derivatives import colour, stencil
+from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
+from pace_optim.problem.base_path import base_path
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import imu_pose, joints_of_feet
+from pace_optim.problem.problem import load_problem
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.dataset import make_dataset
-from pace_optim.recording.moving_base import Carried, force_noise, free_phases
+from pace_optim.recording.moving_base import Carried, force_noise, free_phases, part_of_phase
 from pace_optim.recording.parts import informative_parts
 
 
@@ -39,18 +42,29 @@ def steps_of(problem, x):
     hessian, gradient = around.jacobian(residuals).normal_equations()
     scale = hessian.diagonal().clamp(min=1e-30).sqrt()
     whole = torch.linalg.pinv(hessian / scale[:, None] / scale, rtol=1e-7, hermitian=True)
-    return space.to_physical(x - whole @ (gradient / scale) / scale), residuals
+    jacobian = around.jacobian(residuals)
+    return space.to_physical(x - whole @ (gradient / scale) / scale), residuals, jacobian
 
 
 def test_swinging_legs_have_the_truth_at_the_bottom_of_their_error(walk):
     problem, truth = walk
-    found, residuals = steps_of(problem, problem.space.to_normalised(truth))
+    found, residuals, jacobian = steps_of(problem, problem.space.to_normalised(truth))
     assert float(residuals.joint_score[0].sqrt().max()) < 2e-4  # of 1e-4 of noise
     for name, within in (("armature", 0.03), ("viscous_friction", 0.05)):
         own = problem.space[name]
         error = (found[own] / truth[own] - 1).abs()
         assert float(error.max()) < 2 * within and float(error.median()) < within, name
     assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 1e-3
+    # error bars know of forces that act later than the rows say: d - kp τ, a - (kd + d) τ, delay + τ
+    space, x = problem.space, problem.space.to_normalised(truth)
+    late = torch.as_tensor(_late_forces(jacobian, problem.training_evaluator(), space, x))
+    hessian = jacobian.normal_equations()[0] * residuals.where.sum()
+    move = torch.linalg.pinv(hessian, rtol=1e-13, hermitian=True) @ late * space.slope(x)
+    assert move[space["viscous_friction"]] == pytest.approx(-40 * _LATE, rel=0.02)
+    assert move[space["armature"]] == pytest.approx(
+        (-(0.5 + truth[space["viscous_friction"]]) * _LATE).numpy(), rel=0.1
+    )
+    assert float(move[space["delay"]]) == pytest.approx(_LATE / DT, rel=0.02)
 
 
 def test_without_the_motion_of_the_base_the_error_is_many_times_the_noise(walk):
@@ -164,6 +178,12 @@ def test_chatter_is_no_swing_and_a_swing_keeps_a_margin():
     assert np.flatnonzero(free).tolist() == list(range(112, 196))
     standing[150] = True  # one sample of contact cuts it
     assert not free_phases(standing, DT)[146:163].any()
+    part = part_of_phase(free)
+    assert (
+        part[112] == pytest.approx(0.5 / 84)
+        and part[195] == pytest.approx(83.5 / 84)
+        and np.isnan(part[[111, 196]]).all()
+    )
 
 
 def test_what_happens_between_samples_is_noise_of_the_accelerometer():
@@ -186,6 +206,9 @@ def test_the_frame_turns_by_the_slope_of_the_gyroscope():
     motion = carried.motion(2, 0.5)
     assert motion[0, :, 0, 0].tolist() == [0.25, 0.75] and motion[0, :, 0, 3].tolist() == [2.0, 2.0]
     assert motion[0, :, 0, 8].tolist() == [9.25, 9.75] and motion[2, :, 0, 3].tolist() == [0.0, 0.0]
+    # drives that hold their torques for a control step: the force of a sample is that of the step before it
+    held = carried.motion(2, 0.5, 0.5)
+    assert held[0, :, 0, 8].tolist() == [9.75, 10.25] and held[..., :6].equal(motion[..., :6])
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +249,41 @@ def test_of_minutes_of_walking_the_parts_that_swing_most_are_used():
     assert [part.name for part in parts] == ["leg 10 to 15 s", "leg 25 to 30 s"]
     assert "10 s that move the joints most are used (25 %)" in parts[0].notes[-1]
     assert parts[0].free.all() and len(parts[0].frame) == len(parts[0].command) == 2000
+
+
+def test_a_base_turns_with_its_gyroscope_and_goes_where_its_feet_push_it(env):
+    steps, joints = 400, env.scene["robot"].joint_names
+    lean = np.linspace(0, 0.3, steps)
+    walk = recording(
+        DT * np.arange(steps),
+        joint_names=joints,
+        dof_pos=np.stack([lean if joint.endswith("hip") else 0 * lean for joint in joints], axis=1),
+        contact=np.ones((steps, 4), dtype=bool),
+        feet=("fl", "fr", "rl", "rr"),
+        frame=np.stack([0 * lean, 0 * lean, 1.0 + 1e-9 * lean, 0 * lean, 0 * lean, 9.81 + 0 * lean], axis=1),
+        frame_point=np.zeros(3),
+    )
+    path = base_path(walk, env.sim.model, joints)
+    assert path.feet[0] == ("fl_shank", pytest.approx([0, 0, -0.16]))
+    assert 2 * np.arctan2(path.pose[:, 6], path.pose[:, 3]) == pytest.approx(DT * np.arange(steps), abs=1e-6)
+    straight = base_path(replace(walk, frame=walk.frame * [1, 1, 1e-9, 1, 1, 1]), env.sim.model, joints)
+    assert straight.pose[-1, 0] == pytest.approx(0.32 * np.sin(0.3), abs=1e-6)  # legs of 0.32 m lean back
+    assert np.ptp(straight.pose[:, 2]) == pytest.approx(0.32 * (1 - np.cos(0.3)), abs=1e-6)
+    assert base_path(replace(walk, frame=walk.frame[:1].repeat(steps, axis=0)), env.sim.model, joints) is None
+
+
+def test_a_registered_robot_that_walks_is_simulated_with_finer_steps(tmp_path):
+    steps = 200
+    names = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
+    position = np.tile([0.0, 0.8, -1.5], (steps, 4)) + 0.1 * np.sin(np.arange(steps) / 20)[:, None]
+    fields = {"time": DT * np.arange(steps), "dof_pos": position, "des_dof_pos": position, "joint_names": names}
+    used = []
+    for shake in (0.0, 1.0):
+        base = {"base_ang_vel": shake * position[:, :3], "base_lin_acc": np.tile([0, 0, 9.81], (steps, 1))}
+        np.savez(tmp_path / "walk.npz", **fields, **base)
+        problem = load_problem("Pace-Go2-v0", data=[tmp_path / "walk.npz"], tell=lambda _: None)
+        used.append((problem.physics_dt, problem.env_cfg.sim.integrator))
+    assert used == [(DT, "implicitfast"), (DT / 4, "leapfrog")]
 
 
 def test_a_leg_that_stands_throughout_is_named(tmp_path):

@@ -8,13 +8,18 @@ from recordings import says
 from walking import DT, walking_problem
 
 from pace_optim.identification.log_checks.balance import views_of
-from pace_optim.identification.log_checks.checks import explained
+from pace_optim.identification.log_checks.checks import checked, explained
 
 
 @pytest.fixture(scope="module")
-def view(tmp_path_factory):
-    """A trot, as the balance of torques sees it."""
-    problem, _ = walking_problem(tmp_path_factory.mktemp("walk"), duration=1.5)
+def problem(tmp_path_factory):
+    """A trot."""
+    return walking_problem(tmp_path_factory.mktemp("walk"), duration=1.5)[0]
+
+
+@pytest.fixture(scope="module")
+def view(problem):
+    """The same, as the balance of torques sees it."""
     return views_of(problem)[0]
 
 
@@ -45,6 +50,16 @@ def test_an_imu_that_is_late_is_found_with_its_delay(view):
     found = explained(replace(view, frame=frame))
     assert [each.check for each in found] == ["IMU delay"] and not found[0].stops
     assert float(found[0].text.split(" ms")[0].split()[-1]) == pytest.approx(1e3 * DT * steps, abs=1.0)
+
+
+def test_an_imu_that_is_late_is_shifted_for_the_fit(problem):
+    late = replace(problem.with_imu_delays({"walk": -3 * DT}), imu_delays={})
+    found = checked(late)
+    assert found.imu_delays["walk"] == pytest.approx(3 * DT, abs=1e-3)
+    assert "[W3]" in found.contradictions[-1] and "shifted" in found.contradictions[-1]
+    off = [float((each.dataset.carried.base - problem.dataset.carried.base).square().mean()) for each in (late, found)]
+    assert off[1] < 0.3 * off[0]
+    assert checked(problem).imu_delays == {}
 
 
 def test_a_contact_that_sticks_is_found(view):

@@ -3,8 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
 from browser import CHROMIUM, Browser
 
+from pace_actuators.files import write_tensors
 from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
 from pace_optim.report import write_report
@@ -12,7 +14,7 @@ from pace_optim.report.motion import looks_of, motions_of, scene_of
 from pace_optim.report.motion.window import add_ghost
 from pace_optim.report.run_data import RecordingData
 
-from run_folders import JOINTS, write_run  # isort: skip
+from run_folders import JOINTS, make_trajectory, write_run  # isort: skip
 
 LEG = """
 <mujoco>
@@ -33,6 +35,8 @@ LEG = """
   </worldbody>
 </mujoco>
 """
+BASE = (0.3, -0.2, 0.1, 0.6, 0.0, 0.8, 0.0)
+"""Where the base is: position [m] and quaternion."""
 FOUR_BAR = """
 <mujoco>
   <worldbody>
@@ -66,6 +70,15 @@ def page(tmp_path_factory):
         pytest.skip("there is no Chromium here: apt-get install chromium")
     folder = write_run(tmp_path_factory.mktemp("logs") / "leg" / "26_01_01_00-00-00")
     mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(LEG), str(folder / "model.mjb"), None)
+    content = make_trajectory()
+    for entry in content["recordings"]:
+        count = len(entry["time"])
+        entry |= {
+            "base": torch.tensor(BASE, dtype=torch.float64).repeat(count, 1),
+            "standing": torch.ones(count, 1, dtype=torch.bool),
+            "feet": [{"body": "foot", "pos": [0.0, 0.0, -0.1]}],
+        }
+    write_tensors(folder / "best_trajectory.pt", content)
     browser = Browser(tmp_path_factory.mktemp("profile"))
     try:
         browser.open(write_report(folder), ready="document.documentElement?.dataset.drawn === 'true'")
@@ -93,8 +106,12 @@ def test_bodies_stand_in_the_browser_where_mujoco_puts_them(page, which):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         poses = np.array(poses)
-        assert poses[:, :3] == pytest.approx(data.xpos, abs=1e-5)
-        same_turn = np.abs((poses[:, 3:] * data.xquat).sum(axis=1))  # q and -q are one rotation
+        place, turned = np.empty((model.nbody, 3)), np.empty((model.nbody, 4))
+        for b in range(model.nbody):
+            mujoco.mju_rotVecQuat(place[b], data.xpos[b], np.array(BASE[3:]))
+            mujoco.mju_mulQuat(turned[b], np.array(BASE[3:]), data.xquat[b])
+        assert poses[:, :3] == pytest.approx(place + BASE[:3], abs=1e-5)
+        same_turn = np.abs((poses[:, 3:] * turned).sum(axis=1))  # q and -q are one rotation
         assert same_turn == pytest.approx(1.0, abs=1e-5)
 
 
