@@ -250,8 +250,8 @@ class TorqueSpeedLimit(Effect):
 
     |τ| <= max(0, τ_stall (1 - |v|/v_0)) where τ v >= 0.
 
-    Where a joint turns within a step, it brakes until then and drives from then on. A step whose torque were that of its
-    beginning would brake too long, always to the same side.
+    Where a joint turns within a step, it brakes until then and drives from then on, and the mean acts. With the torque
+    of the step's beginning it would brake too long, always to the same side. The speed goes on as in the last step.
     """
 
     name = "torque_speed_limit"

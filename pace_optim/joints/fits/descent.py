@@ -115,6 +115,11 @@ class JointDescent:
             for j in moved.nonzero()[:, 0].tolist():
                 self._error[..., j] = error[choice[int(best[j])], ..., j]
 
+    @property
+    def leads(self) -> bool:
+        """Whether the last chord step has led a joint further."""
+        return bool(self._led.any())
+
     def chord(self) -> torch.Tensor:
         """Where the derivatives that were kept lead from x, (1, n, P); joints that they led no further stay."""
         if self._jacobian is None or self._error is None:

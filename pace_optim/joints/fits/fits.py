@@ -219,6 +219,8 @@ class Fits:
         if chords:
             batch = self.batch(problem, [Slot(model=way.model, rows=1) for way in ways], training=True)
         for _ in range(chords):
+            if not any(way.leads for way in ways):
+                break
             rows = [way.chord() for way in ways]
             physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
             errors = batch.split(batch.simulate(physical, where, cfg.stride))
