@@ -77,10 +77,9 @@ class VerdictCfg:
     than this part of what effects leave, and an effect dominates above this share."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
-    uneven: float = 0.17
+    uneven: float = 0.15
     """and a size for each recording would explain no more than this part of what is left. Measured: up to 0.08 for the
-    evenest effect among many others as large together, up to 0.151 for a backlash whose errors are rough, 0.18 to 0.93
-    for proxies."""
+    evenest effect among many others as large together, 0.18 to 0.36 for proxies."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
 

@@ -42,11 +42,11 @@ class Evidence:
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
-    An effect is named where it explains most of what lies above the floor without it. Its size must be the same in
-    every recording and typical of drives: a proxy may lead near the floor too. Where it does not lead near the floor,
-    its size must also be several error bars from zero and away from its bounds. Beside a larger effect it counts only
-    on what that leaves far from the floor. For effects beside a larger one, also on other joints of its tree, take up
-    what the model of the larger one gets wrong.
+    An effect is named where it explains most of what lies above the floor without it, and has a size that is typical of
+    drives. Where it does not lead near the floor, its size must also be several error bars from zero, the same in every
+    recording, and away from its bounds. Beside a larger effect it counts only on what that leaves far from the floor.
+    For effects beside a larger one, also on other joints of its tree, take up what the model of the larger one gets
+    wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:
@@ -56,7 +56,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     far = evidence.left + evidence.harm > near
     return [
         *(["its size is not significant"] if far and evidence.bars < cfg.verdict.bars else []),
-        *(["its size differs between recordings"] if evidence.uneven > cfg.verdict.uneven else []),
+        *(["its size differs between recordings"] if far and evidence.uneven > cfg.verdict.uneven else []),
         *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),
     ]

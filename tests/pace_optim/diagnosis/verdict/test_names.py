@@ -58,8 +58,8 @@ SURE = Evidence(
         ({"uneven": 0.2}, ["its size differs between recordings"]),
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),
-        ({"left": 8.0, "bars": 0.0, "at_bound": True}, []),  # as far as physics allows
-        ({"left": 4.0, "uneven": 0.9}, ["its size differs between recordings"]),  # a proxy near the floor
+        ({"left": 8.0, "bars": 0.0, "uneven": 1.0, "at_bound": True}, []),  # it explains everything
+        ({"left": 4.0, "implausible": True}, ["no drive has such a value"]),  # a proxy near the floor
         ({"left": 8.0, "harm": 2.0, "at_bound": True}, ["it is at a bound"]),
         ({"without": 8.0, "left": 1.0}, []),  # the first one of a joint
         ({"without": 8.0, "left": 1.0, "slight": True}, ["the error is near the floor without it"]),
