@@ -286,7 +286,7 @@ def _told(found: Findings, problem: Problem, fits: Fits, case: Case) -> dict[str
         "after": 1e3 * float(outcome.final_errors.mse.mean().sqrt()),
         "floor": 1e3 * float(found.data.floor.square().mean().sqrt()),
         "summary": summary_of(found, problem),
-        "sizes": sizes(fits, outcome, problem.joint_names),
+        "sizes": sizes(fits, outcome, found.data.floor, problem.joint_names),
     }
 
 

@@ -161,7 +161,8 @@ def run_case(job: Job) -> dict[str, Any]:
         "shares": {effect.name: share for effect, share in found.shares.items()},
         "ranking": ranking(outcome, problem.joint_names, found.verdict, list(found.shares)),
         "sizes": [
-            {**size, "true": _true(truth["effects"], size)} for size in sizes(fits, outcome, problem.joint_names)
+            {**size, "true": _true(truth["effects"], size)}
+            for size in sizes(fits, outcome, found.data.floor, problem.joint_names)
         ],
         "alone": alone,
         "rmse": {"before": _rms(outcome.base_errors), "after": _rms(outcome.final_errors), "truth": with_truth},

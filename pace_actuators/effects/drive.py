@@ -249,10 +249,15 @@ class TorqueSpeedLimit(Effect):
     """The torque falls with the speed where the motor drives; braking is not limited.
 
     |τ| <= max(0, τ_stall (1 - |v|/v_0)) where τ v >= 0.
+
+    Where a joint turns within a step, it brakes until then and drives from then on, and the mean acts. With the torque
+    of the step's beginning it would brake too long, always to the same side. The speed goes on as in the last step.
     """
 
     name = "torque_speed_limit"
     stage = "drive"
+    memory: ClassVar[Mapping[str, float]] = {"_speed": 0.0}
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="velocity", unit="rad/s", lower=0.5, upper=60.0, null=_INFINITE, start=8.0, scale="log", meaning="v_0"
@@ -286,8 +291,15 @@ class TorqueSpeedLimit(Effect):
 
     def torque_speed(self, s: DriveState) -> None:
         """Clip by quadrant."""
+        new = self.take_new_rows()
+        last = self._speed if new is None else torch.where(new, s.motor_vel, self._speed)
+        left, change = s.motor_vel * s.effort.sign(), (s.motor_vel - last) * s.effort.sign()
         fall = self._stall / self.velocity
-        most = (self._stall - fall * s.motor_vel.abs()).clamp_(min=0.0)
-        limited = self._on & (s.effort * s.motor_vel >= 0) & (s.effort.abs() > most)
+        most = (self._stall - fall * left.abs()).clamp_(min=0.0)
+        limited = self._on & (left >= 0) & (s.effort.abs() > most)
+        turns = self._on & (left < 0) & (left + change > 0) & (s.effort.abs() > self._stall)
+        braking = torch.where(turns, -left / torch.where(turns, change, 1.0), 1.0)
         s.speed_slope = torch.where(limited & (most > 0), fall, s.speed_slope)
-        s.effort = torch.where(limited, torch.copysign(most, s.effort), s.effort)
+        mean = torch.lerp(torch.copysign(self._stall, s.effort), s.effort, braking)
+        s.effort = torch.where(limited, torch.copysign(most, s.effort), torch.where(turns, mean, s.effort))
+        self._speed = s.motor_vel.clone()

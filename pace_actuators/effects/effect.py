@@ -165,8 +165,6 @@ class Effect:
     missing."""
     free_form: ClassVar[bool] = False
     """Whether it is a curve of any form: it says what is missing and not why, and no diagnosis looks for it."""
-    special_case_of: ClassVar[str] = ""
-    """A more general effect that can be it: a diagnosis looks for that one."""
     twins: ClassVar[tuple[str, ...]] = ()
     """Effects that act alike by construction with one load, one gain and no absolute reference."""
     needs_loads: ClassVar[bool] = False

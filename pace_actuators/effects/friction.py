@@ -58,7 +58,6 @@ class DynamicFriction(Effect):
     source = "Bjelonic et al., PACE 0.2.0: dynamic friction as a ratio of static friction"
     probes = ({"ratio": 0.8},)
     two_sided = False
-    special_case_of = "stribeck_friction"
     twins = ("stribeck_friction",)
     separates = "a slow triangle"
     ratio: torch.Tensor

@@ -75,9 +75,6 @@ class VerdictCfg:
     most: float = 0.5
     """An effect must explain this part of what lies above the floor without it. A curve says more where it leaves less
     than this part of what effects leave, and an effect dominates above this share."""
-    least: float = 0.01
-    """An effect that does not lead near the floor must explain this part of what a larger one explains on joints of
-    its tree: a tenth of its error may be an error of that joint's model."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15

@@ -78,7 +78,7 @@ def search_effects(
     absorbed = absorbed_effects(fits, coarse, base, candidates, effort, cfg.candidates)
     n, recordings = base.model.num_joints, problem.dataset.recordings
     excluded, why = excluded_effects(recordings, candidates, measured, n)
-    base = replace(base, model=replace(base.model, barred=absorbed | excluded))
+    base = replace(base, model=replace(base.model, barred=excluded))
 
     # one effect after another, as long as they pay on held-out recordings
     enough = cfg.judging.alike * data.floor
@@ -110,7 +110,7 @@ def search_effects(
     return Findings(
         outcome=outcome,
         data=replace(data, sentences=[*data.sentences, *late, *why]),
-        absorbed=absorbed,
+        absorbed={effect: joints for effect, joints in absorbed.items() if effect not in shares},
         verdict=decision,
         explained=part_explained(outcome, data.floor),
         paying=labels(outcome.final.model, problem.joint_names, list(shares)) if shares else [],

@@ -11,7 +11,7 @@ from pace_actuators.effects import Effect, available_effects, get_effect
 def candidate_effects(
     extra: Sequence[str] = (), *, only: bool = False, switched_off: bool = True
 ) -> list[type[Effect]]:
-    """What is tried: all registered effects but curves of any form and special cases, and the user's; or only those.
+    """What is tried: all registered effects but curves of any form, and the user's; or only those.
 
     Args:
         extra: The user's.
@@ -30,4 +30,4 @@ def candidate_effects(
         )
     every = [] if only else [get_effect(name) for name in available_effects()]
     every = [effect for effect in every if switched_off or not effect.acts_while_off]
-    return list(dict.fromkeys([*(e for e in every if not e.free_form and not e.special_case_of), *own]))
+    return list(dict.fromkeys([*(e for e in every if not e.free_form), *own]))

@@ -89,7 +89,7 @@ def told(
             found.outcome, problem.joint_names, found.verdict, list(found.shares), joint_types=problem.joint_types
         ),
         hints=[asdict(hint) | {"joint": problem.joint_names[hint.joint]} for hint in found.hints],
-        sizes=sizes(fits, found.outcome, problem.joint_names),
+        sizes=sizes(fits, found.outcome, found.data.floor, problem.joint_names),
         likes=likes(found.outcome),
         joints=by_joint(found, problem),
         data=[*found.data.sentences, *_about_run(found, problem, run)],

@@ -121,8 +121,7 @@ class Search:
         fits, near = self.fits, self.cfg.judging.next_effect
         if bool(self._rough(now, now.score, near).any()) and self.cfg.has("wide_steps"):
             now = fits.over_wide_steps(problem, now)
-        if now.jacobian is None:  # it was fitted in windows
-            now = fits.to_whole(problem, [now])[0]
+        now = fits.to_the_end(problem, now)
         errors = fits.validation_errors(problem, [now])[0]
         rough = self._rough(now, now.score, near)
         if not bool(rough.any()) or not self.cfg.has("trim"):
@@ -158,3 +157,7 @@ class Outcome:
     rounds: Sequence[Round] = ()
     cfg: DiagnosisCfg = DEFAULT
     """The numbers that it was found with, and is judged by."""
+
+    def far(self, floor: torch.Tensor) -> torch.Tensor:
+        """Joints that end far from a floor (n,) [rad], (n,) bool."""
+        return self.final_errors.mse.sqrt() > self.cfg.judging.far * floor

@@ -42,24 +42,21 @@ class Evidence:
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
-    An effect is named where it explains most of what lies above the floor without it, and leads near the floor. Where
-    it does not lead near the floor, its size must be several error bars from zero, the same in every recording, away
-    from its bounds, and typical of drives. It must also explain a part of what a larger effect beside it does. Beside a
-    larger effect it counts only on what that leaves far from the floor. For effects beside a larger one, also on other
-    joints of its tree, take up what the model of the larger one gets wrong.
+    An effect is named where it explains most of what lies above the floor without it, and has a size that is typical of
+    drives. Where it does not lead near the floor, its size must also be several error bars from zero, the same in every
+    recording, and away from its bounds. Beside a larger effect it counts only on what that leaves far from the floor.
+    For effects beside a larger one, also on other joints of its tree, take up what the model of the larger one gets
+    wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:
         return ["the error is near the floor without it"]
     if evidence.explained < cfg.verdict.most:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
-    if evidence.left + evidence.harm <= near:
-        return []
-    rise = evidence.without - evidence.left
+    far = evidence.left + evidence.harm > near
     return [
-        *(["it explains little beside a larger effect"] if rise < cfg.verdict.least * evidence.larger else []),
-        *(["its size is not significant"] if evidence.bars < cfg.verdict.bars else []),
-        *(["its size differs between recordings"] if evidence.uneven > cfg.verdict.uneven else []),
-        *(["it is at a bound"] if evidence.at_bound else []),
+        *(["its size is not significant"] if far and evidence.bars < cfg.verdict.bars else []),
+        *(["its size differs between recordings"] if far and evidence.uneven > cfg.verdict.uneven else []),
+        *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),
     ]

@@ -69,7 +69,7 @@ def fit_curves(
         log: Gets the decision.
     """
     model = outcome.final.model
-    joints = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.far * floor
+    joints = outcome.far(floor)
     for effect, has in zip(model.effects, model.has, strict=True):
         joints &= ~(has & effect.shared)
     if not bool(joints.any()) or not outcome.cfg.has("curves"):

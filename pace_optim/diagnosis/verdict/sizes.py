@@ -16,18 +16,19 @@ from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.simulation.problem import TwinProblem
 
 
-def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
+def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[str, ...]) -> list[dict[str, Any]]:
     """Every parameter of every effect found, joint by joint, for ``diagnosis.json``; curves are left out.
 
     Args:
         fits: Fits models.
         outcome: Where the search ended.
+        floor: Of each joint, (n,) [rad].
         joint_names: The joints.
 
     Returns:
         ``{"effect", "parameter", "joint", "value", "std", "unit", "factor", "at_bound"}`` each. ``std`` is ``None``
-        where a value is held or at a bound, and that of all joints together where they share one; ``factor`` says what
-        was stated is multiplied by, if it is that.
+        where a value is held or at a bound, or the joint ends far from the floor. It is that of all joints together
+        where they share one; ``factor`` says what was stated is multiplied by, if it is that.
     """
     now = outcome.final
     found = now.model.has & torch.tensor([not effect.free_form for effect in now.model.effects]).bool()[:, None]
@@ -37,6 +38,7 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
         now = fits.looked_at(outcome.problem, [now])[0]
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
     std = torch.where(std > 0, torch.hypot(std, _step_shares(fits, outcome.problem, now)), std)
+    far = outcome.far(floor).tolist()
     result = []
     for effect, has in zip(now.model.effects, found, strict=True):
         columns = now.model.columns(effect)
@@ -50,7 +52,7 @@ def sizes(fits: Fits, outcome: Outcome, joint_names: tuple[str, ...]) -> list[di
                     "parameter": parameter.name,
                     "joint": joint_names[j],
                     "value": value,
-                    "std": error if error > 0 else None,
+                    "std": error if error > 0 and not far[j] else None,
                     "unit": parameter.unit,
                     "factor": factor_of(effect, parameter, value),
                     "at_bound": held_back,

@@ -33,9 +33,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple
     named = named & ~with_curve
     if bool(named.any()):
         return "effect", _restricted(outcome, named | with_curve)
-    far = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.far * floor
     hinted = new_effects(outcome, outcome.final.model).any(dim=0)
-    return "unknown" if bool((far | with_curve | hinted).any()) else "nothing_missing", outcome
+    return "unknown" if bool((outcome.far(floor) | with_curve | hinted).any()) else "nothing_missing", outcome
 
 
 def part_explained(outcome: Outcome, floor: torch.Tensor) -> float:

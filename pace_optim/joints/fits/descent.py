@@ -53,6 +53,7 @@ class JointDescent:
         self._width = torch.zeros(n, dtype=torch.long)
         self._jacobian: torch.Tensor | None = None
         self._error: torch.Tensor | None = None
+        self._led = torch.ones(n, dtype=torch.bool)
         self._scores: list[float] = []
 
     @property
@@ -110,6 +111,36 @@ class JointDescent:
             self._converged |= at_favoured & ~narrower & self._at_the_bottom()
             if self._keep:
                 self._keep_derivatives(columns, error[0], at_favoured)
+        if self._error is not None:
+            for j in moved.nonzero()[:, 0].tolist():
+                self._error[..., j] = error[choice[int(best[j])], ..., j]
+
+    @property
+    def leads(self) -> bool:
+        """Whether the last chord step has led a joint further."""
+        return bool(self._led.any())
+
+    def chord(self) -> torch.Tensor:
+        """Where the derivatives that were kept lead from x, (1, n, P); joints that they led no further stay."""
+        if self._jacobian is None or self._error is None:
+            raise ValueError("Chord steps need a descent that keeps its Jacobian.")
+        result = self.x.clone()
+        for j in self._led.nonzero()[:, 0].tolist():
+            at = self._free[j]
+            columns = self._jacobian[at.to(self._jacobian.device), ..., j].flatten(1)
+            gradient = (columns @ self._error[..., j].flatten()).cpu().double() / self._samples[j]
+            linear = LinearModel(self._hessian[j, : len(at), : len(at)], gradient)
+            result[j, at] = linear.step(self.x[j, at], 0.0)
+        return result[None]
+
+    def tell_chord(self, x: torch.Tensor, error: torch.Tensor) -> None:
+        """Take the row (1, n, P) on joints where its error (1, K, R, n) is lower."""
+        score = error[0].square().sum(dim=(0, 1), dtype=torch.float64).cpu() / self._samples
+        self._led &= score < self.score
+        self.x = torch.where(self._led[:, None], x[0], self.x)
+        self.score = torch.where(self._led, score, self.score)
+        if self._error is not None:
+            self._error = torch.where(self._led.to(error.device), error[0], self._error)
 
     def _steps(self) -> torch.Tensor:
         """By how much each joint is moved in each neighbour, (neighbours, n); 1 where it is not."""

@@ -65,7 +65,16 @@ class Fits:
 
     def to_whole(self, problem: TwinProblem, starts: Sequence[Fitted]) -> list[Fitted]:
         """The last iterations of models that windows have led, on whole recordings."""
-        return self.side_by_side(problem, starts, self.cfg.whole, keep_jacobian=True)
+        return self.side_by_side(problem, starts, self.cfg.whole, keep_jacobian=True, chords=self.cfg.chords)
+
+    def to_the_end(self, problem: TwinProblem, now: Fitted) -> Fitted:
+        """A model on whole recordings, with new derivatives as long as they lower a joint's error."""
+        now = self.to_whole(problem, [now])[0]
+        for _ in range(self.cfg.rounds - 1):
+            before, now = now.score, self.to_whole(problem, [now])[0]
+            if bool((now.score > (1 - self.cfg.enough) * before).all()):
+                break
+        return now
 
     def looked_at(self, problem: TwinProblem, models: Sequence[Fitted]) -> list[Fitted]:
         """Models where they are, with their errors and derivatives."""
@@ -81,6 +90,7 @@ class Fits:
         part: float = 1.0,
         rough: bool = False,
         kept: torch.Tensor | None = None,
+        chords: int = 0,
     ) -> list[Fitted]:
         """Fit several models from their present x, each joint by itself.
 
@@ -95,9 +105,10 @@ class Fits:
             part: Only so much of the beginning of the recordings is simulated.
             rough: Whether derivatives are taken over wide steps first.
             kept: Which of the recordings that are trained on count for which joints, (R, n) bool; all if not given.
+            chords: Steps that follow with the kept Jacobian, at most.
         """
         return self.shared_out(
-            lambda own: self._fit(problem, own, max_iteration, keep_jacobian, part, rough, kept),
+            lambda own: self._fit(problem, own, max_iteration, keep_jacobian, part, rough, kept, chords),
             starts,
             [start.tried for start in starts],
         )
@@ -182,6 +193,7 @@ class Fits:
         part: float,
         rough: bool,
         kept: torch.Tensor | None,
+        chords: int,
     ) -> list[Fitted]:
         """:meth:`side_by_side` in one process."""
         cfg = self.cfg
@@ -204,6 +216,16 @@ class Fits:
                 break
             if len(going) < cfg.thinned * len(running):
                 running, batch = going, self._batch_of(problem, going)
+        if chords:
+            batch = self.batch(problem, [Slot(model=way.model, rows=1) for way in ways], training=True)
+        for _ in range(chords):
+            if not any(way.leads for way in ways):
+                break
+            rows = [way.chord() for way in ways]
+            physical = [way.model.to_physical(x) for way, x in zip(ways, rows, strict=True)]
+            errors = batch.split(batch.simulate(physical, where, cfg.stride))
+            for way, x, error in zip(ways, rows, errors, strict=True):
+                way.tell_chord(x, error)
         return [way.result() for way in ways]
 
     def _batch_of(self, problem: TwinProblem, fits: Sequence[Fitted] | Sequence[JointDescent]) -> SideBySide:

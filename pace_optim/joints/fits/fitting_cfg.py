@@ -18,7 +18,9 @@ class FittingCfg:
     fine: int = 3
     """then in windows at the problem's physics step, ..."""
     whole: int = 2
-    """then on whole recordings."""
+    """then on whole recordings, ..."""
+    chords: int = 4
+    """and so many steps with the last derivatives, which weak directions need."""
     rounds: int = 3
     """At most so many times the coarse iterations while a model still falls; the base model's reference, that of what
     was found, and a trimmed fit are made again as often at most."""

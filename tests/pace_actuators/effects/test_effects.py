@@ -246,7 +246,8 @@ def test_limits_of_the_drive():
     assert drive.one(1.0, v=4.0) == pytest.approx(20 * (1 - 4 / 10))
     assert drive.one(1.0) == pytest.approx(20.0)
     assert drive.one(1.0, v=12.0) == 0.0
-    assert drive.one(-1.0, v=4.0) == pytest.approx(-100.0)  # it brakes with all it is asked for
+    assert [drive.one(-1.0, v=v) for v in (12.0, 4.5)] == pytest.approx([-100.0, -100 * 0.6 - 20 * 0.4])
+    assert drive.one(-1.0, v=4.0) == pytest.approx(-100.0)  # it brakes with all it is asked for, until it turns
 
 
 def test_what_is_asked_is_limited_before_the_current_loop_and_the_torque_constant_and_the_line_comes_last():

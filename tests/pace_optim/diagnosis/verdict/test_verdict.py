@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import FITS, joint_alone, make_diagnosis, outcome_of
+from diagnoses import FITS, errors_of, joint_alone, make_diagnosis, outcome_of
 from report_pages import page_of
 from run_folders import write_run
 
@@ -14,9 +14,9 @@ from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_actuators.text import size_text
 from pace_optim.diagnosis import Diagnosis
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.findings.findings import percent_text
 from pace_optim.diagnosis.findings.text import lines_of
+from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.estimate.error_bars.uncertainty import sandwich
@@ -97,15 +97,23 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
 
 
+def ended(problem, final):
+    """A search that ended with a model at 1 mrad."""
+    errors = errors_of(*[1e-3] * len(final.x))
+    return Outcome(problem=problem, base=final, base_errors=errors, final=final, final_errors=errors)
+
+
 def test_sizes_and_error_bars_are_those_of_least_squares():
     robot = joint_alone()
     model, none = JointModel.base(robot.problem), torch.zeros(1, 1, dtype=torch.float64)
     extended, values = model.extended(robot.truth_values, GAIN, torch.tensor([True]), none + GAIN.parameters[0].null)
     now = FITS.side_by_side(robot.twins, [Fitted.start(extended, values)], max_iteration=2, keep_jacobian=True)[0]
-    outcome = SimpleNamespace(problem=robot.twins, final=now, cfg=DEFAULT)
-    (size,) = sizes(FITS, outcome, ("servo",))
+    outcome = ended(robot.twins, now)
+    (size,) = sizes(FITS, outcome, torch.ones(1), ("servo",))
     assert size["effect"] == "torque_gain" and size["joint"] == "servo" and not size["at_bound"]
     assert size["factor"] == pytest.approx(1.0, abs=0.02) and 0 < size["std"] < 0.02
+    (far,) = sizes(FITS, outcome, torch.zeros(1), ("servo",))  # more is missing there
+    assert far == size | {"std": None}
 
 
 def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step(monkeypatch):
@@ -138,13 +146,13 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
 
     problem = SimpleNamespace(physics_dt=1e-3, with_physics_dt=lambda dt: None)
     stds = [
-        [size["std"] for size in sizes(Fits(), SimpleNamespace(problem=problem, final=final), ("hip", "knee"))]
+        [size["std"] for size in sizes(Fits(), ended(problem, final), torch.ones(2), ("hip", "knee"))]
         for final in (alone, shared)
     ]
     assert stds[0][0] == stds[0][1] > 0 and stds[1] == pytest.approx([stds[0][0] / np.sqrt(2)] * 2)
     # a finer step changes the errors as 0.01 more of the normalised gain does: the value makes up for that
     monkeypatch.setattr(Fits, "change", 0.01)
-    (with_step, _) = sizes(Fits(), SimpleNamespace(problem=problem, final=alone), ("hip", "knee"))
+    (with_step, _) = sizes(Fits(), ended(problem, alone), torch.ones(2), ("hip", "knee"))
     slope = float(model.box.slope(alone.x)[0, model.columns(GAIN).start])
     assert with_step["std"] == pytest.approx(np.hypot(stds[0][0], 0.01 * slope * 4 / 3), rel=1e-3)
 
