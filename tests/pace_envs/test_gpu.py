@@ -180,7 +180,7 @@ def test_a_reward_that_waits_for_the_gpu_is_told_and_runs_without_a_graph():
 
 @on_gpu
 def test_memory_that_is_garbage_stays_while_a_step_is_captured():
-    warp = pytest.importorskip("mujoco_warp").wp
+    warp = pytest.importorskip("warp")
     unused, captures = [warp.zeros(8, device="cuda:0")], []
 
     def makes_garbage(env: ManagerBasedRLEnv) -> torch.Tensor:
