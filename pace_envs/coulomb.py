@@ -11,9 +11,10 @@ after MuJoCo's step of length h, f the friction in it, and w = (M⁻¹)ᵢᵢ,
 joint after joint until none changes: a joint that turns pushes those that stick, and their friction holds against it
 (projected Gauss-Seidel; Stewart and Trinkle, Int. J. Numer. Methods Eng. 39, 1996, solve the same for a whole step).
 
-A free step has no more constraints than frictions. Where a contact, a limit or an equality acts, nothing is changed. A
-GPU takes the first of these steps alone, for all joints at once, with the w of the model's posture
-(``dof_invweight0``).
+Joints that stick creep a little in MuJoCo's step. Where none turns, one pass over all joints at once, with the w of the
+model's posture (``dof_invweight0``), ends that; a GPU takes this pass alone.
+
+A free step has no more constraints than frictions. Where a contact, a limit or an equality acts, nothing is changed.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ import torch
 
 NOTABLE = 1e-6
 """Of what friction can take from a speed in a step: a smaller change of it is rounding."""
+TURNS = 1e-2
+"""The same from which on a joint turns; what creeps changes by less."""
 SWEEPS = 50
 """Over all joints, at most; a few settle them."""
 
@@ -38,23 +41,16 @@ static double off(double before, double speed, double force, double w, double h,
   const double stop = h * w * most, step = turned(before, speed - before - h * w * force, stop) - speed;
   return fabs(step) > {NOTABLE} * stop ? step : 0.0;
 }}
-static void turn_friction(const mjModel* m, mjData* d, const double* before, Solve solve, Drift drift) {{
+static void settle(const mjModel* m, mjData* d, const double* before, double* change, Solve solve) {{
   const int n = m->nv;
-  const double h = m->opt.timestep, *most = m->dof_frictionloss, *at_home = m->dof_invweight0;
-  int rows = 0, turns = 0;
-  for (int i = 0; i < n; ++i) {{
-    if (most[i] <= 0.0) continue;
-    ++rows;
-    if (at_home[i] > 0.0 && off(before[i], d->qvel[i], d->qfrc_constraint[i], at_home[i], h, most[i])) turns = 1;
-  }}
-  if (!turns || d->nf != rows || d->nefc != rows) return;
-  double* inverse = (double*)calloc((2 * n + 3) * n, sizeof(double));
-  double *unit = inverse + n * n, *speed = unit + n * n, *force = speed + n, *change = force + n;
+  const double h = m->opt.timestep, *most = m->dof_frictionloss;
+  double* inverse = (double*)calloc(2 * (n + 1) * n, sizeof(double));
+  double *unit = inverse + n * n, *speed = unit + n * n, *force = speed + n;
   for (int i = 0; i < n; ++i) unit[i * n + i] = 1.0;
   solve(m, d, inverse, unit, n);
   memcpy(speed, d->qvel, n * sizeof(double));
   memcpy(force, d->qfrc_constraint, n * sizeof(double));
-  for (int sweep = 0; turns && sweep < {SWEEPS}; ++sweep) {{
+  for (int sweep = 0, turns = 1; turns && sweep < {SWEEPS}; ++sweep) {{
     turns = 0;
     for (int i = 0; i < n; ++i) {{
       const double *row = inverse + i * n, w = row[i];
@@ -66,12 +62,32 @@ static void turn_friction(const mjModel* m, mjData* d, const double* before, Sol
     }}
   }}
   for (int i = 0; i < n; ++i) change[i] = speed[i] - d->qvel[i];
-  memcpy(d->qvel, speed, n * sizeof(double));
-  drift(m, d->qpos, change, h);
   free(inverse);
 }}
+static void turn_friction(const mjModel* m, mjData* d, const double* before, double* room, Solve solve, Drift drift) {{
+  const int n = m->nv;
+  const double h = m->opt.timestep, *most = m->dof_frictionloss;
+  double *impulse = room, *change = room + n;
+  int rows = 0, creeps = 0, turns = 0;
+  for (int i = 0; i < n; ++i) {{
+    const double w = m->dof_invweight0[i];
+    rows += most[i] > 0.0;
+    const double force = d->qfrc_constraint[i], f = most[i];
+    const double step = f > 0.0 && w > 0.0 ? off(before[i], d->qvel[i], force, w, h, f) : 0.0;
+    impulse[i] = step == 0.0 ? 0.0 : step / w;
+    creeps |= step != 0.0;
+    turns |= fabs(step) > {TURNS} * h * w * most[i];
+  }}
+  if (!creeps || d->nf != rows || d->nefc != rows) return;
+  if (turns)
+    settle(m, d, before, change, solve);
+  else
+    solve(m, d, change, impulse, 1);
+  for (int i = 0; i < n; ++i) d->qvel[i] += change[i];
+  drift(m, d->qpos, change, h);
+}}
 """
-"""The same in C, after MuJoCo's step: ``before`` are the speeds before it."""
+"""The same in C, after MuJoCo's step: ``before`` are the speeds before it, ``room`` has 2 nv numbers."""
 
 
 def turned(speed: torch.Tensor, pushed: torch.Tensor, stop: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ from mujoco import batch
 
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
-from pace_envs.coulomb import impulses, settled
+from pace_envs.coulomb import TURNS, impulses, settled
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
@@ -396,10 +396,16 @@ class Simulation:
             most: Coulomb friction.
         """
         hit, change = impulse.any(dim=1).nonzero()[:, 0], torch.zeros_like(impulse)
-        if len(hit):
-            entries = torch.nn.functional.pad(self._outcomes["M"][hit], (0, 1))
-            inverse, after = torch.linalg.inv(entries[:, self._place_in_inertia]), self.qvel[hit]
-            change[hit] = settled(before[hit], after, force[hit], most[hit], inverse, self.cfg.dt) - after
+        if not len(hit):
+            return change
+        entries = torch.nn.functional.pad(self._outcomes["M"][hit], (0, 1))
+        inertia, impulse = entries[:, self._place_in_inertia], impulse[hit]
+        change[hit] = torch.linalg.solve(inertia, impulse)
+        turns = (impulse.abs() > TURNS * self.cfg.dt * most[hit]).any(dim=1)
+        if bool(turns.any()):
+            those, inverse = hit[turns], torch.linalg.inv(inertia[turns])
+            after = self.qvel[those]
+            change[those] = settled(before[those], after, force[those], most[those], inverse, self.cfg.dt) - after
         return change
 
     @cached_property

@@ -157,7 +157,7 @@ class RobotKernel:
             "series": self._series,
             "memory": torch.empty(env.num_envs, max(1, source.memory), dtype=torch.float64),
             "bias": env.sim.qfrc_bias.clone() if reads_load else torch.zeros_like(env.sim.qvel),
-            "before": torch.empty(env.num_envs, 3, env.sim.model.nv, dtype=torch.float64),
+            "before": torch.empty(env.num_envs, 5, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         if (course := self._course) is not None:

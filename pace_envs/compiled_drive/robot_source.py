@@ -140,11 +140,11 @@ static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
 {turns}
 static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
   {there}
-  double* before = a->before + (3 * robot + 2) * m->nv;
+  double* before = a->before + (5 * robot + 2) * m->nv;
   memcpy(before, d->qvel, m->nv * sizeof(double));
   if (!a->motion) {{
     a->step(m, d);
-    if (a->solve) turn_friction(m, d, before, a->solve, a->drift);
+    if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
     {back}
     return;
   }}
@@ -154,7 +154,7 @@ static void step(mjModel* m, mjData* d, long long robot, long long k, int part, 
   a->step1(m, d);
   bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
   a->step2(m, d);
-  if (a->solve) turn_friction(m, d, before, a->solve, a->drift);
+  if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
   {back}
 }}
 static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
@@ -164,7 +164,7 @@ static void advance(mjModel* m, mjData* d, long long robot, long long k, int par
   }}
   const int n = m->nv;
   const double h = m->opt.timestep;
-  double *applied = a->before + 3 * robot * n, *damping = applied + n;
+  double *applied = a->before + 5 * robot * n, *damping = applied + n;
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
   for (int i = 0; i < n; ++i) {{

@@ -425,6 +425,12 @@ class CMAESOptimizer(TreeSearch):
         """
         return self._scored().real_ee_pose
 
+    @property
+    def reads_positions_alone(self) -> bool:
+        """Whether the objective is this class's: it reads what :meth:`tell` is given, and nothing of the robot."""
+        kind = type(self)
+        return kind.tell is CMAESOptimizer.tell and kind.add_score is CMAESOptimizer.add_score
+
     def tell(self, sim_dof_pos: torch.Tensor, real_dof_pos: torch.Tensor) -> None:
         """Add one sample to the scores.
 

@@ -22,7 +22,7 @@ def search(
     while not optimizer.finished():
         optimizer.ask()
         optimizer.update_simulator(rollout)
-        for sim_dof_pos, real_dof_pos in rollout:
+        for sim_dof_pos, real_dof_pos in rollout.at_once() if optimizer.reads_positions_alone else rollout:
             optimizer.tell(sim_dof_pos, real_dof_pos)
         optimizer.evolve()
         if after_generation is not None:

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _LOAD_STEPS = 6
 """Fixed-point steps of a start whose positions depend on the load there."""
 
+_LARGEST = 50_000_000
+"""Positions that are kept at once, at most: 400 MB."""
+
 
 class Rollout:
     """Lets every candidate follow every recording's commands.
@@ -191,12 +194,25 @@ class Rollout:
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
+        return self._pairs(None)
+
+    def at_once(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """The same pairs, for those who read nothing else of the robot: drives that can be compiled simulate first."""
+        size = self.duration_steps * self.env.num_envs * self.robot.num_joints
+        if size > _LARGEST or self.env.device.type != "cpu":
+            return self._pairs(None)
+        return self._pairs(lambda steps: self._in_one_go(torch.arange(steps)))
+
+    def _pairs(
+        self, simulated: Callable[[int], Iterable[torch.Tensor]] | None
+    ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Pairs of simulated and measured positions; ``simulated`` as for :meth:`samples`."""
         data = self.dataset
         weights = (self._where.double() / self._where.sum()).to(self.env.dtype)
         counts = self._where.any(dim=1).tolist()
         self._is_late = self.observation_lag(self.duration_steps) is not None
         self._contacts_at = -1
-        for k, sim_dof_pos in self.samples():
+        for k, sim_dof_pos in self.samples(simulated):
             self._step = k
             if counts[k]:
                 self.weight = self._rows(weights[k, :, None])
