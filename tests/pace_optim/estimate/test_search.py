@@ -7,7 +7,7 @@ def test_the_loop_asks_simulates_tells_and_evolves_until_finished():
     calls = []
 
     class Optimizer:
-        generation = 0
+        generation, reads_positions_alone = 0, False
 
         def finished(self):
             return self.generation == 2

@@ -256,6 +256,17 @@ def tensor_bytes():
     return sum({t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}.values())
 
 
+def test_pairs_that_are_simulated_at_once_are_those_of_stepping():
+    problem = make_problem(record())
+    rollout = problem.evaluator().rollout(2)
+    pairs = []
+    for way in (rollout.__iter__, rollout.at_once):
+        rollout.start(torch.stack([physical(problem, {**TRUTH, "delay": delay}) for delay in (1.0, 1.37)]))
+        pairs.append([torch.stack([each.clone() for each in both]) for both in way()])
+    assert len(pairs[0]) > 100
+    torch.testing.assert_close(*map(torch.stack, pairs), rtol=0, atol=1e-14)
+
+
 def test_the_number_of_environments_must_be_a_multiple_of_the_recordings():
     problem = make_problem([record(), record(chirp(0.6))])
     env = problem.make_env(5)
