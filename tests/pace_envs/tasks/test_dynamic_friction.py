@@ -115,7 +115,6 @@ def test_a_fit_of_a_task_with_the_flag_recovers_both_frictions(tmp_path):
     assert result.effects == ["dynamic_friction"]
 
 
-def test_a_diagnosis_looks_for_the_general_law():
-    names = [effect.name for effect in candidate_effects()]
-    assert "stribeck_friction" in names and "dynamic_friction" not in names
-    assert "dynamic_friction" in [effect.name for effect in candidate_effects(["dynamic_friction"])]
+def test_a_diagnosis_tries_both_laws():
+    """Either is named as the other where it is missing."""
+    assert {"stribeck_friction", "dynamic_friction"} <= {effect.name for effect in candidate_effects()}
