@@ -107,6 +107,12 @@ def test_a_robot_of_several_joints_that_move_each_other():
     assert positions.shape[1:] == speeds.shape[1:] == shown.shape[1:]
 
 
+def test_frictions_of_joints_that_push_each_other_settle_as_in_the_environment():
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg).with_physics_dt(DT / 2)
+    assert apart(problem, problem.space.from_dict({**TRUTH, "friction": 3.0})) < 1e-9
+
+
 def test_drives_in_several_groups_whose_joints_are_not_in_the_model_s_order():
     cfg = env_cfg(ANYMAL)
     robot = cfg.scene.robot
