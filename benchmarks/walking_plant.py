@@ -126,7 +126,7 @@ class Plant:
     """Of commands [control steps]."""
     effort_limit: float = 89.0
     hidden: Hidden = field(default_factory=Hidden)
-    """What no fit is told of."""
+    """What no fit knows of."""
     imu: tuple[str, tuple[float, float, float]] | None = None
     """Body and place of the IMU [m]; ``None``: the site ``imu``."""
     tilt: float = np.radians(5)
