@@ -71,7 +71,7 @@ def distances(problem: Problem, truth: torch.Tensor) -> tuple[np.ndarray, np.nda
         x = (x - whole @ (gradient / scale) / scale).clamp(-1.0, 1.0)
     there = assess(problem, problem.evaluator(), colouring, x)
     physical, bars = space.to_physical(x), there.uncertainty
-    change = change_without_step(problem, physical, there.jacobian.residuals)
+    change = change_without_step(problem, physical, there.jacobian.residuals, there.phases)
     if change is not None:
         known = ~np.isnan(bars.std)
         share = step_share(there.jacobian, change, space, x, known)

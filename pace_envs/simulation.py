@@ -18,6 +18,7 @@ from mujoco import batch
 from pace_actuators.effects import Effect
 from pace_actuators.memory import check_memory
 from pace_envs.coulomb import TURNS, impulses, settled
+from pace_envs.model_file import leave_out_pictures
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FIELDS, FrameState, bias_in_frame
 from pace_envs.mujoco_warnings import keep_quiet
@@ -72,7 +73,7 @@ class SimulationCfg:
     """Whether geoms collide."""
 
     sensors: bool = True
-    """Whether MuJoCo computes the model's sensors."""
+    """Whether MuJoCo computes the model's sensors; without them the model has no textures either."""
 
     num_threads: int = 0
     """Threads of the physics; 0 means one per processor that the process may use. Results do not depend on it."""
@@ -518,6 +519,7 @@ class Simulation:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         if not self.cfg.sensors:
             spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+            leave_out_pictures(spec)
         for body in spec.bodies[1:]:
             body.simple = 0  # effects on the model move centres of mass; MuJoCo's short cut for balanced bodies cannot
         timeconst, impedance = self.cfg.friction_timeconst, self.cfg.friction_impedance

@@ -83,6 +83,14 @@ def leave_out_surfaces(spec: mujoco.MjSpec, path: Path) -> None:
         spec.delete(element)
 
 
+def leave_out_pictures(spec: mujoco.MjSpec) -> None:
+    """Delete textures: each copy of a model has its own, and they may be nearly all of it. Colours stay."""
+    for material in spec.materials:
+        material.textures = ["" for _ in material.textures]
+    for texture in list(spec.textures):
+        spec.delete(texture)
+
+
 def _surfaces(spec: mujoco.MjSpec) -> list:
     return [*spec.skins, *spec.hfields, *spec.textures]
 

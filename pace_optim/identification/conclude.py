@@ -235,7 +235,7 @@ def _with_step(run: Optimization, end: _End) -> _End:
     while True:
         run.progress.say("simulating with a finer step, to measure the part of the step")
         there = end.jacobian.residuals
-        change = change_without_step(end.problem, end.problem.space.to_physical(end.x), there)
+        change = change_without_step(end.problem, end.problem.space.to_physical(end.x), there, end.at.phases)
         outcome = None if end.is_far else run.at_half_the_step(end.problem, end.x, there, change)
         if outcome is None:
             return replace(end, without_step=change)

@@ -243,6 +243,9 @@ class Evaluator:
         known = self.phases is not None and (self._phases_at is None or not anew)
         if self.dataset.carried is None or known or (anew and _same(self._phases_at, physical)):
             return False
+        for each in (self, self._nearby):
+            if each is not None:
+                each.phases = None  # before the next: they take much memory
         self.phases, self._phases_at = self.free_phases(physical), physical.clone()
         return True
 

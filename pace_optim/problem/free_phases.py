@@ -35,7 +35,7 @@ physics differs from swing to swing, too, by a few times: such phases keep their
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -82,64 +82,50 @@ class FreePhases:
     """The free phases of a dataset, and the covariance of their errors."""
 
     blocks: tuple[Block, ...]
-    covariances: tuple[torch.Tensor, ...]
-    """Of each, C / σ², (steps joints, steps joints)."""
+    factors: tuple[torch.Tensor, ...]
+    """Of each, L with C = σ² L Lᵀ, (steps joints, steps joints)."""
     noise: torch.Tensor
     """σ, (R, n) [rad]."""
     floor: torch.Tensor
     """Noise floor of the recordings s, (R, n) [rad]: errors of the right model are brought to it."""
-    expected: tuple[torch.Tensor, ...] = ()
-    """Of each block, what error bars take for C / σ²: with all that lasts."""
+    expected: Callable[[int], torch.Tensor] | None = None
+    """Of the block of an index, what error bars take for C / σ²: with all that lasts; ``None``: not known."""
     _known: list[tuple[torch.Tensor, torch.Tensor, list[tuple[int, int, torch.Tensor]]]] = field(default_factory=list)
-    """Steps, a mask, and L⁻¹ there, of the last few."""
+    """Steps, a mask, and L there, of the last few."""
 
     def of_single_joints(self) -> FreePhases:
         """The same of each joint by itself, without its neighbours."""
-        blocks, covariances = [], []
-        for block, covariance in zip(self.blocks, self.covariances, strict=True):
+        blocks, factors = [], []
+        for block, factor in zip(self.blocks, self.factors, strict=True):
             for i, joint in enumerate(block.joints):
-                own = slice(i, None, len(block.joints))
+                own = factor[i :: len(block.joints)]
                 blocks.append(replace(block, joints=[joint]))
-                covariances.append(covariance[own, own])
-        return replace(self, blocks=tuple(blocks), covariances=tuple(covariances), expected=(), _known=[])
+                factors.append(torch.linalg.cholesky(own @ own.T))
+        return replace(self, blocks=tuple(blocks), factors=tuple(factors), expected=None, _known=[])
 
     def select(self, recordings: Sequence[int]) -> FreePhases:
         """Those of some of the recordings, by index."""
         chosen = list(recordings)
         kept = [
-            (replace(block, recording=chosen.index(block.recording)), covariance)
-            for block, covariance in zip(self.blocks, self.covariances, strict=True)
+            (replace(block, recording=chosen.index(block.recording)), factor)
+            for block, factor in zip(self.blocks, self.factors, strict=True)
             if block.recording in chosen
         ]
-        blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
-        return replace(
-            self,
-            blocks=blocks,
-            covariances=covariances,
-            expected=(),
-            noise=self.noise[chosen],
-            floor=self.floor[chosen],
-            _known=[],
-        )
+        return self._of(kept, self.noise[chosen], self.floor[chosen])
 
     def on_joints(self, joints: Sequence[int]) -> FreePhases:
         """Those of some joints, by index, each by itself."""
         chosen = list(joints)
         kept = [
-            (replace(block, joints=[chosen.index(block.joints[0])]), covariance)
-            for block, covariance in zip(self.blocks, self.covariances, strict=True)
+            (replace(block, joints=[chosen.index(block.joints[0])]), factor)
+            for block, factor in zip(self.blocks, self.factors, strict=True)
             if block.joints[0] in chosen
         ]
-        blocks, covariances = zip(*kept, strict=True) if kept else ((), ())
-        return replace(
-            self,
-            blocks=blocks,
-            covariances=covariances,
-            expected=(),
-            noise=self.noise[:, chosen],
-            floor=self.floor[:, chosen],
-            _known=[],
-        )
+        return self._of(kept, self.noise[:, chosen], self.floor[:, chosen])
+
+    def _of(self, kept: Sequence[tuple[Block, torch.Tensor]], noise: torch.Tensor, floor: torch.Tensor) -> FreePhases:
+        blocks, factors = zip(*kept, strict=True) if kept else ((), ())
+        return replace(self, blocks=blocks, factors=factors, expected=None, noise=noise, floor=floor, _known=[])
 
     def taken_out(self, error: torch.Tensor, step: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
         """Errors without what beginnings and the specific force explain; changed in place.
@@ -149,48 +135,60 @@ class FreePhases:
             step: Control step of each of the K, ascending, (K,).
             where: Which samples count, (T, R) bool.
         """
-        for block, (begin, end, whitening) in zip(self.blocks, self._where(step, where), strict=True):
+        for block, (begin, end, factor) in zip(self.blocks, self._where(step, where), strict=True):
             if begin < end:
                 part = error[:, begin:end, block.recording][..., block.joints]
                 sigma = self.noise[block.recording, block.joints]
-                left = ((part / sigma).flatten(1) @ whitening.T).view(part.shape)
+                left = _whitened((part / sigma).flatten(1).T, factor).T.reshape(part.shape)
                 left *= self.floor[block.recording, block.joints]
                 error[:, begin:end, block.recording, block.joints] = left
         return error
 
     def expected_of(self, step: torch.Tensor, where: torch.Tensor) -> Iterator[tuple[Block, int, int, torch.Tensor]]:
-        """Of each block, its rows among the steps, and the covariance of L⁻¹ e / σ that error bars take for true.
+        """Of each block that counts, its rows among the steps, and the covariance of L⁻¹ e / σ for error bars.
 
         Args:
             step: Control step of each of the K, ascending, (K,).
             where: Which samples count, (T, R) bool.
         """
-        known = self._where(step, where)
-        for block, (begin, end, whitening), expected in zip(self.blocks, known, self.expected, strict=True):
-            joints = len(block.joints)
-            own = ((step[begin:end] - block.first)[:, None] * joints + torch.arange(joints)).flatten()
-            yield block, begin, end, whitening @ expected[own][:, own] @ whitening.T
+        if self.expected is None:
+            return
+        for i, (block, (begin, end, factor)) in enumerate(zip(self.blocks, self._where(step, where), strict=True)):
+            if begin < end:
+                own = _entries(block, step[begin:end])
+                yield block, begin, end, _whitened(_whitened(self.expected(i)[own][:, own], factor).T, factor)
 
     def _where(self, step: torch.Tensor, where: torch.Tensor) -> list[tuple[int, int, torch.Tensor]]:
-        """For each block, its rows among the steps, and L⁻¹ of its samples."""
+        """For each block, its rows among the steps, none where no sample counts, and L of those that count."""
         for steps, mask, known in self._known:
             if (mask is where or torch.equal(mask, where)) and torch.equal(steps, step):
                 return known
         result = []
-        for block, covariance in zip(self.blocks, self.covariances, strict=True):
+        for block, whole in zip(self.blocks, self.factors, strict=True):
             begin, end = np.searchsorted(step.numpy(), [block.first, block.end])
-            at = step[begin:end]
-            counts = where[at, block.recording][:, None].expand(-1, len(block.joints)).flatten()
-            joints = len(block.joints)
-            own = ((at - block.first)[:, None] * joints + torch.arange(joints)).flatten()
-            part = covariance[own][:, own]
-            part = torch.where(counts[:, None] & counts, part, torch.eye(len(own), dtype=part.dtype))
-            factor = torch.linalg.cholesky(part)
-            whitening = torch.linalg.solve_triangular(factor, torch.eye(len(own), dtype=part.dtype), upper=False)
-            result.append((int(begin), int(end), whitening))
+            at, factor = step[begin:end], whole
+            counts = where[at, block.recording]
+            if not bool(counts.any()):
+                end = begin
+            elif len(at) < block.end - block.first or not bool(counts.all()):
+                own, every = _entries(block, at), counts.repeat_interleave(len(block.joints))
+                part = whole[own] @ whole[own].T
+                factor = torch.linalg.cholesky(torch.where(every[:, None] & every, part, torch.eye(len(own)).to(part)))
+            result.append((int(begin), int(end), factor))
         self._known.append((step, where, result))
         del self._known[:-_KEPT]
         return result
+
+
+def _entries(block: Block, at: torch.Tensor) -> torch.Tensor:
+    """Rows of a block's matrices at control steps, joint by joint."""
+    joints = len(block.joints)
+    return ((at - block.first)[:, None] * joints + torch.arange(joints)).flatten()
+
+
+def _whitened(columns: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+    """L⁻¹ times columns."""
+    return torch.linalg.solve_triangular(factor, columns, upper=False)
 
 
 def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, ...]:
@@ -289,6 +287,45 @@ def encoder_noise(carried: Carried, error: torch.Tensor) -> torch.Tensor:
     return torch.where(known, noise, usual)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Influence:
+    """What beginnings and the base's motion do to errors."""
+
+    carried: Carried
+    change: torch.Tensor
+    """What :class:`PhaseProbes` change of what encoders show, (2 depth + 6, T, R, n)."""
+    noise: torch.Tensor
+    """Of the encoders, (R, n) [rad]."""
+    gyroscope: torch.Tensor
+    """Its noise, (R, 3) [rad/s]."""
+    slope: torch.Tensor
+    """Change of the angular acceleration and the specific force in a control step, (T - 1, R, 6)."""
+    control_dt: float
+    """[s]."""
+
+    def covariances(self, block: Block) -> tuple[torch.Tensor, torch.Tensor]:
+        """C / σ² of a block, and what error bars take for it."""
+        carried, r, joints = self.carried, block.recording, block.joints
+        depth, sigma, most = (len(self.change) - 6) // 2, self.noise[r, joints], carried.start_std.amax(dim=0)
+        rows = [kind * depth + i for kind in range(2) for i in range(len(joints))]
+        scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
+        begun = scale[:, None, None] * self.change[rows][:, block.first : block.end, r][..., joints] / sigma
+        response = self.change[2 * depth :, block.begin : block.end, r][..., joints] / (PUSH * sigma)
+        kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
+        history = min(block.first - block.begin, 2 * _BLOCK)
+        steps = torch.arange(block.first - history, block.end - 1)
+        felt = _felt(kick, history, block.end - block.first)
+        white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
+        pushed = white.flatten(0, 1)
+        begun, pushed = begun.flatten(1), pushed.T @ pushed
+        own = torch.eye(pushed.shape[1], dtype=pushed.dtype) + begun.T @ begun
+        gyroscope = self.gyroscope[r, :, None, None] / self.control_dt
+        turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope
+        late = _LATE / self.control_dt * (felt * self.slope[steps, r].T[:, :, None]).sum(dim=1)
+        every = torch.cat([late, turned.flatten(0, 1), _lasting(white)])
+        return own + pushed, own + (1 - _ALIKE) * pushed + every.T @ every
+
+
 def free_phases(
     carried: Carried, trees: Sequence[Sequence[int]], change: torch.Tensor, error: torch.Tensor, control_dt: float
 ) -> FreePhases:
@@ -304,53 +341,44 @@ def free_phases(
         error: Of the candidate without those changes, (T, R, n) [rad].
         control_dt: [s].
     """
-    depth, noise = max(len(tree) for tree in trees), encoder_noise(carried, error)
-    most, gyroscope = carried.start_std.amax(dim=0), _white(carried.base[..., :3])
     turning = carried.base[..., :3].diff(dim=0) / control_dt
-    slope = torch.cat([turning.diff(dim=0, append=turning[-1:]), carried.base[..., 3:].diff(dim=0)], dim=-1)
-    blocks, covariances, expected = blocks_of(carried, trees), [], []
+    influence = _Influence(
+        carried=carried,
+        change=change,
+        noise=encoder_noise(carried, error),
+        gyroscope=_white(carried.base[..., :3]),
+        slope=torch.cat([turning.diff(dim=0, append=turning[-1:]), carried.base[..., 3:].diff(dim=0)], dim=-1),
+        control_dt=control_dt,
+    )
+    blocks, factors, square = blocks_of(carried, trees), [], []
     for block in blocks:
-        r, joints = block.recording, block.joints
-        sigma = noise[r, joints]
-        rows = [kind * depth + i for kind in range(2) for i in range(len(joints))]
-        scale = torch.cat([carried.start_std[r, joints, kind] / most[joints, kind] for kind in range(2)])
-        begun = scale[:, None, None] * change[rows][:, block.first : block.end, r][..., joints] / sigma
-        response = change[2 * depth :, block.begin : block.end, r][..., joints] / (PUSH * sigma)
-        kick = response.diff(dim=1)[:, : 2 * _BLOCK]  # of a push that lasts a step, steps after its beginning
-        history = min(block.first - block.begin, 2 * _BLOCK)
-        steps = torch.arange(block.first - history, block.end - 1)
-        felt = _felt(kick, history, block.end - block.first)
-        white = felt[3:] * carried.force_std[steps, r].T[:, :, None]
-        pushed = white.flatten(0, 1)
-        begun, pushed = begun.flatten(1), pushed.T @ pushed
-        own = torch.eye(pushed.shape[1], dtype=change.dtype) + begun.T @ begun
-        covariances.append(own + pushed)
-        turned = torch.nn.functional.pad(felt[:3], (0, 0, 1, 1)).diff(dim=1) * gyroscope[r, :, None, None] / control_dt
-        late = _LATE / control_dt * (felt * slope[steps, r].T[:, :, None]).sum(dim=1)
-        every = torch.cat([late, turned.flatten(0, 1), _lasting(white)])
-        expected.append(own + (1 - _ALIKE) * pushed + every.T @ every)
-    wide = _disturbed(blocks, expected, error, noise)
-    covariances = [factor * each for factor, each in zip(wide, covariances, strict=True)]
-    expected = [factor * each for factor, each in zip(wide, expected, strict=True)]
+        covariance, expected = influence.covariances(block)
+        factors.append(torch.linalg.cholesky(covariance))
+        square.append(_mean_square(block, expected, error, influence.noise))
+    wide = _disturbed(blocks, square)
     return FreePhases(
         blocks=blocks,
-        covariances=tuple(covariances),
-        noise=noise,
+        factors=tuple(factor * own**0.5 for factor, own in zip(factors, wide, strict=True)),
+        noise=influence.noise,
         floor=carried.start_std[..., 0],
-        expected=tuple(expected),
+        expected=lambda i: wide[i] * influence.covariances(blocks[i])[1],
     )
 
 
-def _disturbed(
-    blocks: Sequence[Block], covariances: Sequence[torch.Tensor], error: torch.Tensor, noise: torch.Tensor
-) -> list[float]:
-    """What the covariance of each block is multiplied by: more than 1 where its errors are far above its leg's."""
-    square = []
-    for block, covariance in zip(blocks, covariances, strict=True):
-        own = error[block.first : block.end, block.recording][:, block.joints] / noise[block.recording, block.joints]
-        own = own.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).flatten()[:, None]
-        left = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), own, upper=False)
-        square.append(float(left.square().mean()))
+def _mean_square(block: Block, covariance: torch.Tensor, error: torch.Tensor, noise: torch.Tensor) -> float:
+    """Of a block's errors (T, R, n), over what a covariance C / σ² expects."""
+    own = error[block.first : block.end, block.recording][:, block.joints] / noise[block.recording, block.joints]
+    own = own.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).flatten()[:, None]
+    return float(_whitened(own, torch.linalg.cholesky(covariance)).square().mean())
+
+
+def _disturbed(blocks: Sequence[Block], square: Sequence[float]) -> list[float]:
+    """What the covariance of each block is multiplied by: more than 1 where its errors are far above its leg's.
+
+    Args:
+        blocks: The blocks.
+        square: Of each, the mean square of its errors over what is expected.
+    """
     legs: dict[tuple[int, ...], list[float]] = {}
     for block, each in zip(blocks, square, strict=True):
         legs.setdefault(tuple(block.joints), []).append(each)

@@ -111,14 +111,14 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
 
 
 def _part(recording: Recording, first: int, end: int, dt: float) -> Recording:
-    """Some samples; it begins at the speed that it has there."""
+    """Some samples, copied so that the rest can go; it begins at the speed that it has there."""
     at, begin = recording.sample_steps[first:end], float(recording.time[first])
     grid = slice(int(at[0]), int(at[-1]) + 1)
     measured: dict[str, Any] = {
-        key: value[first:end] for key in SAMPLED_SERIES if (value := getattr(recording, key)) is not None
+        key: value[first:end].copy() for key in SAMPLED_SERIES if (value := getattr(recording, key)) is not None
     }
     commands: dict[str, Any] = {
-        key: value[grid]
+        key: value[grid].copy()
         for key in ("command", "command_vel", "command_effort", "command_torque_enable", "frame", "free")
         if (value := getattr(recording, key)) is not None
     }

@@ -41,6 +41,8 @@ class Assessment:
     """The simulation's own noise [rad]."""
     initial: Initial
     """On the same samples as the Jacobian."""
+    phases: FreePhases | None
+    """What its residuals have taken out of free phases; ``None`` where no base moves."""
 
     def moved(
         self, problem: Problem, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()
@@ -120,9 +122,19 @@ def _assessment(
         middle = _middle_of_swings(there, training.phases, training.dataset.train) + np.outer(late, late)
     uncertainty = estimate_uncertainty(there, problem.space, x, initial.derivatives, initial.joints, held, middle)
     physical = problem.space.to_physical(x)
-    evaluator.look_at_phases(physical, anew=True)
-    residuals = evaluator.residuals(physical[None], problem.dataset.sampled)
-    return Assessment(x=x, uncertainty=uncertainty, residuals=residuals, jacobian=there, noise=noise, initial=initial)
+    if evaluator.dataset.num_recordings == training.dataset.num_recordings:
+        evaluator.phases = training.phases
+    else:
+        evaluator.look_at_phases(physical, anew=True)
+    return Assessment(
+        x=x,
+        uncertainty=uncertainty,
+        residuals=evaluator.residuals(physical[None], problem.dataset.sampled),
+        jacobian=there,
+        noise=noise,
+        initial=initial,
+        phases=training.phases,
+    )
 
 
 def _gone_on(evaluator: Evaluator, ended: Descent, x: torch.Tensor, there: Jacobian) -> tuple[torch.Tensor, Jacobian]:

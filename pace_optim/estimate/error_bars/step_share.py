@@ -8,6 +8,7 @@ import torch
 from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered, inverse_of
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -17,19 +18,24 @@ as that of friction that turns within a step, whatever the integrator)."""
 TO_NO_STEP = FINER / (FINER - 1)
 
 
-def change_without_step(problem: Problem, physical: torch.Tensor, there: Residuals) -> torch.Tensor | None:
+def change_without_step(
+    problem: Problem, physical: torch.Tensor, there: Residuals, phases: FreePhases | None = None
+) -> torch.Tensor | None:
     """How the motion would change if the physics had no step, on the training samples, (K, R, n) [rad].
 
     Args:
         problem: What was fitted.
         physical: The result, (size,).
         there: Its residuals.
+        phases: What these have taken out of free phases.
 
     Returns:
         The change; ``None`` where the finer simulation diverges.
     """
     finer = problem.with_physics_dt(problem.physics_dt / FINER)
-    change = TO_NO_STEP * (finer.training_evaluator().residuals(physical[None]).error[0] - there.error[0])
+    evaluator = finer.training_evaluator()
+    evaluator.phases = phases
+    change = TO_NO_STEP * (evaluator.residuals(physical[None]).error[0] - there.error[0])
     return change if bool(change.isfinite().all()) else None
 
 

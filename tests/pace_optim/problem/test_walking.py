@@ -77,7 +77,7 @@ def test_without_the_motion_of_the_base_the_error_is_many_times_the_noise(walk):
     for each in (problem, resting):
         evaluator = each.evaluator()
         std = carried.start_std[..., 0]
-        evaluator.phases = FreePhases(blocks=(), covariances=(), noise=std, floor=std)  # errors as they are
+        evaluator.phases = FreePhases(blocks=(), factors=(), noise=std, floor=std)  # errors as they are
         scores.append(float(evaluator.residuals(truth[None]).score[0]))
     assert scores[1] > 100 * scores[0]
 
@@ -134,16 +134,19 @@ def test_error_bars_know_of_an_imu_that_is_late(walk):
         own = replace(carried, base=base)
         evaluator = replace(problem, dataset=replace(problem.dataset, carried=own)).evaluator()
         std = carried.start_std[..., 0]
-        evaluator.phases = FreePhases(blocks=(), covariances=(), noise=std, floor=std)
+        evaluator.phases = FreePhases(blocks=(), factors=(), noise=std, floor=std)
         raw.append(evaluator.residuals(truth[None]))
     change, step = (raw[1].error - raw[0].error)[0], raw[0].step
     square = np.zeros(2)
-    for block, *known in zip(phases.blocks, phases.covariances, phases.expected, strict=True):
+    for i, (block, factor) in enumerate(zip(phases.blocks, phases.factors, strict=True)):
         rows = (step >= block.first) & (step < block.end)
         if int(rows.sum()) < block.end - block.first:
             continue
         error = (change[rows, block.recording][:, block.joints] / phases.noise[block.recording, block.joints]).flatten()
-        square += [float(error @ torch.linalg.solve(covariance, error)) for covariance in known]
+        square += [
+            float(error @ torch.linalg.solve(covariance, error))
+            for covariance in (factor @ factor.T, phases.expected(i))
+        ]
     assert 0 < square[1] < square[0] / 5
 
 
@@ -155,10 +158,7 @@ def test_a_swing_that_something_disturbs_hardly_counts(walk):
     measured = problem.dataset.measured.clone()
     measured[own.first : own.end, 0, own.joints] += 0.02 * torch.linspace(0, 1, own.end - own.first)[:, None].sin()
     touched = replace(problem, dataset=replace(problem.dataset, measured=measured)).evaluator().free_phases(truth)
-    wider = [
-        float(b.diagonal().sum() / a.diagonal().sum())
-        for a, b in zip(phases.covariances, touched.covariances, strict=True)
-    ]
+    wider = [float(b.square().sum() / a.square().sum()) for a, b in zip(phases.factors, touched.factors, strict=True)]
     assert wider[block] > 100 and max(w for i, w in enumerate(wider) if i != block) < 3
 
 
