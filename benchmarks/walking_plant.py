@@ -151,7 +151,7 @@ class Plant:
             base = root.parent
             spec.delete(root)
             if self.swing:
-                base.add_joint(name="rope", type=mujoco.mjtJoint.mjJNT_BALL, pos=[0, 0, self.swing])
+                base.add_joint(name="rope", type=mujoco.mjtJoint.mjJNT_BALL, pos=[0, 0, self.swing], range=[0, 0])
         if self.imu is not None:
             spec.body(self.imu[0]).add_site(name="imu", pos=self.imu[1])
         for geom in spec.geoms:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.comparison.load_torque import inverse_dynamics, model_of, smoothed
+from pace_optim.comparison.load_torque import smoothed
 from pace_optim.problem.evaluator import Evaluator
+from pace_optim.problem.inverse_dynamics import LinkMotion, model_of
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import configured_drive
 
@@ -47,7 +48,9 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
             asked = asked + feed_forward
         still = np.zeros_like(position[::_STRIDE])
         model = model_of(rollout.env, r)
-        gravity = inverse_dynamics(model, rollout.robot.joint_names, (position + encoder_bias)[::_STRIDE], still, still)
+        gravity = LinkMotion.of(
+            model, rollout.robot.joint_names, (position + encoder_bias)[::_STRIDE], still, still
+        ).torque()
         joints = {}
         for j, name in enumerate(rollout.robot.joint_names):
             joints[name] = {

@@ -12,6 +12,7 @@ import numpy as np
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv
 from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.legs_in_the_air import standing_legs
 from pace_optim.recording import Recording
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.keys import did_you_mean
@@ -36,29 +37,48 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
     when = at if recording.sample_offset is None else at + recording.sample_offset
     shown = np.concatenate([recording.base_ang_vel @ axes.T, recording.base_lin_acc @ axes.T], axis=1)
     frame = np.stack([np.interp(steps, when, column) for column in shown.T], axis=1)
+    legs = joints_of_feet(env, recording.feet, recording.label)
+    names, standing, by_torques = recording.feet, standing_feet(recording), False
+    if standing is None and _gains_are_stated(recording, env):
+        legs = trees_of(env)
+        names = tuple(recording.joint_names[joints[0]] for joints in legs)
+        standing = standing_legs(recording, env, legs, shown, point)
+        by_torques = standing is not None and bool(standing.any())
     free = np.ones((len(steps), recording.num_joints), dtype=bool)
-    standing = standing_feet(recording)
     if standing is not None:
         dt = float(np.median(np.diff(recording.time)))
         sample = np.searchsorted(at, steps, side="right") - 1
-        for foot, joints in enumerate(joints_of_feet(env, recording.feet, recording.label)):
-            free[:, joints] &= free_phases(standing[:, foot], dt)[sample][:, None]
-    notes = (*recording.notes, _swings(recording, standing, free, env))
+        for leg, joints in enumerate(legs):
+            free[:, joints] &= free_phases(standing[:, leg], dt)[sample][:, None]
+    said = (
+        "and nothing says when feet touch the ground: all of the recording counts. A robot that walks needs contact "
+        "or foot_force, or gains that are stated."
+    )
+    if standing is not None:
+        said = _swings(recording, names, legs, free, by_torques)
+    notes = (*recording.notes, f"The base moves as the IMU shows, {said}")
     return replace(recording, frame=frame, frame_point=point, free=free, notes=notes)
 
 
-def _swings(recording: Recording, standing: np.ndarray | None, free: np.ndarray, env: ManagerBasedEnv) -> str:
+def _gains_are_stated(recording: Recording, env: ManagerBasedEnv) -> bool:
+    """Whether the drives' torques are known."""
+    return recording.drive.stiffness is not None or not env.cfg.sim2real.assumed_gains  # type: ignore[attr-defined]
+
+
+def _swings(
+    recording: Recording, names: Sequence[str], legs: Sequence[Sequence[int]], free: np.ndarray, by_torques: bool
+) -> str:
     """How much of the recording counts."""
-    if standing is None:
+    if not recording.feet and not by_torques:
         return (
-            "The base moves as the IMU shows, and nothing says when feet touch the ground: all of the recording "
-            "counts. A robot that walks needs contact or foot_force."
+            "and no contact is logged: all of the recording counts. The drives' torques balance without a force of "
+            "the ground."
         )
     said = []
-    for foot, joints in zip(recording.feet, joints_of_feet(env, recording.feet, recording.label), strict=True):
+    for name, joints in zip(names, legs, strict=True):
         own = free[:, joints[0]]
         phases = int((np.diff(own.astype(int), prepend=0) == 1).sum())
-        said.append(f"{foot} {100 * own.mean():.0f} % of the time in {phases} swings")
+        said.append(f"{name} {100 * own.mean():.0f} % of the time in {phases} swings")
     held = [name for i, name in enumerate(recording.joint_names) if not free[:, i].any()]
     never = (
         f" {listed(held, 6)}: always held by the ground, so nothing of them is identified. Lift that leg, or record it "
@@ -66,7 +86,12 @@ def _swings(recording: Recording, standing: np.ndarray | None, free: np.ndarray,
         if held
         else ""
     )
-    return f"The base moves as the IMU shows, and a leg counts while its foot is in the air: {listed(said)}.{never}"
+    how = (
+        "and no contact is logged: a leg counts while the torques of its drives balance without a force of the ground"
+        if by_torques
+        else "and a leg counts while its foot is in the air"
+    )
+    return f"{how}: {listed(said)}.{never}"
 
 
 def imu_pose(model: mujoco.MjModel, imu: ImuPose, label: str) -> tuple[np.ndarray, np.ndarray]:
@@ -115,8 +140,7 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
         ValueError: If the model has nothing of that name.
     """
     robot, model = env.scene["robot"], env.sim.model
-    names, result = list(robot.joint_names), []
-    trees = [[names.index(name) for name in tree] for tree in independent_trees(env)]
+    names, trees, result = list(robot.joint_names), trees_of(env), []
     for foot in feet:
         own = chain_of_foot(model, foot, names)
         if not own:
@@ -127,6 +151,12 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
             )
         result.append(sorted({j for tree in trees if set(tree) & set(own) for j in tree}))
     return result
+
+
+def trees_of(env: ManagerBasedEnv) -> list[list[int]]:
+    """Joints that move each other, by index."""
+    names = list(env.scene["robot"].joint_names)
+    return [[names.index(name) for name in tree] for tree in independent_trees(env)]
 
 
 def chain_of_foot(model: mujoco.MjModel, foot: str, joints: Sequence[str]) -> list[int]:

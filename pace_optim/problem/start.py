@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pace_actuators.base_parameters import CARRIED
-from pace_envs import ManagerBasedRLEnv
+from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv
 from pace_envs.from_model import defaults
 from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
 from pace_envs.tasks.pace.pace_cfg import PaceCfg
@@ -109,19 +109,25 @@ def _half(recording: Recording) -> int:
     return max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
 
 
-def asked_torque(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+def asked_torque(env: ManagerBasedEnv, recording: Recording) -> np.ndarray:
     """What the drives were asked for, within the configured limits, (T, n) [N m]."""
     speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
-    kp, kd = (
-        of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
-        for name in ("stiffness", "damping")
-    )
+    kp, kd = gains(env, recording)
     steps = recording.sample_steps
     asked_speed = 0.0 if recording.command_vel is None else recording.command_vel[steps]
     torque = kp * (recording.sampled_command - recording.dof_pos) + kd * (asked_speed - speed)
     torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
     limit = of_joints(env, "effort_limit")
     return np.clip(torque, -limit, limit)
+
+
+def gains(env: ManagerBasedEnv, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness [N m/rad] and damping [N m s/rad] of the drives' loops, (n,) each."""
+    kp, kd = (
+        of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
+        for name in ("stiffness", "damping")
+    )
+    return kp, kd
 
 
 def _smooth(position: np.ndarray, half: int) -> np.ndarray:

@@ -23,7 +23,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.comparison.load_torque import frame_motion, inverse_dynamics, model_of
+from pace_optim.problem.bounded_least_squares import bounded_least_squares
+from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
 from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
 from pace_optim.recording.moving_base import standing_feet
@@ -201,9 +202,17 @@ class Links:
     direction: np.ndarray
     """Sign of the speed, smoothed like all else; (N, n) each."""
 
+    motion: LinkMotion
+    _position: np.ndarray
+
     @classmethod
-    def of(cls, view: View) -> Links:
-        """Of a recording."""
+    def of(cls, view: View, before: Links | None = None) -> Links:
+        """Of a recording.
+
+        Args:
+            view: The recording.
+            before: Of the same recording otherwise; joints that move alike under the same gravity are looked at once.
+        """
         position = view.smooth(view.position)
         speed = np.gradient(position, view.dt, axis=0)
         acceleration = np.gradient(speed, view.dt, axis=0)
@@ -215,14 +224,29 @@ class Links:
             few *= _SELDOM
         every = max(1, int(view.width) if view.free is None else 1, (len(position) - first - edge) // few)
         rows = np.arange(first, len(position) - edge, every)
-        model = copy.copy(view.model)
-        model.opt.gravity[:] = view.gravity
+        if before is not None and before.is_of(view, rows):
+            motion = before.motion
+        else:
+            model = copy.copy(view.model)
+            model.opt.gravity[:] = view.gravity
+            motion = LinkMotion.of(model, view.joints, position[rows], speed[rows], acceleration[rows])
         frame = None if view.frame is None else frame_motion(view.smooth(view.frame), view.dt)[rows]
-        torque = inverse_dynamics(
-            model, view.joints, position[rows], speed[rows], acceleration[rows], frame, view.point
-        )
         return cls(
-            rows=rows, torque=torque, speed=speed[rows], acceleration=acceleration[rows], direction=direction[rows]
+            rows=rows,
+            torque=motion.torque(frame, view.point),
+            speed=speed[rows],
+            acceleration=acceleration[rows],
+            direction=direction[rows],
+            motion=motion,
+            _position=view.position,
+        )
+
+    def is_of(self, view: View, rows: np.ndarray) -> bool:
+        """Whether a recording has the same motion of joints at the same instants, under the same gravity."""
+        return (
+            view.position is self._position
+            and np.array_equal(rows, self.rows)
+            and np.array_equal(view.gravity, self.motion.model.opt.gravity)
         )
 
 
@@ -276,30 +300,12 @@ def _balance(view: View, links: Links, j: int, moving: np.ndarray, further: np.n
         given = view.smooth_given(j, delay)
         torque, slope = given[rows], (given[rows + 1] - given[rows - 1]) / (2 * view.dt)
         spread = float(np.square(torque - torque.mean()).sum())
-        _, left = _bounded(
+        _, left = bounded_least_squares(
             np.column_stack([*columns[:4], np.ones(len(rows)), slope, *columns[4:]]), torque, lower, upper
         )
         if spread > 0 and (best is None or left < best[0]):
             best = left, Balance(misfit=float(np.sqrt(left / spread)), delay=delay)
     return None if best is None else best[1]
-
-
-def _bounded(table: np.ndarray, values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least squares within bounds: what leaves them furthest is held there, one after another; and what is left."""
-    scale = np.sqrt(np.square(table).mean(axis=0)) + 1e-12
-    table = table / scale
-    square, target = table.T @ table, table.T @ values
-    square[np.diag_indices_from(square)] += 1e-9 * len(values)
-    low, high = lower * scale, upper * scale
-    found, free = np.zeros(len(scale)), np.ones(len(scale), dtype=bool)
-    while free.any():
-        found[free] = np.linalg.solve(square[np.ix_(free, free)], (target - square[:, ~free] @ found[~free])[free])
-        beyond = np.where(free, np.maximum(low - found, found - high), 0.0)
-        worst = int(beyond.argmax())
-        if beyond[worst] <= 0:
-            break
-        found[worst], free[worst] = np.clip(found[worst], low[worst], high[worst]), False
-    return found / scale, float(np.square(values - table @ found).sum())
 
 
 def without(view: View, where: np.ndarray) -> View:

@@ -112,7 +112,7 @@ class Evidence:
     def of(cls, view: View, before: Evidence | None = None, joints: Iterable[int] | None = None) -> Evidence:
         """Of a recording; where only some joints have changed since, the others keep their balance."""
         if before is None or not before.is_same_motion(view):
-            links = Links.of(view)
+            links = Links.of(view, None if before is None else before.links)
             return cls(view=view, links=links, balance=balances(view, links, range(len(view.joints))))
         changed = balances(view, before.links, range(len(view.joints)) if joints is None else joints)
         return cls(view=view, links=before.links, balance={**before.balance, **changed})
@@ -466,7 +466,7 @@ def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndar
 
     def misfit(value: float, reference: Evidence) -> float:
         view = replace(changed(float(np.exp(value))), coarse=reference.view.coarse)
-        links = reference.links if reference.is_same_motion(view) else Links.of(view)
+        links = reference.links if reference.is_same_motion(view) else Links.of(view, reference.links)
         return float(sum(np.log(each.misfit) for each in balances(view, links, joints).values()))
 
     values = np.log(np.sort(values))
@@ -644,7 +644,7 @@ def _best_change(evidence: Evidence) -> tuple[Check, Change, Evidence] | None:
 def _may_explain(coarse: Evidence, change: Change) -> bool:
     """Whether a change helps its own joints at the few instants that are looked at first."""
     view = replace(change.view, coarse=True)
-    links = coarse.links if coarse.is_same_motion(view) else Links.of(view)
+    links = coarse.links if coarse.is_same_motion(view) else Links.of(view, coarse.links)
     found = balances(view, links, change.joints)
     ratio = [each.misfit / coarse.balance[j].misfit for j, each in found.items() if j in coarse.balance]
     return bool(ratio) and bool(np.exp(np.mean(np.log(ratio))) < _WORTH)

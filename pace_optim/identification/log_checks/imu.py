@@ -91,12 +91,14 @@ def late(view: View) -> tuple[View, float] | None:
     if view.frame is None:
         return None
     coarse = replace(view, coarse=True)
-    before = _misfit(coarse)
+    links = Links.of(coarse)
+    before = _misfit(coarse, links)
     if before is None:
         return None
 
     def misfit(delay: float) -> float:
-        return _misfit(_earlier(coarse, delay)) or before
+        earlier = _earlier(coarse, delay)
+        return _misfit(earlier, Links.of(earlier, links)) or before
 
     found = minimize_scalar(misfit, bounds=(_EARLY, _LATE), method="bounded", options={"xatol": 5e-4, "maxiter": 12})
     if abs(found.x) < _NAMED or found.fun > _GAIN * before:
@@ -112,9 +114,9 @@ def _earlier(view: View, delay: float) -> View:
     return replace(view, frame=np.stack([np.interp(at + delay, at, column) for column in view.frame.T], axis=1))
 
 
-def _misfit(view: View) -> float | None:
+def _misfit(view: View, links: Links) -> float | None:
     """Geometric mean of the joints' misfits; ``None`` where no joint is judged."""
-    found: dict[int, Balance] = balances(view, Links.of(view), range(len(view.joints)))
+    found: dict[int, Balance] = balances(view, links, range(len(view.joints)))
     return float(np.exp(np.mean([np.log(each.misfit) for each in found.values()]))) if found else None
 
 

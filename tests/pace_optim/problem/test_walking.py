@@ -14,7 +14,7 @@ from pace_optim.estimate.derivatives import colour, stencil
 from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
 from pace_optim.problem.base_path import base_path
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
-from pace_optim.problem.moving_base import imu_pose, joints_of_feet
+from pace_optim.problem.moving_base import imu_pose, joints_of_feet, on_moving_base
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.dataset import make_dataset
@@ -123,6 +123,22 @@ def test_a_joint_that_stands_is_where_it_was_measured(walk):
     assert float(residuals.error[0][held].abs().max()) == 0.0
     share = problem.dataset.carried.free.double().mean(dim=0)
     assert bool((share > 0.1).all()) and bool((share < 0.9).all())
+
+
+def test_without_contacts_legs_are_in_the_air_while_their_torques_balance(walk, env):
+    logged = walk[0].dataset.recordings[0]
+    found = on_moving_base(replace(logged, contact=None, feet=()), env)
+    assert "no contact is logged: a leg counts while the torques of its drives balance" in found.notes[-1]
+    for leg in range(4):
+        free, wanted = found.free[:, 2 * leg], logged.free[:, 2 * leg]
+        assert free.mean() == pytest.approx(wanted.mean(), rel=0.1)
+        assert not (free & logged.contact[:, leg]).any()
+
+
+def test_legs_in_ropes_are_in_the_air_throughout(tmp_path):
+    problem, _ = walking_problem(tmp_path, crawler(2, feet={}, swing=2.0), duration=0.8)
+    assert bool(problem.dataset.carried.free[1:].all())
+    assert any("all of the recording counts" in note for note in problem.dataset.recordings[0].notes)
 
 
 def test_error_bars_know_of_an_imu_that_is_late(walk):

@@ -1,0 +1,90 @@
+"""Torques that move a robot's links as given: inverse dynamics, on a base that rests or moves."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from pace_envs import ManagerBasedEnv
+from pace_envs.motor_coordinates import DrivenJoints
+from pace_envs.moving_frame import FrameState, bias_in_frame
+
+_MODEL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos")
+"""What a recording's load may change."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinkMotion:
+    """A motion of K instants of some joints of a model, whose base may still move in any way."""
+
+    model: mujoco.MjModel
+    driven: DrivenJoints
+    at_rest: np.ndarray
+    """Torques of all degrees of freedom on a base that rests, (K, nv) [N m]."""
+    bias: np.ndarray
+    """Their part that the base changes, (K, nv) [N m]."""
+    state: FrameState
+
+    @classmethod
+    def of(
+        cls,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        position: np.ndarray,
+        speed: np.ndarray,
+        acceleration: np.ndarray,
+    ) -> LinkMotion:
+        """Of n joints.
+
+        Args:
+            model: The links.
+            joints: Names, (n,); motors that move several joints among them.
+            position: (K, n) [rad].
+            speed: (K, n) [rad/s].
+            acceleration: (K, n) [rad/s²].
+        """
+        data, driven = mujoco.MjData(model), DrivenJoints.of_model(model, joints)
+        qpos = [model.joint(name).qposadr[0] for name in driven.joints]
+        dof = [model.joint(name).dofadr[0] for name in driven.joints]
+        position, speed, acceleration = (driven.to_joints(each) for each in (position, speed, acceleration))
+        torque, bias = np.empty((2, len(position), model.nv))
+        state = FrameState.empty(model, len(position))
+        for k in range(len(position)):
+            data.qpos[qpos], data.qvel[dof], data.qacc[dof] = position[k], speed[k], acceleration[k]
+            mujoco.mj_inverse(model, data)
+            torque[k], bias[k] = data.qfrc_inverse, data.qfrc_bias
+            state.keep(k, data)
+        return cls(model=model, driven=driven, at_rest=torque, bias=bias, state=state)
+
+    def torque(self, frame: np.ndarray | None = None, point: np.ndarray | None = None) -> np.ndarray:
+        """Torques of the joints, (K, n) [N m].
+
+        Args:
+            frame: How the model's frame moves, (K, 9): see :mod:`pace_envs.moving_frame`; ``None``: it rests.
+            point: Where its specific force acts, (3,) [m].
+        """
+        torque = self.at_rest
+        if frame is not None and point is not None:
+            torque = torque - self.bias + bias_in_frame(self.model, self.state, frame, point)
+        dof = [self.model.joint(name).dofadr[0] for name in self.driven.joints]
+        return self.driven.efforts_of_motors(torque[:, dof])
+
+
+def frame_motion(frame: np.ndarray, dt: float) -> np.ndarray:
+    """Angular velocity, angular acceleration and specific force, (K, 9), of the first and the last of them, (K, 6)."""
+    return np.concatenate([frame[:, :3], np.gradient(frame[:, :3], dt, axis=0), frame[:, 3:]], axis=1)
+
+
+def model_of(env: ManagerBasedEnv, row: int) -> mujoco.MjModel:
+    """One environment's model, with drives that neither weigh nor rub."""
+    model = copy.deepcopy(env.sim.model)
+    for name in _MODEL_FIELDS:
+        getattr(model, name)[:] = env.sim.expand(name)[row].numpy().reshape(getattr(model, name).shape)
+    for name in ("dof_armature", "dof_damping", "dof_frictionloss"):
+        getattr(model, name)[:] = 0.0
+    env.scene["robot"].driven.clear(model)
+    return model
