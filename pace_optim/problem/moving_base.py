@@ -37,26 +37,31 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
     when = at if recording.sample_offset is None else at + recording.sample_offset
     shown = np.concatenate([recording.base_ang_vel @ axes.T, recording.base_lin_acc @ axes.T], axis=1)
     frame = np.stack([np.interp(steps, when, column) for column in shown.T], axis=1)
-    legs = joints_of_feet(env, recording.feet, recording.label)
-    names, standing, by_torques = recording.feet, standing_feet(recording), False
+    legs, names = joints_of_feet(env, recording.feet, recording.label), recording.feet
+    standing, how = standing_feet(recording), "a leg counts while its foot is in the air"
     if standing is None and _gains_are_stated(recording, env):
         legs = trees_of(env)
         names = tuple(recording.joint_names[joints[0]] for joints in legs)
         standing = standing_legs(recording, env, legs, shown, point)
-        by_torques = standing is not None and bool(standing.any())
+        how = "no contact is logged: a leg counts while its drives' torques balance without a force of the ground"
     free = np.ones((len(steps), recording.num_joints), dtype=bool)
-    if standing is not None:
+    if standing is None:
+        said = (
+            "nothing says when feet touch the ground: all of the recording counts. A robot that walks needs contact "
+            "or foot_force, or gains that are stated."
+        )
+    elif recording.contact is None and recording.foot_force is None and not standing.any():
+        said = (
+            "no contact is logged: the drives' torques balance without a force of the ground, so all of the recording "
+            "counts."
+        )
+    else:
         dt = float(np.median(np.diff(recording.time)))
         sample = np.searchsorted(at, steps, side="right") - 1
         for leg, joints in enumerate(legs):
             free[:, joints] &= free_phases(standing[:, leg], dt)[sample][:, None]
-    said = (
-        "and nothing says when feet touch the ground: all of the recording counts. A robot that walks needs contact "
-        "or foot_force, or gains that are stated."
-    )
-    if standing is not None:
-        said = _swings(recording, names, legs, free, by_torques)
-    notes = (*recording.notes, f"The base moves as the IMU shows, {said}")
+        said = f"{how}: {_swings(recording, names, legs, free)}"
+    notes = (*recording.notes, f"The base moves as the IMU shows, and {said}")
     return replace(recording, frame=frame, frame_point=point, free=free, notes=notes)
 
 
@@ -65,15 +70,8 @@ def _gains_are_stated(recording: Recording, env: ManagerBasedEnv) -> bool:
     return recording.drive.stiffness is not None or not env.cfg.sim2real.assumed_gains  # type: ignore[attr-defined]
 
 
-def _swings(
-    recording: Recording, names: Sequence[str], legs: Sequence[Sequence[int]], free: np.ndarray, by_torques: bool
-) -> str:
-    """How much of the recording counts."""
-    if not recording.feet and not by_torques:
-        return (
-            "and no contact is logged: all of the recording counts. The drives' torques balance without a force of "
-            "the ground."
-        )
+def _swings(recording: Recording, names: Sequence[str], legs: Sequence[Sequence[int]], free: np.ndarray) -> str:
+    """How often each leg swings, and which joints never do."""
     said = []
     for name, joints in zip(names, legs, strict=True):
         own = free[:, joints[0]]
@@ -86,12 +84,7 @@ def _swings(
         if held
         else ""
     )
-    how = (
-        "and no contact is logged: a leg counts while the torques of its drives balance without a force of the ground"
-        if by_torques
-        else "and a leg counts while its foot is in the air"
-    )
-    return f"{how}: {listed(said)}.{never}"
+    return f"{listed(said)}.{never}"
 
 
 def imu_pose(model: mujoco.MjModel, imu: ImuPose, label: str) -> tuple[np.ndarray, np.ndarray]:

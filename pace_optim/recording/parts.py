@@ -24,7 +24,7 @@ _EVALUATIONS = 200_000_000
 """Times that a joint's acceleration is computed for them: half a minute of two cores."""
 _COPIES = 4
 """Arrays of that size that there are at once."""
-_WALKING = 40.0
+_WALKING = 20.0
 """Of a robot that walks, so much is used by default [s]: a walk repeats itself."""
 _LENGTH = 5.0
 """Of a part [s]."""

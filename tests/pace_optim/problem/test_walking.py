@@ -128,7 +128,7 @@ def test_a_joint_that_stands_is_where_it_was_measured(walk):
 def test_without_contacts_legs_are_in_the_air_while_their_torques_balance(walk, env):
     logged = walk[0].dataset.recordings[0]
     found = on_moving_base(replace(logged, contact=None, feet=()), env)
-    assert "no contact is logged: a leg counts while the torques of its drives balance" in found.notes[-1]
+    assert "no contact is logged: a leg counts while its drives' torques balance" in found.notes[-1]
     for leg in range(4):
         free, wanted = found.free[:, 2 * leg], logged.free[:, 2 * leg]
         assert free.mean() == pytest.approx(wanted.mean(), rel=0.1)
