@@ -25,6 +25,8 @@ def step_error(problem: Problem, physical: torch.Tensor, where: torch.Tensor) ->
     windows = Windows.of(problem.dataset, problem.control_dt).with_samples(where)
     problem, counts = replace(problem, dataset=windows.cut(problem.dataset)), windows.mask(where)
     finer = problem.with_physics_dt(problem.physics_dt / 2)
-    coarse, fine = (p.evaluator().residuals(physical[None], counts) for p in (problem, finer))
-    change = (coarse.error[0] - fine.error[0])[coarse.where]
+    evaluator, fine = problem.evaluator(), finer.evaluator()
+    coarse = evaluator.residuals(physical[None], counts)
+    fine.phases = evaluator.phases
+    change = (coarse.error[0] - fine.residuals(physical[None], counts).error[0])[coarse.where]
     return change.square().mean(dim=0).sqrt().nan_to_num(nan=0.0, posinf=0.0)

@@ -12,9 +12,9 @@ from scipy.optimize import lsq_linear
 from pace_envs import load_env_cfg
 from pace_envs.task_source import use_task
 from pace_optim.identification.log_checks import check_log, checked
-from pace_optim.identification.log_checks.balance import _bounded
 from pace_optim.identification.log_checks.checks import _flat_ends
 from pace_optim.identification.setup import load_for_fit
+from pace_optim.problem.bounded_least_squares import bounded_least_squares
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
 from pace_optim.run.settings import FitSettings
@@ -82,7 +82,7 @@ def test_every_bound_is_kept_and_little_is_lost_by_it():
     for _ in range(50):
         table, values = rng.normal(size=(40, 6)), rng.normal(size=40)
         lower, upper = -rng.uniform(0, 0.1, 6), rng.uniform(0, 0.1, 6)
-        found, left = _bounded(table, values, lower, upper)
+        found, left = bounded_least_squares(table, values, lower, upper)
         assert (found >= lower - 1e-9).all() and (found <= upper + 1e-9).all()
         best = 2 * lsq_linear(table, values, (lower, upper)).cost
         assert best <= left * (1 + 1e-9) and left < 1.02 * best
