@@ -46,7 +46,7 @@ _STEPS = 20
 _HANGS = 0.5
 """Misfit of all instants, over the torque's standard deviation, below which a leg never stands."""
 _FOUND = 0.12
-"""Misfit of those that balance, over the deviation of their torque, above which no instant is in the air."""
+"""Misfit of those that balance, over the deviation of their torque, that is in the air; the joints' geometric mean."""
 _BALANCED = 0.1
 """Part of the torque's standard deviation that is left in the air at most."""
 _SMEARED = 1.5
@@ -182,7 +182,7 @@ def _left_of(balances: Sequence[_Balance], joints: Sequence[int], inner: np.ndar
             else:
                 misfit = _rms(balance.left(own, rows)[rows]) / np.maximum(balance.drive[rows][:, own].std(axis=0), 1e-9)
                 gain = float(energy[left[looked] < _BALANCED].sum())
-                if (misfit < _FOUND).all() and (best is None or gain > best[0]):
+                if np.log(misfit).mean() < math.log(_FOUND) and (best is None or gain > best[0]):
                     best = gain, left
     return None if best is None else best[1]
 
