@@ -411,3 +411,14 @@ def test_mujocos_warnings_leave_no_file_in_the_users_folder(tmp_path, monkeypatc
     data.qpos[:] = np.nan
     mujoco.mj_step(model, data)
     assert data.warning.number.any() and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("sensors", "textures"), [(True, 1), (False, 0)])
+def test_a_model_that_nothing_looks_at_has_no_textures(sensors, textures):
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><asset><texture name="t" type="2d" builtin="flat" rgb1="1 0 0" width="64" height="64"/>'
+        '<material name="m" texture="t" rgba="0 1 0 1"/></asset>'
+        '<worldbody><body><joint/><geom size="0.1" material="m"/></body></worldbody></mujoco>'
+    )
+    model = make_simulation(SimulationCfg(sensors=sensors), spec, 1).model
+    assert model.ntex == textures and model.mat_rgba.tolist() == [[0, 1, 0, 1]]
