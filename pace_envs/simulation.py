@@ -51,10 +51,11 @@ class SimulationCfg:
 
     With x and v the state, M, D and f the inertia, the damping and all other forces:
 
-        x½ = x + h v / 2        M(x½) (v₊ - v) = h (f(x½, v) - D (v + v₊) / 2)        x₊ = x½ + h v₊ / 2
+        x½ = x + h v / 2        M(x½) (v₊ - v) = h (f - c(x½, v½) - D (v + v₊) / 2)        x₊ = x½ + h v₊ / 2
 
+    Gravity and Coriolis forces c act at the speed of the step's middle, v½ = v + (v - v₋) / 2 with v₋ one step before.
     What is held over the step (a drive's torque) acts when it should, and Coulomb friction turns where the speed passes
-    zero (:mod:`pace_envs.coulomb`). Of first order remain the forces that grow with the square of the speed.
+    zero (:mod:`pace_envs.coulomb`). Contacts and limits remain of first order.
     """
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
@@ -119,6 +120,7 @@ class Simulation:
         device: Device of all tensors.
         dtype: Type of all tensors.
         model: The compiled model.
+        gained: Of speed in the last step of second order, in MuJoCo's coordinates, (num_envs, nv).
         version: Grows where arrays were replaced: CUDA graphs that were captured before are of no use.
     """
 
@@ -167,6 +169,8 @@ class Simulation:
         self._constants_changed = False
         self._expanded: dict[str, torch.Tensor] = {}
         self._drift = Drift(self.model, self.device) if self.is_trapezoidal else None
+        self.gained = torch.zeros_like(self.qvel)
+        self._bias: torch.Tensor | None = None
         self._link_fields: dict[str, torch.Tensor] = {}
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
         self._frame: _Frame | None = None
@@ -192,12 +196,12 @@ class Simulation:
     @property
     def qfrc_bias(self) -> torch.Tensor:
         """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m]."""
-        bias = self._own_bias if self._frame is None or self._frame.bias is None else self._frame.bias
+        bias = self._own_bias if self._bias is None else self._bias
         return bias if self.coordinates is None else self.coordinates.efforts_of_motors(bias)
 
     @cached_property
     def _own_bias(self) -> torch.Tensor:
-        """The same where the base is at rest."""
+        """The same as MuJoCo computes it: of a base at rest, at the speed before a step."""
         return self.bind("qfrc_bias")
 
     def move_base(self, motion: torch.Tensor | None, point: np.ndarray | None = None) -> None:
@@ -209,7 +213,7 @@ class Simulation:
             point: Where the specific force was measured, (num_envs, 3) [m], in the model's world.
         """
         if motion is None or point is None:
-            self._frame = None
+            self._frame = self._bias = None
         elif self._frame is None:
             self._frame = _Frame(motion=motion, point=point, fields=[self.bind(name).numpy() for name in FIELDS])
         else:
@@ -327,7 +331,7 @@ class Simulation:
     @property
     def state(self) -> list[torch.Tensor]:
         """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
-        return [self.bind(field) for field in _STATE]
+        return [*(self.bind(field) for field in _STATE), self.gained]
 
     def step(self) -> None:
         """Advance every simulation by one physics step."""
@@ -338,14 +342,23 @@ class Simulation:
         else:
             self._leap(self._drift)
 
-    def _step(self) -> None:
-        """MuJoCo's own step, in the frame of a base that moves."""
-        if self._frame is None:
+    def _step(self, middle: torch.Tensor | None = None) -> None:
+        """MuJoCo's own step, in the frame of a base that moves.
+
+        Args:
+            middle: Speeds at which gravity and Coriolis forces act, (num_envs, nv); ``None``: those before the step.
+        """
+        if middle is None and self._frame is None:
             self.batch.step()
             return
-        applied, own = self.qfrc_applied.clone(), self._own_bias  # bound before it is computed
+        applied, speed, own = self.qfrc_applied.clone(), self.qvel.clone(), self._own_bias
+        if middle is not None:
+            self.qvel.copy_(middle)
         self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self.qfrc_applied += own - self._frame.next_bias(self.model)
+        self._bias = own.clone() if self._frame is None else self._frame.next_bias(self.model)
+        self.qvel.copy_(speed)
+        self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.qfrc_applied += own - self._bias
         self.batch.step()
         self.qfrc_applied.copy_(applied)
 
@@ -362,9 +375,10 @@ class Simulation:
         with self._in_joints():
             outcomes = self._outcomes if self.turns_friction else None  # bound before the step that computes them
             before = self.qvel.clone()
-            self._step()
+            self._step(before + 0.5 * self.gained)
             if outcomes is not None:
                 self._turn_friction(before, outcomes, drift)
+            torch.sub(self.qvel, before, out=self.gained)
         drift(self.qpos, self.qvel, -0.5 * h)
         damping.copy_(whole)
         self.qfrc_applied.copy_(applied)
@@ -433,11 +447,15 @@ class Simulation:
         self.update_constants()
         with self._in_joints():
             self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
+        if self._bias is not None and self._frame is None:
+            rows = self.rows(env_ids)
+            self._bias[rows] = self._own_bias[rows]
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put the state of all or some simulations back to the model's (positions, speeds, forces, time)."""
         ids = None if env_ids is None else self.resolve_env_ids(env_ids)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.gained[self.rows(env_ids)] = 0.0
 
     def tensor(self, value: object) -> torch.Tensor:
         """A value as a tensor where, and of the type that, the simulation's are."""
@@ -544,16 +562,13 @@ class _Frame:
     """Of :data:`FIELDS`, live."""
     step: int = 0
     """Of ``motion``, the one that comes next."""
-    bias: torch.Tensor | None = None
-    """Of the last step, (num_envs, nv) [N m]."""
 
     def next_bias(self, model: mujoco.MjModel) -> torch.Tensor:
         """Of the step that comes next, at the present state."""
         motion = self.motion[min(self.step, len(self.motion) - 1)].numpy()
         self.step += 1
         state = FrameState(**dict(zip(FIELDS, self.fields, strict=True)))
-        self.bias = torch.from_numpy(bias_in_frame(model, state, motion, self.point))
-        return self.bias
+        return torch.from_numpy(bias_in_frame(model, state, motion, self.point))
 
 
 class Drift:

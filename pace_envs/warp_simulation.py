@@ -60,8 +60,17 @@ class WarpSimulation(Simulation):
             self._forget_graphs()
         return self._expanded[field]
 
-    def _step(self) -> None:
-        self._run("step")
+    def _step(self, middle: torch.Tensor | None = None) -> None:
+        if middle is None:
+            self._run("step")
+        else:
+            self._middle.copy_(middle)
+            self._run("halves")
+
+    @cached_property
+    def _middle(self) -> torch.Tensor:
+        """Speeds of a step's middle, which ``halves`` reads, (num_envs, nv)."""
+        return torch.zeros_like(self.qvel)
 
     @cached_property
     def _outcomes(self) -> dict[str, torch.Tensor]:
@@ -96,13 +105,13 @@ class WarpSimulation(Simulation):
         """Put the state of all or some simulations back to the model's."""
         rows = self.rows(env_ids)
         self.qpos[rows] = self._qpos0
-        for field in (self.qvel, self.qfrc_applied, *self._cleared):
+        for field in (self.qvel, self.qfrc_applied, self.gained, *self._cleared):
             field[rows] = 0.0
 
     @property
     def state(self) -> list[torch.Tensor]:
         """Live tensors of all that :meth:`reset` puts back, (num_envs, ...) each."""
-        return [self.qpos, self.qvel, self.qfrc_applied, *self._cleared]
+        return [self.qpos, self.qvel, self.qfrc_applied, self.gained, *self._cleared]
 
     def rows(self, env_ids: EnvIds) -> torch.Tensor | slice:
         """What selects environments; indices that are on the device already are trusted, so that nothing waits."""
@@ -197,9 +206,28 @@ class WarpSimulation(Simulation):
         wp.capture_launch(self._graphs[name], stream=stream)
 
     def _call(self, name: str) -> None:
+        if name == "halves":
+            self._halves()
+            return
         function: Callable[..., None] = getattr(self._mjw, name)
         more = [self._warp.from_torch(each) for each in (self._response, self._impulse)] if name == "solve_m" else []
         function(self.warp_model, self.data, *more)
+
+    def _halves(self) -> None:
+        """A step whose gravity and Coriolis forces act at the speed of its middle."""
+        model, data, wp, mjw = self.warp_model, self.data, self._warp, self._mjw
+        mjw.step1(model, data)
+        wp.copy(self._speed, data.qvel)
+        wp.copy(data.qvel, wp.from_torch(self._middle))
+        mjw.fwd_velocity(model, data)
+        wp.copy(data.qvel, self._speed)
+        mjw.passive(model, data)  # damping is that of the speed before the step
+        mjw.step2(model, data)
+
+    @cached_property
+    def _speed(self) -> Any:
+        """Where ``halves`` keeps the speeds before the step."""
+        return self._warp.empty_like(self.data.qvel)
 
     @contextlib.contextmanager
     def _on_stream(self) -> Iterator[None]:

@@ -157,16 +157,17 @@ class RobotKernel:
             "series": self._series,
             "memory": torch.empty(env.num_envs, max(1, source.memory), dtype=torch.float64),
             "bias": env.sim.qfrc_bias.clone() if reads_load else torch.zeros_like(env.sim.qvel),
-            "before": torch.empty(env.num_envs, 5, env.sim.model.nv, dtype=torch.float64),
+            "before": torch.zeros(env.num_envs, 6, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         if (course := self._course) is not None:
             tensors |= {name: getattr(course, name) for name in ("motion", "point", "held", "shift", "push")}
             tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
+        tensors["before"][:, 5] = env.sim.gained
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
             **dict.fromkeys(ARGUMENTS, 0),
-            **{name: self._batch.address_of(f"mj_{name}") for name in ("step", "step1", "step2")},
+            **{name: self._batch.address_of(function) for name, function in _FUNCTIONS.items()},
             "drift": self._batch.address_of("mj_integratePos") if env.sim.is_trapezoidal else 0,
             "solve": self._batch.address_of("mj_solveM") if env.sim.turns_friction else 0,
             "robots": env.num_envs,
@@ -235,6 +236,16 @@ class _Batch:
             status = self._library.mjb_status(self._batch)
             failed = next(i for i in range(len(self._models)) if ctypes.cast(status, ctypes.POINTER(ctypes.c_int))[i])
             raise ValueError(f"MuJoCo: {ctypes.string_at(self._library.mjb_error(self._batch, failed)).decode()}")
+
+
+_FUNCTIONS = {
+    "step1": "mj_step1",
+    "step2": "mj_step2",
+    "com_vel": "mj_comVel",
+    "rne": "mj_rne",
+    "tendon_bias": "mj_tendonBias",
+}
+"""Of MuJoCo, which every step calls."""
 
 
 class _Config(ctypes.Structure):

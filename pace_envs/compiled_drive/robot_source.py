@@ -17,44 +17,40 @@ from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import COLUMNS, SOURCE
 
 ARGUMENTS = {
-    "step": "void (*step)(const mjModel*, mjData*)",
+    # MuJoCo's functions
     "step1": "void (*step1)(const mjModel*, mjData*)",
     "step2": "void (*step2)(const mjModel*, mjData*)",
-    "drift": "Drift drift",
-    "solve": "Solve solve",
-    "robots": "long long robots",
+    "com_vel": "void (*com_vel)(const mjModel*, mjData*)",
+    "rne": "void (*rne)(const mjModel*, mjData*, int, mjtNum*)",
+    "tendon_bias": "void (*tendon_bias)(const mjModel*, mjData*, mjtNum*)",
+    "drift": "Drift drift",  # mj_integratePos where steps are those of Simulation._leap, else 0
+    "solve": "Solve solve",  # mj_solveM where friction turns, else 0
+    # sizes
+    "robots": "long long robots",  # environments
     "recordings": "long long recordings",
-    "first": "long long first",
-    "last": "long long last",
-    "end": "long long end",
-    "commands": "long long commands",
-    "slot": "const long long* slot",
-    "series": "const double* series",
-    "memory": "double* memory",
-    "bias": "double* bias",
-    "before": "double* before",
-    "out": "double* out",
-    "effort": "double* effort",
-    "state": "double* state",
-    "motion": "const double* motion",
-    "point": "const double* point",
-    "push": "const double* push",
-    "room": "double* room",
-    "held": "const double* held",
-    "shift": "const double* shift",
+    "first": "long long first",  # control step that it takes first
+    "last": "long long last",  # control step before which it ends
+    "end": "long long end",  # control step at which joints are only shown
+    "commands": "long long commands",  # control steps that commands last
+    # arrays
+    "slot": "const long long* slot",  # to which row of ``out`` each control step is shown (-1: none)
+    "series": "const double* series",  # (names, steps, recordings, joints)
+    "memory": "double* memory",  # of the drives of each environment
+    "bias": "double* bias",  # forces of gravity and motion (environments, nv)
+    "before": "double* before",  # room for a step (environments, 6, nv); its last row: what speeds gained
+    "out": "double* out",  # what is shown (rows, environments, joints)
+    "effort": "double* effort",  # the motors' torques there, where they are recorded
+    "state": "double* state",  # MuJoCo's positions and speeds there (rows, environments, nq + nv), or 0
+    # a base that moves, or 0
+    "motion": "const double* motion",  # (commands, physics steps of a control step, recordings, 9)
+    "point": "const double* point",  # where the specific force was measured (recordings, 3)
+    "push": "const double* push",  # what is added to it and to the angular acceleration (environments, 6)
+    "room": "double* room",  # (environments, 12 nbody)
+    # joints that are held, or 0
+    "held": "const double* held",  # positions and speeds (commands, recordings, joints, 2); NaN: free
+    "shift": "const double* shift",  # what is added to them (environments, joints, 2)
 }
-"""What ``simulate`` gets, eight bytes each: MuJoCo's step and its halves, its ``mj_integratePos`` where steps are
-those of ``Simulation._leap``, else 0, and its ``mj_solveM`` where friction turns, else 0; environments and recordings;
-the control steps from ``first`` to before ``last`` that it takes, and the one at which joints are only shown; how many
-steps commands last; to which row of ``out`` each step is shown (-1: none); series (names, steps, recordings, joints);
-the drives' memory and the forces of gravity and motion of each environment; room for what was before a step, and for
-its friction (environments, 5, nv); what is shown (rows, environments, joints), where they are recorded the motors'
-torques there (the same), and unless it is 0 MuJoCo's positions and speeds there (rows, environments, nq + nv). Unless
-it is 0, the motion of a base that moves (commands, physics steps of a control step, recordings, 9), where its specific
-force was measured (recordings, 3), what is added to that (environments, 3), and room to compute with (environments, 12
-nbody); unless it is 0, positions and speeds at which joints are held (commands, recordings, joints, 2; NaN: free), and
-what is added to them (environments, joints, 2). Then the leaves of each drive, each with the memory of its delays
-behind it."""
+"""What ``simulate`` gets, eight bytes each. Then the leaves of each drive, with the memory of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
 _BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n" + PRELUDE
@@ -140,21 +136,27 @@ static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
 {turns}
 static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
   {there}
-  double* before = a->before + (5 * robot + 2) * m->nv;
-  memcpy(before, d->qvel, m->nv * sizeof(double));
-  if (!a->motion) {{
-    a->step(m, d);
-    if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
-    {back}
-    return;
-  }}
-  double motion[{COLUMNS}];
-  memcpy(motion, a->motion + row(robot, k, {parts - 1}, part, a) * {COLUMNS}, sizeof motion);
-  for (int i = 0; i < 6; ++i) motion[{COLUMNS - 6} + i] += a->push[robot * 6 + i];
+  const int n = m->nv, leaps = a->drift != 0;
+  double *before = a->before + (6 * robot + 2) * n, *gained = before + 3 * n;
+  memcpy(before, d->qvel, n * sizeof(double));
   a->step1(m, d);
-  bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
+  if (leaps) {{
+    for (int i = 0; i < n; ++i) d->qvel[i] += 0.5 * gained[i];
+    a->com_vel(m, d);
+  }}
+  if (a->motion) {{
+    double motion[{COLUMNS}];
+    memcpy(motion, a->motion + row(robot, k, {parts - 1}, part, a) * {COLUMNS}, sizeof motion);
+    for (int i = 0; i < 6; ++i) motion[{COLUMNS - 6} + i] += a->push[robot * 6 + i];
+    bias_in_frame(m, d, motion, a->point + robot % a->recordings * 3, a->room + robot * 12 * m->nbody);
+  }} else if (leaps) {{
+    a->rne(m, d, 0, d->qfrc_bias);
+    a->tendon_bias(m, d, d->qfrc_bias);
+  }}
+  memcpy(d->qvel, before, n * sizeof(double));
   a->step2(m, d);
-  if (a->solve) turn_friction(m, d, before, before + m->nv, a->solve, a->drift);
+  if (a->solve) turn_friction(m, d, before, before + n, a->solve, a->drift);
+  for (int i = 0; i < n; ++i) gained[i] = d->qvel[i] - before[i];
   {back}
 }}
 static void advance(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
@@ -164,7 +166,7 @@ static void advance(mjModel* m, mjData* d, long long robot, long long k, int par
   }}
   const int n = m->nv;
   const double h = m->opt.timestep;
-  double *applied = a->before + 5 * robot * n, *damping = applied + n;
+  double *applied = a->before + 6 * robot * n, *damping = applied + n;
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
   for (int i = 0; i < n; ++i) {{
