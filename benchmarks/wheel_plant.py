@@ -1,7 +1,7 @@
 """A robot of a published model file in plain MuJoCo, with drives of its own: nothing here is this project's code.
 
 A PD loop at 1 kHz holds each joint: τ = clip(kp (q* - q_enc) - kd q̇), q_enc = q - bias. It sees a command a whole
-number of milliseconds after it was issued. Physics steps of 0.125 ms; base fixed, nothing touches.
+number of milliseconds after it was issued. Physics steps of 1/32 ms; base fixed, nothing touches.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-STEP = 0.000125
-"""Physics step [s]: 8 to a run of the drives' loops, 20 to a row of a log at 400 Hz."""
-LOOP_STEPS = 8
+STEP = 0.001 / 32
+"""Physics step [s]. MuJoCo's step is of first order: at 0.125 ms, it alone was wrong by as much as an encoder's noise."""
+LOOP_STEPS = 32
 """Physics steps between two runs of the drives' loops."""
 NOISE = 1e-4
 """Of the encoders [rad or m]."""
@@ -383,6 +383,7 @@ def log(plant: Plant, drives: Drives, target: np.ndarray, seed: int, torques: np
     model, columns, dofs = plant.model, plant.columns, plant.dofs
     model.dof_armature[dofs], model.dof_damping[dofs] = drives.armature, drives.viscous_friction
     model.dof_frictionloss[dofs] = drives.friction
+    mujoco.mj_setConst(model, mujoco.MjData(model))  # how soft a limit is follows from the armature
     hit = np.array([name in drives.hidden_on for name in drives.joints])
     added = _add_payload(plant, drives)
     data = mujoco.MjData(model)
