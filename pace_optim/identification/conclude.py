@@ -227,7 +227,7 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
     if rates.chosen == rates.fitted:
         return end
     x = end.problem.space.to_normalised(torch.from_numpy(rates.value_at(rates.chosen)))
-    return replace(end, problem=end.problem.with_drive_dt(rates.chosen)).moved(run, x)
+    return replace(_reached(run, run.with_loop(end.problem, rates.chosen, x)), rates=rates)
 
 
 def _with_step(run: Optimization, end: _End) -> _End:

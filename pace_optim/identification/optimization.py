@@ -269,6 +269,13 @@ class Optimization:
         self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
         return found.way
 
+    def with_loop(self, problem: Problem, period: float, x: torch.Tensor) -> Outcome:
+        """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""
+        other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
+        end = other.way.near(x, NEAR)
+        self._use(other)
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
     def at_half_the_step(
         self, problem: Problem, x: torch.Tensor, there: Residuals, change: torch.Tensor | None
     ) -> Outcome | None:

@@ -14,26 +14,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import Jacobian
+from pace_optim.estimate.derivatives import Colouring, Jacobian
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
-from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered, inverse_of
-from pace_optim.problem.evaluator import Residuals
+from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.estimate.way_down import WayDownCfg
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
-from pace_optim.terminal.parallel import parallel_map
 
 _RATES = (1e3, 2e3, 4e3, 8e3)
 """Rates of servo drives' loops [Hz]. Faster ones are between the last and a continuous loop, a period of 0."""
-_SIMULATED = (1e-3, 5e-4)
-"""Periods that are simulated beside the assumed one and a continuous loop [s]; shorter ones follow by a polynomial."""
-_FINER = 2
-"""All are simulated with a physics step that is this part of the finest of them: the step's error looks like a rate."""
+_USUAL, _FAST = 1e-3, 5e-4
+"""Periods that are simulated beside the assumed one [s]: the usual one of servo drives, and one that is far shorter. A
+continuous loop takes the place of that where a delay is the command's. Others follow by a polynomial."""
+_FINEST = 5e-4
+"""Physics step of all simulations at most [s], and half of the usual period: the step's error looks like a rate."""
 _COARSE = 2.0 + 1e-6
-"""Times the finest of them: a longer physics step may be one that made the recordings."""
-_CHORD_STEPS = 4
-"""Gauss–Newton steps with the derivatives of the assumed rate, at most."""
-_NOTHING_LEFT = 1e-5
-"""They end where the next is expected to lower the score by less than this part of it."""
+"""Times that: a longer physics step may be one that made the recordings."""
+_REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=1e-5, near_enough=1e-5)
+"""A fit with another period. Rates differ by a thousandth of the score, so it goes to the end."""
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
 UNEXPLAINED = 0.5
@@ -65,8 +64,13 @@ class LoopRates:
 
     @property
     def chosen(self) -> float:
-        """The fitted period where the recordings allow it, else the longest that they do [s]."""
-        return self.fitted if self.fitted in self.allowed else self.allowed[0]
+        """The fitted period where the recordings allow it, else the likeliest [s]."""
+        return self.fitted if self.fitted in self.allowed else self.periods[int(self.weights.argmax())]
+
+    @property
+    def farthest(self) -> float:
+        """The allowed period that is farthest from the chosen one [s]."""
+        return max(self.allowed, key=lambda period: abs(period - self.chosen))
 
     def value_at(self, period: float) -> np.ndarray:
         """What a fit finds with a candidate, physical (size,)."""
@@ -81,8 +85,8 @@ class LoopRates:
         return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
 
     def to_dict(self, space: ParameterSpace) -> dict[str, Any]:
-        """For ``result.json``: the periods, and the values at both ends of what the recordings allow."""
-        ends = dict.fromkeys((self.chosen, self.allowed[-1]))
+        """For ``result.json``: the periods, and the values with the chosen one and the farthest from it."""
+        ends = dict.fromkeys((self.chosen, self.farthest))
         return {
             **used_loop(self.assumed, self.chosen),
             "allowed_s": list(self.allowed),
@@ -96,23 +100,23 @@ class LoopRates:
             space: The parameters.
             known: Which of them have an error bar, (size,) bool.
         """
-        slow, fast = self.chosen, self.allowed[-1]
+        used, other = self.chosen, self.farthest
         begin = "The loop rate of the drives is not stated (--drive_dt). "
         if len(self.allowed) == 1:
-            begin += f"These recordings favour {_rate(slow)}; the error bars include the others. "
-        elif slow != self.assumed:
-            begin += f"These recordings allow {_rate(self.allowed[0])} to {_rate(fast)}; {_rate(slow)} is used. "
-        if fast == slow:
+            begin += f"These recordings favour {_rate(used)}; the error bars include the others. "
             return [f"{begin}[W15]"]
-        change = self.value_at(fast) - self.value_at(slow)
-        size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(slow)), 1e-12), 0.0)
+        if used != self.assumed:
+            slow, fast = self.allowed[0], self.allowed[-1]
+            begin += f"These recordings allow {_rate(slow)} to {_rate(fast)}; {_rate(used)} is used. "
+        change = self.value_at(other) - self.value_at(used)
+        size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(used)), 1e-12), 0.0)
         shown = [
             f"{space.labels[i].split('/')[0].replace('_', ' ')} of {space.labels[i].split('/')[1]} is "
-            f"{self.value_at(slow)[i]:.4g} with {_rate(slow)} and {self.value_at(fast)[i]:.4g} with {_rate(fast)}"
+            f"{self.value_at(used)[i]:.4g} with {_rate(used)} and {self.value_at(other)[i]:.4g} with {_rate(other)}"
             for i in np.argsort(-size)[:_NAMED].tolist()
         ]
         return [
-            f"{begin}These recordings cannot separate {_rate(slow)} and {_rate(fast)}: {', '.join(shown)}. The error "
+            f"{begin}These recordings cannot separate {_rate(used)} and {_rate(other)}: {', '.join(shown)}. The error "
             "bars include the difference; a stated rate removes it. [W15]"
         ]
 
@@ -129,10 +133,10 @@ def used_loop(assumed: float, used: float) -> dict[str, float]:
 def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
     """Compare the rates that the loops may have, at a fit with one of them.
 
-    All are simulated with one physics step, and fitted again by Gauss-Newton steps with the derivatives J of the
-    fitted rate (the chord method). Residuals and values between the shortest simulated periods follow by the
-    polynomial through these. A rate is not told by what was fitted alone: the residuals are those on all samples, also
-    on those kept for validation. With r those of a candidate and d = r - r' their difference to the best one's,
+    All are simulated with one physics step, and fitted again on pieces of the recordings, each from the end of the one
+    nearest to it. Residuals and values between the shortest simulated periods follow by the polynomial through these.
+    What was fitted alone does not tell a rate: the residuals are those on all samples of the pieces, also on those kept
+    for validation. With r those of a candidate and d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
@@ -155,17 +159,24 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     control, fitted = problem.control_dt, problem.loop_dt
     logged = max(r.command_dt or 0.0 for r in problem.dataset.recordings)
     slower = [logged] if logged > (1 + _APART) * control else []
-    continuous = [0.0] if problem.delay_mode == "command" else []  # a delayed torque needs a loop that holds it
-    periods = sorted({control, fitted, *(p for p in _SIMULATED if p < control), *slower, *continuous}, reverse=True)
-    finest = min(*_SIMULATED, control) / _FINER
-    ends = parallel_map(
-        lambda some: [_refitted(problem.with_loop(period, finest), x, there, known) for period in some], periods
-    )
-    found = {period: end for period, end in zip(periods, ends, strict=True) if end is not None}
-    least = min((end.score for end in found.values()), default=math.inf)
-    coarser = problem.physics_dt > _COARSE * _FINER * finest
-    if fitted not in found or (coarser and float(there.residuals.score[0]) <= least):
-        return None
+    fast = 0.0 if problem.delay_mode == "command" else _FAST  # a delayed torque needs a loop that holds it
+    periods = sorted({control, fitted, *(p for p in (_USUAL, fast) if p < control), *slower}, reverse=True)
+    pieces, finest = problem.on_pieces(WayDownCfg().share), min(_FINEST, control / 2)
+    hessian, _ = there.normal_equations()
+    start, ends = Descent(x=x, hessian=hessian), dict[float, _Refit]()
+    for period in sorted(periods, key=lambda each: abs(each - fitted)):
+        nearest = min(ends, key=lambda other: abs(other - period), default=None)
+        begin = start if nearest is None else ends[nearest].descent
+        end = _refitted(pieces.with_loop(period, finest), begin, there.colouring)
+        if end is not None:
+            ends[period] = end
+        elif period == fitted:
+            return None
+    if problem.physics_dt > _COARSE * finest:
+        coarse = _refitted(pieces, start, there.colouring)
+        if coarse is not None and coarse.descent.score <= min(end.descent.score for end in ends.values()):
+            return None
+    found = {period: ends[period] for period in periods if period in ends}
     nodes = tuple(found)[-3:]
     between = [1 / f for f in _RATES if 1 / f < max(nodes) and 1 / f not in found] if len(nodes) > 1 else []
     candidates = tuple(sorted({*found, *between}, reverse=True))
@@ -192,42 +203,25 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
 class _Refit:
     """A fit with another period."""
 
+    descent: Descent
+    """On the training samples."""
     values: np.ndarray
     """Physical, (size,)."""
-    score: float
-    """On the training samples [rad²]."""
     error: torch.Tensor
     """On all samples, (K, R, n) [rad]."""
     where: torch.Tensor
     """Which samples these are, (K, R) bool."""
 
 
-def _refitted(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> _Refit | None:
-    """The end of a few steps with known derivatives; ``None`` where a simulation diverges."""
-    evaluator, free = problem.training_evaluator(), np.flatnonzero(known)
-    hessian, _ = there.normal_equations()
-    inverse = torch.from_numpy(inverse_of(hessian.numpy()[np.ix_(free, free)])[0])
-    best: tuple[torch.Tensor, Residuals] | None = None
-    for _ in range(1 + _CHORD_STEPS):
-        residuals = evaluator.residuals(problem.space.to_physical(x)[None])
-        score = float(residuals.score[0])
-        if best is not None and not score < float(best[1].score[0]):
-            break
-        if not math.isfinite(score):
-            return None
-        best = x, residuals
-        gradient = there.gradient_at(x, residuals.error[0])[free]
-        step = -inverse @ gradient
-        if -float(step @ gradient) < _NOTHING_LEFT * score:
-            break
-        x = x.clone()
-        x[free] = (x[free] + step).clamp(-1.0, 1.0)
-    if best is None:
+def _refitted(pieces: Problem, start: Descent, colouring: Colouring) -> _Refit | None:
+    """A fit from the end of one with another period; ``None`` where it diverges."""
+    begin = Descent(x=start.x.clone(), hessian=start.hessian)
+    end = least_squares(pieces.training_evaluator(), colouring, [begin], _REFIT)[0]
+    if not math.isfinite(end.score):
         return None
-    physical = problem.space.to_physical(best[0])
-    every = problem.evaluator().residuals(physical[None], problem.dataset.sampled)
-    score = float(best[1].score[0])
-    return _Refit(values=physical.numpy(), score=score, error=every.error[0], where=every.where)
+    physical = pieces.space.to_physical(end.x)
+    every = pieces.evaluator().residuals(physical[None], pieces.dataset.sampled)
+    return _Refit(descent=end, values=physical.numpy(), error=every.error[0], where=every.where)
 
 
 def _lagrange(nodes: Sequence[float], at: float) -> np.ndarray:
