@@ -22,8 +22,11 @@ NO_GPU = "torch finds no CUDA here"
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason=NO_GPU)
 
 
-def _env(task: str, device: str, graphs: bool = True, num_envs: int = 8) -> ManagerBasedRLEnv:
+def _env(
+    task: str, device: str, graphs: bool = True, num_envs: int = 8, integrator: str = "implicitfast"
+) -> ManagerBasedRLEnv:
     cfg = load_env_cfg(task)
+    cfg.sim.integrator = integrator
     cfg.scene.num_envs, cfg.seed, cfg.sim.device, cfg.sim.graphs = num_envs, 0, device, graphs
     return ManagerBasedRLEnv(cfg)
 
@@ -42,9 +45,17 @@ def test_a_missing_gpu_or_package_is_told_in_one_sentence():
 
 
 @on_gpu
-@pytest.mark.parametrize("task", ["Pace-AnymalD-v0", "Pace-AnymalD-Velocity-v0"])
-def test_both_devices_and_both_ways_move_the_same(task: str):
-    cpu, graphs, plain = _env(task, "cpu"), _env(task, "cuda:0"), _env(task, "cuda:0", graphs=False)
+@pytest.mark.parametrize(
+    ("task", "integrator"),
+    [
+        ("Pace-AnymalD-v0", "implicitfast"),
+        ("Pace-AnymalD-v0", "leapfrog"),
+        ("Pace-AnymalD-Velocity-v0", "implicitfast"),
+    ],
+)
+def test_both_devices_and_both_ways_move_the_same(task: str, integrator: str):
+    cpu = _env(task, "cpu", integrator=integrator)
+    graphs, plain = (_env(task, "cuda:0", graphs=each, integrator=integrator) for each in (True, False))
     for env in (cpu, graphs, plain):
         env.reset(seed=1)
     for env in (graphs, plain):

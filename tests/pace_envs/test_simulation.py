@@ -208,6 +208,36 @@ def test_friction_of_joints_that_push_each_other_turns_within_a_step():
     assert float((chains_pushed(1) - exact).square().mean().sqrt()) < 0.03 * float(exact.square().mean().sqrt())
 
 
+def chain_whirled(steps):
+    """Angles of a chain of three links without friction, (3,), after it has turned fast for 0.2 s."""
+    cfg = SimulationCfg(dt=0.0025 / steps, integrator="leapfrog", gravity=(0.0, 0.0, 0.0))
+    sim = make_simulation(cfg, mujoco.MjSpec.from_string(CHAIN.replace('frictionloss="0.5"', "")), 1)
+    sim.qpos[:], sim.qvel[:] = torch.tensor([[0.0, 0.8, -1.2]]), torch.tensor([[3.0, -2.0, 4.0]])
+    for _ in range(80 * steps):
+        sim.step()
+    return sim.qpos[0].clone()
+
+
+def test_coriolis_forces_are_of_second_order():
+    """At the speed before a step, half of the step would leave half of the error."""
+    exact = chain_whirled(50)
+    coarse, fine = (float((chain_whirled(steps) - exact).norm()) for steps in (2, 4))
+    assert coarse < 1e-3 and fine < 0.3 * coarse
+
+
+def test_a_reset_forgets_what_speeds_gained():
+    cfg = SimulationCfg(dt=0.0025, integrator="leapfrog", gravity=(0.0, 0.0, 0.0))
+    sim, ends = make_simulation(cfg, mujoco.MjSpec.from_string(CHAIN), 2), []
+    for _ in range(2):
+        sim.qvel[:] = torch.tensor([[3.0, -2.0, 4.0]])
+        for _ in range(3):
+            sim.step()
+        ends.append(sim.qpos.clone())
+        sim.reset([1])
+        sim.qpos[0], sim.qfrc_applied[:] = sim.qpos[1], 0.0
+    assert torch.equal(ends[0][1], ends[1][1]) and not torch.equal(ends[0][0], ends[1][0])
+
+
 def test_friction_of_second_order_steps_holds():
     assert np.abs(swung(0.0025, amplitude=0.19)).max() < 1e-4
 

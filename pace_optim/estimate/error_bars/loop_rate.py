@@ -31,8 +31,8 @@ _FINEST = 5e-4
 """Physics step of all simulations at most [s], and half of the usual period: the step's error looks like a rate."""
 _COARSE = 2.0 + 1e-6
 """Times that: a longer physics step may be one that made the recordings."""
-_REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=1e-5, near_enough=1e-5)
-"""A fit with another period. Rates differ by a thousandth of the score, so it goes to the end."""
+_REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=1e-4, near_enough=1e-4)
+"""A fit with another period. Scores of rates differ by a thousandth: it goes near the end."""
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
 UNEXPLAINED = 0.5
