@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 STEP = 0.001 / 32
-"""Physics step [s]. MuJoCo's step is of first order: at 0.125 ms, it alone was wrong by as much as an encoder's noise."""
+"""Physics step [s]. MuJoCo's step is of first order: at 0.125 ms, its error is as large as an encoder's noise."""
 LOOP_STEPS = 32
 """Physics steps between two runs of the drives' loops."""
 NOISE = 1e-4

@@ -47,7 +47,7 @@ class SimulationCfg:
     """Physics time step [s]."""
 
     integrator: Literal["implicitfast", "leapfrog", "implicit", "euler"] = "implicitfast"
-    """One of MuJoCo's, all of first order, or ``"leapfrog"``: of second order, at little more than the cost of implicitfast.
+    """One of MuJoCo's, all of first order, or ``"leapfrog"``: of second order, at little more than implicitfast's cost.
 
     With x and v the state, M, D and f the inertia, the damping and all other forces:
 
