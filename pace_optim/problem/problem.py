@@ -247,11 +247,15 @@ class Problem:
         """An evaluator of candidates on all recordings."""
         return Evaluator(self.make_env, self.dataset, self.space, self.trees)
 
-    def training_evaluator(self) -> Evaluator:
-        """An evaluator of candidates on the recordings that are trained on; derivatives take the longest step."""
-        data, nearby = self.dataset.select(self.dataset.trained()), None
-        if self.coarsest_dt > self.physics_dt:
-            nearby = Evaluator(self.with_physics_dt(self.coarsest_dt).make_env, data, self.space, self.trees)
+    def training_evaluator(self, like: Problem | None = None) -> Evaluator:
+        """An evaluator of candidates on the recordings that are trained on; derivatives take the longest step.
+
+        Args:
+            like: Whose derivatives serve; the default: this problem's.
+        """
+        like, data, nearby = like or self, self.dataset.select(self.dataset.trained()), None
+        if like.coarsest_dt > self.physics_dt:
+            nearby = Evaluator(like.with_physics_dt(like.coarsest_dt).make_env, data, self.space, self.trees)
         return Evaluator(self.make_env, data, self.space, self.trees, nearby=nearby)
 
     @cached_property

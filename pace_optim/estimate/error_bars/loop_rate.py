@@ -133,10 +133,11 @@ def used_loop(assumed: float, used: float) -> dict[str, float]:
 def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
     """Compare the rates that the loops may have, at a fit with one of them.
 
-    All are simulated with one physics step, and fitted again on pieces of the recordings, each from the end of the one
-    nearest to it. Residuals and values between the shortest simulated periods follow by the polynomial through these.
-    What was fitted alone does not tell a rate: the residuals are those on all samples of the pieces, also on those kept
-    for validation. With r those of a candidate and d = r - r' their difference to the best one's,
+    All are simulated with one physics step, and fitted again on pieces of the recordings: each from the end of the one
+    nearest to it, by derivatives of the fitted rate and the longest step. Residuals and values between the shortest
+    simulated periods follow by the polynomial through these. What was fitted alone does not tell a rate: the residuals
+    are those on all samples of the pieces, also on those kept for validation. With r those of a candidate and
+    d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
@@ -167,13 +168,13 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     for period in sorted(periods, key=lambda each: abs(each - fitted)):
         nearest = min(ends, key=lambda other: abs(other - period), default=None)
         begin = start if nearest is None else ends[nearest].descent
-        end = _refitted(pieces.with_loop(period, finest), begin, there.colouring)
+        end = _refitted(pieces.with_loop(period, finest), pieces, begin, there.colouring)
         if end is not None:
             ends[period] = end
         elif period == fitted:
             return None
     if problem.physics_dt > _COARSE * finest:
-        coarse = _refitted(pieces, start, there.colouring)
+        coarse = _refitted(pieces, pieces, start, there.colouring)
         if coarse is not None and coarse.descent.score <= min(end.descent.score for end in ends.values()):
             return None
     found = {period: ends[period] for period in periods if period in ends}
@@ -213,10 +214,10 @@ class _Refit:
     """Which samples these are, (K, R) bool."""
 
 
-def _refitted(pieces: Problem, start: Descent, colouring: Colouring) -> _Refit | None:
-    """A fit from the end of one with another period; ``None`` where it diverges."""
+def _refitted(pieces: Problem, like: Problem, start: Descent, colouring: Colouring) -> _Refit | None:
+    """A fit from the end of one with another period, by derivatives like another's; ``None`` where it diverges."""
     begin = Descent(x=start.x.clone(), hessian=start.hessian)
-    end = least_squares(pieces.training_evaluator(), colouring, [begin], _REFIT)[0]
+    end = least_squares(pieces.training_evaluator(like), colouring, [begin], _REFIT)[0]
     if not math.isfinite(end.score):
         return None
     physical = pieces.space.to_physical(end.x)
