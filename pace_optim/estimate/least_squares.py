@@ -225,6 +225,8 @@ def _iterate(
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
         step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]))
+        if step.expected <= allowed:
+            break
     gained = descent.scores[-2] - descent.scores[-1]
     longer = jacobian is not None and evaluator.looks_coarser and not descent.own_step
     beside = longer and gained <= cfg.near_enough * descent.score
