@@ -125,6 +125,27 @@ def _load_friction(rng: np.random.Generator) -> Law:
     return Law(friction=lambda f, s: f + coefficient * abs(s.motor - s.gravity))
 
 
+def _cold_friction(rng: np.random.Generator) -> Law:
+    per_kelvin, warms_s = rng.uniform(0.01, 0.02), rng.uniform(6.0, 12.0)
+
+    def temperature(t: float) -> float:
+        return 55.0 - 30.0 * math.exp(-max(t, 0.0) / warms_s)
+
+    def factor(s: State) -> float:
+        return 1 - per_kelvin * (temperature(s.t) - 40.0)
+
+    return Law(friction=lambda f, s: factor(s) * f, drag=lambda d, s: factor(s) * d, temperature=temperature)
+
+
+def _battery(rng: np.random.Generator) -> Law:
+    falls, rate = rng.uniform(3.0, 5.0), rng.uniform(0.3, 0.6)
+
+    def voltage(t: float) -> float:
+        return 24.0 - falls * (t / (6 * DURATION)) - 0.5 * math.sin(rate * t)
+
+    return Law(torque=lambda tau, s: tau * voltage(s.t) / 24.0, voltage=voltage)
+
+
 LAWS: dict[str, Case] = {
     "clean": Case(law=lambda rng: Law(), right=("nothing_missing",)),
     "gravity_part": Case(law=_part_of_gravity, right=("gravity_compensation",), plan=_large),
@@ -143,6 +164,8 @@ LAWS: dict[str, Case] = {
     "command_filter": Case(law=_command_filter, right=("command_filter",)),
     "stribeck": Case(law=_stribeck, right=("stribeck_friction",)),
     "gain": Case(law=_gain(0.75, 0.9), right=("torque_gain", "payload")),
+    "cold_friction": Case(law=_cold_friction, right=("thermal_friction",), variable=("temperature",)),
+    "battery": Case(law=_battery, right=("supply_voltage",), variable=("voltage",), plan=_large),
     "load_friction": Case(law=_load_friction, right=("load_dependent_friction",), plan=_loads),
 }
 """What drives have, and the library too; ``gain`` is the same as a payload with one load."""
@@ -234,9 +257,11 @@ def record(folder: Path, case: Case, rng: np.random.Generator) -> None:
     for i in (0, 1, 5, 2, 3, 4):
         plan = own[i]
         seen, heat = simulate(plan, base, law, begin, heat)
+        clock = begin + CONTROL_DT * np.arange(len(plan.command))
+        logged = {name: how for name in ("temperature", "voltage") if (how := getattr(law, name)) is not None}
         np.savez(
             folder / f"{i}_{plan.name}.npz",
-            time=begin + CONTROL_DT * np.arange(len(plan.command)),
+            time=clock,
             dof_pos=(seen + NOISE * rng.standard_normal(len(seen)))[:, None],
             des_dof_pos=plan.command[:, None],
             stiffness=plan.stiffness,
@@ -246,6 +271,7 @@ def record(folder: Path, case: Case, rng: np.random.Generator) -> None:
             velocity_limit=1e3,
             load_mass=plan.load_mass,
             load_length=plan.load_length,
+            **{name: np.array([[how(t)] for t in clock]) for name, how in logged.items()},
         )
         begin += DURATION
 
@@ -281,6 +307,7 @@ def _told(found: Findings, problem: Problem, fits: Fits, case: Case) -> dict[str
         "right": said in ([each] for each in case.right) or (not case.right and found.verdict == "unknown"),
         "wrong_name": found.verdict == "effect" and not set(said) <= set(case.right),
         "best_curve": best,
+        "formula": next(iter(curves.values()), {}).get("formula", ""),
         "right_variable": best is not None and any(best.endswith(f"over_{v}") for v in case.variable),
         "before": 1e3 * float(outcome.base_errors.mse.mean().sqrt()),
         "after": 1e3 * float(outcome.final_errors.mse.mean().sqrt()),

@@ -58,6 +58,10 @@ class Law:
     """All of the joint's inertia."""
     heat_s: float = math.inf
     """Time constant of the heat, which follows the square of the motor's torque [s]."""
+    temperature: Callable[[float], float] | None = None
+    """What the log shows of the motor's temperature [°C], by the session time [s]."""
+    voltage: Callable[[float], float] | None = None
+    """What the log shows of the supply's voltage [V]."""
     speed_loop: tuple[float, float] | None = None
     """A PI loop of the speed in place of kd: gain [N m s/rad] and integral [N m/rad]; kp asks for a speed then."""
 

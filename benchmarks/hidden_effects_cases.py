@@ -27,7 +27,6 @@ from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fits import Fits, fits_on
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.model import start_values
 from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem, load_problem
@@ -213,10 +212,10 @@ def _fit_with(
     fits: Fits, twins: TwinProblem, base: Fitted, effects: Sequence[type[Effect]], truth: dict[str, Any]
 ) -> Fitted:
     """The model that knows which effects there are; its search starts at the usual place."""
-    model, physical, n = base.model, base.model.to_physical(base.x), base.model.num_joints
+    model, physical = base.model, base.model.to_physical(base.x)
     for effect in effects:
         has = torch.tensor([name in str(truth["effects"][effect.name]) for name in twins.joint_names])
-        model, physical = model.extended(physical, effect, has, start_values(effect, {}).repeat(n, 1))
+        model, physical = model.extended(physical, effect, has, model.at_point(effect, {}))
     return fits.coarse_to_fine(twins, [Fitted.start(model, physical)])[0]
 
 

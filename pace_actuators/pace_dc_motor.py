@@ -13,7 +13,7 @@ from pace_actuators.dc_motor import clip_to_line, pd_effort
 from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive import ControllerRun, Drive
 from pace_actuators.drive_delays import DriveDelays
-from pace_actuators.effects.effect import Heat
+from pace_actuators.effects.effect import Conditions, Heat
 
 _INVERSION_STEPS = 6
 """Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
@@ -145,6 +145,11 @@ class DriveWithEffects(Drive):
         """Tell effects how hard the drive has worked in the session before; once the parameters are known."""
         for effect in () if self.effects is None else self.effects.effects:
             effect.remember(heat)
+
+    def notice(self, conditions: Conditions) -> None:
+        """Tell effects what was logged of the drive's conditions."""
+        for effect in () if self.effects is None else self.effects.effects:
+            effect.notice(conditions)
 
 
 class PaceDCMotor(DriveWithEffects):

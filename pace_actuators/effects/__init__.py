@@ -5,6 +5,7 @@
 
 from pace_actuators.effects import (
     command,
+    conditions,
     drive,
     fading_friction,
     free_form,
@@ -16,7 +17,14 @@ from pace_actuators.effects import (
     two_mass,
 )
 from pace_actuators.effects.drive_state import DriveState
-from pace_actuators.effects.effect import PROBED_EFFORT, Effect, EffectParameter, comb_grid, probe_points
+from pace_actuators.effects.effect import (
+    PROBED_EFFORT,
+    PROBED_STIFFNESS,
+    Effect,
+    EffectParameter,
+    comb_grid,
+    probe_points,
+)
 from pace_actuators.effects.effect_cfg import SHARED, WIDE, EffectCfg, effect_cfgs
 from pace_actuators.effects.registry import (
     available_effects,
@@ -30,6 +38,7 @@ from pace_actuators.effects.stack import EffectStack
 
 __all__ = [
     "PROBED_EFFORT",
+    "PROBED_STIFFNESS",
     "SHARED",
     "WIDE",
     "DriveState",
@@ -40,6 +49,7 @@ __all__ = [
     "available_effects",
     "comb_grid",
     "command",
+    "conditions",
     "drive",
     "effect_cfgs",
     "effect_modules",

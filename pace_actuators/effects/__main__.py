@@ -35,7 +35,13 @@ Within the drive, effects act in this order:
 Give a joint either `joint_elasticity` or `backlash`: a backlash includes an elasticity. A joint with both has one gap,
 and behind it the two springs in series. Friction then acts on the motor, other torques on the link.
 
-The last eleven, `torque_over_…`, `friction_over_…`, `gain_over_…` and `inertia_over_position`, are free-form curves.
+Bounds of stiffness, damping and inertia in a transmission or a mount are those of a joint with kp = 85 N m/rad. On
+other joints they are multiplied by kp / 85. Those of `presliding_friction` scale too.
+
+`thermal_friction`, `thermal_torque` and `supply_voltage` follow the motor's temperature and the supply's voltage.
+[Log them](logs.md#temperature-and-voltage). Without a log, the temperature is 25 °C and the voltage `nominal`.
+
+The last fourteen, `torque_over_…`, `friction_over_…`, `gain_over_…` and `inertia_over_position`, are free-form curves.
 Bounds of torques follow the drive. Curves are straight from knot to knot, at `center + reach · knot`, and constant
 beyond the last knot. They show what is missing, not why. `pace diagnose` compares them with the effects that it found,
 and takes a curve if no effect explains the error.

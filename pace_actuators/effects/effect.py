@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
@@ -19,6 +19,10 @@ _WIDER = 4.0
 Heat = Callable[[torch.Tensor, slice], torch.Tensor]
 """By time constants T [s], (rows, num_joints), of environments ``rows``: h of T dh/dt + h = τ² when a recording begins,
 τ the torque that was asked in its session before [N² m²]."""
+Conditions = Callable[[str, int, slice], "tuple[torch.Tensor, torch.Tensor] | None"]
+"""By the name of what is logged (``temperature``, ``voltage``), a number of places, and environments ``rows``: when the
+first place was and how long it is to the next [s], (rows, 1, 2), and the values at the places, (rows, num_joints,
+places); ``None`` if it is not logged."""
 Stage = Literal["command", "measurement", "controller", "drive", "friction", "transmission", "model", "recording"]
 
 
@@ -62,6 +66,20 @@ class EffectParameter:
 
     follows_drive: bool = False
     """Whether it is a torque whose bounds are the largest that the joint's drive gives, where that is known."""
+
+    follows_loop: bool = False
+    """Whether its bounds, start and probes are those of a loop of ``PROBED_STIFFNESS``, and grow with the stiffness of
+    the joint's loop: what yields in a transmission has the size of its drive."""
+
+    def on_loop(self, stiffness: float) -> EffectParameter:
+        """The parameter on a joint with a position loop of a stiffness kp [N m/rad].
+
+        Bounds and start of one that ``follows_loop`` are multiplied by kp / ``PROBED_STIFFNESS``.
+        """
+        if not self.follows_loop:
+            return self
+        size = stiffness / PROBED_STIFFNESS
+        return replace(self, lower=size * self.lower, upper=size * self.upper, start=size * self.start)
 
     def reaching(self, low: float, high: float, effort: float = math.inf) -> tuple[float, float]:
         """Its bounds: of a position of the joint as far as its range too, of a torque as far as the drive goes.
@@ -171,6 +189,9 @@ class Effect:
     """Whether it only shows where loads differ: there it is tried whatever a screening says."""
     acts_while_off: ClassVar[bool] = False
     """Whether it acts only while the drive is switched off: it is tried only where a recording has that."""
+    condition: ClassVar[str] = ""
+    """What of the drive's conditions it follows, ``temperature`` or ``voltage``: it is tried only where that was logged
+    and changes."""
     absorbed_by: ClassVar[str] = ""
     """Base parameter that may take it up wholly, so that recordings of positions do not show it."""
     scales: ClassVar[str] = ""
@@ -229,6 +250,9 @@ class Effect:
 
     def remember(self, heat: Heat) -> None:
         """When a recording begins: take over what the drive did in its session before."""
+
+    def notice(self, conditions: Conditions) -> None:
+        """When a recording begins: take over what was logged of the drive's conditions."""
 
     def advance(self, s: DriveState) -> None:
         """Once per physics step, before all else: bring the own state to the present joint state."""
@@ -376,6 +400,9 @@ def comb_grid(effect: type[Effect], span: float) -> torch.Tensor:
     step = math.pi / max(span, 1e-3)
     return torch.arange(own.lower, own.upper, step, dtype=torch.float64)
 
+
+PROBED_STIFFNESS = 85.0
+"""Stiffness of the position loops that bounds, starts and probes are meant for which follow the loop [N m/rad]."""
 
 PROBED_EFFORT = 5.0
 """Torque of the drives that probes in N m are meant for [N m]; on smaller drives they are taken smaller."""

@@ -18,7 +18,7 @@ from pace_actuators.effects.registry import register_effect
 
 _EFFORT = EffectParameter(name="effort", unit="N m", lower=-10.0, upper=10.0, null=0.0, start=0.05, follows_drive=True)
 """A value of a curve of torques or frictions."""
-_SHARE = EffectParameter(name="share", unit="1", lower=-0.95, upper=4.0, null=0.0, start=0.02)
+SHARE = EffectParameter(name="share", unit="1", lower=-0.95, upper=4.0, null=0.0, start=0.02)
 """A value of a curve that multiplies."""
 _EVEN = tuple(-1 + 0.125 * i for i in range(17))
 _FROM_ZERO = (0.0, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.8, 1.0)
@@ -26,7 +26,7 @@ _RISING = tuple(0.125 * i for i in range(9))
 _DENSE_AT_ZERO = (-1.0, -0.6, -0.3, -0.15, -0.07, -0.03, 0.0, 0.03, 0.07, 0.15, 0.3, 0.6, 1.0)
 
 
-def _parameters(
+def parameters_of_curve(
     knots: tuple[float, ...],
     zero: float | None,
     reach: tuple[float, float, float],
@@ -111,7 +111,7 @@ class TorqueOverPosition(FreeForm):
     stage = "transmission"
     knots = _EVEN
     variable = "position"
-    parameters = _parameters(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0)
+    parameters = parameters_of_curve(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0)
     equation = "τ + f(q)"
     looks = "the error goes with the position, up and down strokes alike"
     separates = "a staircase over the whole range"
@@ -131,7 +131,7 @@ class TorqueOverTorque(FreeForm):
     knots = _DENSE_AT_ZERO
     zero = 0.0
     variable = "torque"
-    parameters = _parameters(knots, zero, (1e-3, 5.0, 300.0), "N m")
+    parameters = parameters_of_curve(knots, zero, (1e-3, 5.0, 300.0), "N m")
     equation = "τ + f(τ), f(0) = 0"
     looks = "the error goes with the torque"
     separates = "another load"
@@ -149,7 +149,7 @@ class TorqueOverTime(FreeForm):
     stage = "transmission"
     knots = _RISING
     variable = "time"
-    parameters = _parameters(knots, None, (1.0, 60.0, 3600.0), "s")
+    parameters = parameters_of_curve(knots, None, (1.0, 60.0, 3600.0), "s")
     equation = "τ + f(t)"
     looks = "the error goes with the time, whatever the motion"
     separates = "the same motion again, later"
@@ -169,7 +169,7 @@ class FrictionOverSpeed(FreeForm):
     zero = 0.0
     variable = "speed"
     kind = "friction"
-    parameters = _parameters(knots, zero, (1e-3, 5.0, 100.0), "rad/s")
+    parameters = parameters_of_curve(knots, zero, (1e-3, 5.0, 100.0), "rad/s")
     equation = "F = F_c + f(|v|), f(0) = 0"
     looks = "the error goes with the speed, both directions alike"
     separates = "triangles of several speeds"
@@ -189,7 +189,7 @@ class FrictionOverPosition(FreeForm):
     zero = 0.0
     variable = "position"
     kind = "friction"
-    parameters = _parameters(knots, zero, (1e-3, 1.0, 10.0), "rad", center=10.0)
+    parameters = parameters_of_curve(knots, zero, (1e-3, 1.0, 10.0), "rad", center=10.0)
     equation = "F = F_c + f(q), f = 0 at the center"
     looks = "the hysteresis loop is wider at some positions than at others"
     separates = "a slow triangle over the whole range"
@@ -210,7 +210,7 @@ class FrictionOverLoad(FreeForm):
     zero = 0.0
     variable = "load on the gear"
     kind = "friction"
-    parameters = _parameters(knots, zero, (1e-3, 5.0, 300.0), "N m")
+    parameters = parameters_of_curve(knots, zero, (1e-3, 5.0, 300.0), "N m")
     equation = "F = F_c + f(|τ - τ_g|), f(0) = 0, τ_g the torque of gravity and load on the joint"
     looks = "the hysteresis loop is wider at some loads than at others"
     reads_load = True
@@ -245,7 +245,7 @@ class GainOverTime(_Gain):
     name = "gain_over_time"
     knots = _RISING
     variable = "time"
-    parameters = _parameters(knots, None, (1.0, 60.0, 3600.0), "s", value=_SHARE)
+    parameters = parameters_of_curve(knots, None, (1.0, 60.0, 3600.0), "s", value=SHARE)
     equation = "τ -> (1 + f(t)) τ"
     looks = "static sag and amplitude change with the time, in proportion to the torque"
     separates = "the same motion again, later"
@@ -262,7 +262,7 @@ class GainOverPosition(_Gain):
     name = "gain_over_position"
     knots = _EVEN
     variable = "position"
-    parameters = _parameters(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0, value=_SHARE)
+    parameters = parameters_of_curve(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0, value=SHARE)
     equation = "τ -> (1 + f(q)) τ"
     looks = "the error goes with the torque, more at some positions than at others"
     separates = "a staircase over the whole range, with two loads"
@@ -281,7 +281,7 @@ class GainOverSpeed(_Gain):
     knots = _FROM_ZERO
     zero = 0.0
     variable = "speed"
-    parameters = _parameters(knots, zero, (1e-3, 5.0, 100.0), "rad/s", value=_SHARE)
+    parameters = parameters_of_curve(knots, zero, (1e-3, 5.0, 100.0), "rad/s", value=SHARE)
     equation = "τ -> (1 + f(|v|)) τ, f(0) = 0"
     looks = "the torque falls short where the joint is fast"
     separates = "fast motions with two loads"
@@ -300,7 +300,7 @@ class FrictionOverTime(FreeForm):
     knots = _RISING
     variable = "time"
     kind = "friction"
-    parameters = _parameters(knots, None, (1.0, 60.0, 3600.0), "s", value=_SHARE)
+    parameters = parameters_of_curve(knots, None, (1.0, 60.0, 3600.0), "s", value=SHARE)
     equation = "(1 + f(t)) times F_c and d"
     looks = "the hysteresis loop becomes wider or narrower with the time"
     separates = "the same motion again, later"
@@ -324,7 +324,7 @@ class InertiaOverPosition(FreeForm):
     knots = _EVEN
     variable = "position"
     kind = "inertia"
-    parameters = _parameters(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0, value=_SHARE)
+    parameters = parameters_of_curve(knots, None, (1e-3, 1.0, 10.0), "rad", center=10.0, value=SHARE)
     equation = "(1 + f(q)) I, and τ - I f'(q) v²/2, I the inertia of link and rotor"
     looks = "fast parts are too early at some positions and too late at others"
     reads_link = True

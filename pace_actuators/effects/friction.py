@@ -205,6 +205,7 @@ class PreslidingFriction(Effect):
             start=300.0,
             scale="log",
             meaning="σ_0",
+            follows_loop=True,
         ),
     )
     equation = "dz/dt = v - σ0 |v| z / F, friction σ0 z"

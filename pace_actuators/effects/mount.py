@@ -61,10 +61,28 @@ class MountCompliance(Effect):
             start=2000.0,
             scale="log",
             meaning="k",
+            follows_loop=True,
         ),
-        EffectParameter(name="damping", unit="N m s/rad", lower=0.0, upper=30.0, null=None, start=3.0, meaning="c"),
         EffectParameter(
-            name="inertia", unit="kg m^2", lower=0.05, upper=10.0, null=None, start=0.8, scale="log", meaning="J"
+            name="damping",
+            unit="N m s/rad",
+            lower=0.0,
+            upper=30.0,
+            null=None,
+            start=3.0,
+            meaning="c",
+            follows_loop=True,
+        ),
+        EffectParameter(
+            name="inertia",
+            unit="kg m^2",
+            lower=0.05,
+            upper=10.0,
+            null=None,
+            start=0.8,
+            scale="log",
+            meaning="J",
+            follows_loop=True,
         ),
     )
     equation = "J d²φ/dt² + c dφ/dt + k φ = - reaction of the joint; the link feels - I d²φ/dt² and gravity turned by φ"

@@ -205,8 +205,18 @@ class JointElasticity(_TwoMass):
             start=1000.0,
             scale="log",
             meaning="k",
+            follows_loop=True,
         ),
-        EffectParameter(name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=0.5, meaning="c"),
+        EffectParameter(
+            name="damping",
+            unit="N m s/rad",
+            lower=0.0,
+            upper=20.0,
+            null=None,
+            start=0.5,
+            meaning="c",
+            follows_loop=True,
+        ),
         _SIDE,
     )
     equation = "J d²θ/dt² = τ - f - friction, link: + f, f = k (θ - q) + c (dθ/dt - dq/dt)"
@@ -244,9 +254,26 @@ class Backlash(_TwoMass):
     parameters = (
         EffectParameter(name="gap", unit="rad", lower=0.0, upper=0.05, null=0.0, start=0.004),
         EffectParameter(
-            name="stiffness", unit="N m/rad", lower=300.0, upper=2e4, null=None, start=5000.0, scale="log", meaning="k"
+            name="stiffness",
+            unit="N m/rad",
+            lower=300.0,
+            upper=2e4,
+            null=None,
+            start=5000.0,
+            scale="log",
+            meaning="k",
+            follows_loop=True,
         ),
-        EffectParameter(name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=5.0, meaning="c"),
+        EffectParameter(
+            name="damping",
+            unit="N m s/rad",
+            lower=0.0,
+            upper=20.0,
+            null=None,
+            start=5.0,
+            meaning="c",
+            follows_loop=True,
+        ),
         _SIDE,
     )
     equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"

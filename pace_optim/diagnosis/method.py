@@ -11,7 +11,7 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.diagnosis.candidates.screening import absorbed_effects
 from pace_optim.diagnosis.checks.data_check import check_data
 from pace_optim.diagnosis.checks.shared_delay import hold_late_joints
-from pace_optim.diagnosis.checks.stated_facts import excluded_effects
+from pace_optim.diagnosis.checks.stated_facts import excluded_effects, unlogged_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.findings.findings import Findings
 from pace_optim.diagnosis.search.one_round import try_effects
@@ -78,7 +78,8 @@ def search_effects(
     absorbed = absorbed_effects(fits, coarse, base, candidates, effort, cfg.candidates)
     n, recordings = base.model.num_joints, problem.dataset.recordings
     excluded, why = excluded_effects(recordings, candidates, measured, n)
-    base = replace(base, model=replace(base.model, barred=excluded))
+    barred = excluded | unlogged_effects(problem.dataset, candidates)
+    base = replace(base, model=replace(base.model, barred=barred))
 
     # one effect after another, as long as they pay on held-out recordings
     enough = cfg.judging.alike * data.floor

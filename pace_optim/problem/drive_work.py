@@ -30,6 +30,15 @@ def drive_reach(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict
     return dict(zip(env.scene["robot"].joint_names, largest.tolist(), strict=True))
 
 
+def loop_stiffness(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
+    """The stiffness of each joint's position loop [N m/rad], the median of the recordings' where it has one."""
+    stated = [each.drive.stiffness for each in recordings]
+    own = of_joints(env, "stiffness")
+    median = np.median([own if each is None else each for each in stated], axis=0)
+    names = env.scene["robot"].joint_names
+    return {name: each for name, each in zip(names, median.tolist(), strict=True) if each > 0 and math.isfinite(each)}
+
+
 def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
     """The dataset with how hard the drives worked, where its recordings are of one session: they do not overlap.
 

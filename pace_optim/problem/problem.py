@@ -32,7 +32,7 @@ from pace_optim.problem.drive_steps import (
     set_drive_rate,
     set_drive_step,
 )
-from pace_optim.problem.drive_work import drive_reach, with_work
+from pace_optim.problem.drive_work import drive_reach, loop_stiffness, with_work
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.log_and_robot import (
@@ -462,6 +462,7 @@ def _posed(
     groups = [[without_loops_of_torques(env, recording) for recording in group] for group in groups]
     sim2real.joint_ranges = _ranges(env, groups[0])
     sim2real.joint_efforts = drive_reach(env, groups[0])
+    sim2real.joint_stiffness = loop_stiffness(env, groups[0])
     if is_model_file(facts.task):
         widen_bounds(sim2real, env, groups[0])
     count = len(groups[0])

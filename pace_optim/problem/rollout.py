@@ -466,6 +466,7 @@ class Rollout:
             actuator.set_session_time(self._session_start[:, ids])
             if self.dataset.work is not None:
                 actuator.remember(partial(self._heat, self.dataset.work, ids))
+            actuator.notice(partial(self._conditions, ids))
         speed = self._rows(self.dataset.start_vel)
         needs_load = any(actuator.needs_load for actuator in self.robot.actuators.values())
         for _ in range(_LOAD_STEPS if needs_load else 1):  # the load bends what an encoder on the motor shows
@@ -476,6 +477,13 @@ class Rollout:
     def _heat(self, work: Work, joints: Any, time_constant: torch.Tensor, rows: slice) -> torch.Tensor:
         """Heat of a group of joints when the recordings of some environments begin: see :data:`Heat`."""
         return work.heat(self._session_start[rows, :1], time_constant, joints)
+
+    def _conditions(self, joints: Any, name: str, places: int, rows: slice) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """What was logged of the conditions of a group of joints, for some environments: see :data:`Conditions`."""
+        if (logged := self.dataset.condition(name, places)) is None:
+            return None
+        time, values = self._rows(logged.time)[:, None], self._rows(logged.values.flatten(1))
+        return time[rows], values.unflatten(1, (-1, places))[rows][:, joints]
 
     def _set_facts(self, r: int) -> None:
         recording = self.dataset.recordings[r]

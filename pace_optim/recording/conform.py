@@ -14,7 +14,7 @@ from pace_actuators.text import listed
 from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid
 from .data import Drive, Recording
-from .keys import FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES
+from .keys import CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
 from .time_base import TimeBase, fit_time_base
@@ -170,6 +170,7 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
     for key, interpolate in (
         ("dof_pos", interpolate_smooth),
         ("dof_vel", interpolate_smooth),
+        *((key, interpolate_linear) for key in CONDITIONS),
         ("real_ee_pose", interpolate_linear),
         ("base_ang_vel", interpolate_linear),
         ("base_lin_acc", interpolate_linear),

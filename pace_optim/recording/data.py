@@ -84,6 +84,10 @@ class Recording:
     """Measured speeds, (T, n) [rad/s]."""
     dof_effort: np.ndarray | None = None
     """Torques that the drive measures or asks for, (T, n) [N m]."""
+    temperature: np.ndarray | None = None
+    """Temperature of each joint's motor, (T, n) [°C]."""
+    voltage: np.ndarray | None = None
+    """Voltage of each drive's supply, (T, n) [V]."""
     torque_enable: np.ndarray | None = None
     """False where the drive gives no torque, (T,) bool."""
     real_ee_pose: np.ndarray | None = None

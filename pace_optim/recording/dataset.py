@@ -15,6 +15,7 @@ from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion, read_earlier
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
+from pace_optim.recording.resample import interpolate_linear
 from pace_optim.recording.sessions import session_starts
 from pace_optim.recording.start import start_speed
 from pace_optim.recording.torque import TorqueChannel
@@ -25,6 +26,8 @@ _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
 _LEAST_TORQUE_NOISE = 1e-3
 """Part of a torque's root mean square that its noise is at least: simulations are no better."""
+_CHANGE = 0.02
+"""Part of its largest value by which a condition changes that says something."""
 _SHORTEST = 3.0
 """A recording that is no longer than this many times that keeps its beginning."""
 
@@ -55,6 +58,24 @@ class Work:
         edges = (each.to(time_constant) for each in (self.begin, self.end))
         first, last = (torch.exp(-(time - edge).clamp(min=0.0)[:, :, None] / time_constant[:, None]) for edge in edges)
         return ((last - first) * self.square.to(time_constant)[:, joints]).sum(dim=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Condition:
+    """What was logged of the drives' conditions, as a line of straight parts over each of R recordings."""
+
+    time: torch.Tensor
+    """When the first of its places was since the session began, and how long it is to the next, (R, 2) [s]."""
+    values: torch.Tensor
+    """At the places, (R, n, places) [°C or V]; zero for joints of which nothing was logged."""
+    known: torch.Tensor
+    """Joints of which it was logged in all recordings, (n,) bool."""
+
+    @property
+    def varies(self) -> torch.Tensor:
+        """Joints on which it changes by more than a fiftieth, (n,) bool: of others it says nothing."""
+        low, high = self.values.amin(dim=(0, 2)), self.values.amax(dim=(0, 2))
+        return self.known & (high - low > _CHANGE * torch.maximum(high.abs(), low.abs()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,6 +224,27 @@ class Dataset:
     def validation(self) -> torch.Tensor:
         """Where there is a sample that is not trained on, (T, R) bool."""
         return self.sampled & ~self.train if self.settling is None else self.sampled & ~self.train & ~self.settling
+
+    def condition(self, name: str, places: int) -> Condition | None:
+        """A condition of the drives over each recording; ``None`` where some recording has none of it.
+
+        Args:
+            name: Of what was logged: ``temperature`` or ``voltage``.
+            places: How many instants there are to a recording, evenly from its first sample to its last.
+        """
+        if any(getattr(recording, name) is None for recording in self.recordings):
+            return None
+        lines, starts = [], (self.session_start - self.start_time).tolist()
+        for recording in self.recordings:
+            at = np.linspace(recording.time[0], recording.time[-1], places)
+            lines.append(interpolate_linear(recording.time, getattr(recording, name), at).T)
+        spans = [(recording.time[0], recording.duration / (places - 1)) for recording in self.recordings]
+        values = torch.as_tensor(np.stack(lines))
+        return Condition(
+            time=torch.tensor([(start + first, step) for start, (first, step) in zip(starts, spans, strict=True)]),
+            values=values.nan_to_num(nan=0.0),
+            known=values.isfinite().all(dim=2).all(dim=0),
+        )
 
     def select(self, indices: Sequence[int]) -> Dataset:
         """Some of the recordings, by index."""

@@ -10,7 +10,9 @@ from pace_actuators.identified import DRIVE_FIELDS
 COMMAND_SERIES = ("des_dof_pos", "des_dof_vel", "des_dof_effort")
 """Commands of a drive; at least one of them is in every recording."""
 MEASURED_SERIES = ("dof_pos", "dof_vel", "dof_effort")
-JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort")
+CONDITIONS = ("temperature", "voltage")
+"""What a drive works in: the temperature of its motor and the voltage of its supply."""
+JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort", *CONDITIONS)
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """Columns of `real_ee_pose`: a position [m], or a position and a quaternion."""
 BASE_SERIES = ("base_ang_vel", "base_lin_acc", "base_quat")
@@ -19,11 +21,11 @@ BASE_COLUMNS = {"base_ang_vel": ("x", "y", "z"), "base_lin_acc": ("x", "y", "z")
 """Columns of these."""
 FEET_SERIES = ("contact", "foot_force")
 """What feet feel of the ground."""
-SAMPLED_SERIES = (*MEASURED_SERIES, "torque_enable", "real_ee_pose", *BASE_SERIES, *FEET_SERIES)
+SAMPLED_SERIES = (*MEASURED_SERIES, *CONDITIONS, "torque_enable", "real_ee_pose", *BASE_SERIES, *FEET_SERIES)
 """Series with a value at each sample."""
 SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time", *BASE_SERIES, *FEET_SERIES)
 UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
-UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()}
+UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()} | {"temperature": "°C", "voltage": "V"}
 """Unit of each series of joints."""
 DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
@@ -39,6 +41,8 @@ _OTHER_WORDS = {
     "des_time": ("command_time", "target_time", "t_des"),
     "dof_vel": ("qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity", "speed"),
     "dof_effort": ("tau", "effort", "torque", "torques", "joint_effort", "joint_torque"),
+    "temperature": ("temp", "temperatures", "motor_temperature", "winding_temperature"),
+    "voltage": ("volts", "supply_voltage", "bus_voltage", "battery_voltage"),
     "torque_enable": ("enable", "enabled", "torque_enabled", "torque_on"),
     "base_ang_vel": ("gyro", "gyroscope", "angular_velocity", "imu_gyro", "base_angular_velocity"),
     "base_lin_acc": ("accelerometer", "linear_acceleration", "imu_acc", "specific_force", "base_acceleration"),

@@ -93,6 +93,7 @@ def base_model(n=1):
         slides=torch.zeros(n, dtype=torch.bool),
         ranges=torch.zeros(n, 2),
         efforts=torch.full((n,), torch.inf),
+        loops=torch.full((n,), 85.0),
     )
 
 

@@ -107,6 +107,10 @@ class PaceCfg(Config):
     joint_efforts: Mapping[str, float] = field(default_factory=dict)
     """The largest torque of each joint's drive [N m, of slides N]: its limit, else by what recordings ask of it."""
 
+    joint_stiffness: Mapping[str, float] = field(default_factory=dict)
+    """The stiffness of each joint's position loop [N m/rad, of slides N/m]: what yields in its transmission is sought
+    around it."""
+
     assumed_gains: tuple[str, ...] = ()
     """Joints whose gains are not stated: the gains of their drives are assumed."""
 
@@ -178,6 +182,7 @@ class PaceCfg(Config):
             slide_joints=tuple(name for name in self.slide_joints if name in names),
             joint_ranges={name: each for name, each in self.joint_ranges.items() if name in names},
             joint_efforts={name: each for name, each in self.joint_efforts.items() if name in names},
+            joint_stiffness={name: each for name, each in self.joint_stiffness.items() if name in names},
             assumed_gains=tuple(name for name in self.assumed_gains if name in names),
             effects=(),
             links=(),

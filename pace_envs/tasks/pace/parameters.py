@@ -14,7 +14,7 @@ import torch
 from pace_actuators import match_names
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import ALL
-from pace_actuators.effects import effect_cfgs
+from pace_actuators.effects import PROBED_STIFFNESS, effect_cfgs
 from pace_actuators.effects.friction import DynamicFriction
 from pace_actuators.joint_units import JointType, units_for
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, POSITIVE, PRIOR, UNITS, Reference, moved_by
@@ -147,13 +147,14 @@ def effect_parameters(cfg: PaceCfg) -> tuple[Parameter, ...]:
             each = []
             for joint, i in zip(own, ids, strict=True):
                 low, high = cfg.joint_ranges.get(joint, (0.0, 0.0))
-                lower, upper = parameter.reaching(low, high, cfg.joint_efforts.get(joint, math.inf))
+                own_parameter = parameter.on_loop(cfg.joint_stiffness.get(joint, PROBED_STIFFNESS))
+                lower, upper = own_parameter.reaching(low, high, cfg.joint_efforts.get(joint, math.inf))
                 if kind is DynamicFriction:
                     lower, upper = cfg.friction_ratio_bounds
                 elif effect.wide:
-                    widest = parameter.widest(float(cfg.bounds["friction"][i, 1]))
+                    widest = own_parameter.widest(float(cfg.bounds["friction"][i, 1]))
                     lower, upper = min(lower, widest[0]), max(upper, widest[1])
-                each.append(given.get(joint, (lower, min(max(parameter.start, lower), upper), upper)))
+                each.append(given.get(joint, (lower, min(max(own_parameter.start, lower), upper), upper)))
             if effect.shared and each:
                 lows, starts, highs = zip(*each, strict=True)
                 each = [(min(lows), sum(starts) / len(starts), max(highs))]

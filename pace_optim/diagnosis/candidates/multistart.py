@@ -10,7 +10,7 @@ from pace_actuators.effects import Effect, probe_points
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.model import COLUMN, JointModel, start_values
+from pace_optim.joints.fits.model import COLUMN, JointModel
 from pace_optim.joints.fits.side_by_side import Slot
 from pace_optim.joints.simulation.problem import TwinProblem
 
@@ -43,7 +43,7 @@ def _best_points(
     bases = _bases(now, cfg.frictions)
     slots, values = [], []
     for effect in effects:
-        own = [start_values(effect, point).repeat(now.model.num_joints, 1) for point in probe_points(effect)]
+        own = [now.model.at_point(effect, point) for point in probe_points(effect)]
         may = now.model.allowed_joints(effect)
         tried = [now.model.extended(base, effect, may, each) for base in bases for each in own]
         slots.append(Slot(model=tried[0][0], rows=len(tried)))

@@ -13,7 +13,7 @@ from pace_actuators.effects import PROBED_EFFORT, Effect, comb_grid, probe_point
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.model import COLUMN, start_values
+from pace_optim.joints.fits.model import COLUMN, JointModel
 from pace_optim.joints.fits.side_by_side import Slot
 from pace_optim.joints.simulation.problem import TwinProblem
 
@@ -73,7 +73,7 @@ def screen(
 
     def look_at(own: Sequence[type[Effect]]) -> list[list[Probe]]:
         result: dict[type[Effect], list[Probe]] = {effect: [] for effect in own}
-        points = [each for effect in own if effect.comb is None for each in probe_values(effect, effort)]
+        points = [each for effect in own if effect.comb is None for each in probe_values(effect, effort, now.model)]
         if points:
             scores, sizes = explained(points)
             for (effect, values), score, size in zip(points, scores, sizes[:, 0], strict=True):
@@ -114,7 +114,7 @@ def absorbed_effects(
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
-    probes = [each for effect in suspects for each in probe_values(effect, effort)]
+    probes = [each for effect in suspects for each in probe_values(effect, effort, now.model)]
     changes, _ = simulated_changes(fits, problem, now, probes, beside)
     jacobian = now.free_jacobian
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
@@ -151,7 +151,7 @@ def _comb_probes(
     frequency = torch.stack([torch.cat([own, own[-1:].expand(count - len(own))]) for own in grids], dim=1)
     names = [p.name for p in effect.parameters]
     place, *amplitudes = (names.index(name) for name in effect.comb)
-    (_, first), (_, second) = probe_values(effect, effort)
+    (_, first), (_, second) = probe_values(effect, effort, now.model)
     scores, sizes = [], []
     for part in frequency.split(cfg.at_once):
         pairs = [(effect, each.index_fill(1, torch.tensor([place]), 0.0)) for _ in part for each in (first, second)]
@@ -200,18 +200,17 @@ def simulated_changes(
     return errors[1:] - errors[:1], batch.dataset.train
 
 
-def probe_values(effect: type[Effect], effort: torch.Tensor) -> list[tuple[type[Effect], torch.Tensor]]:
-    """An effect's probes on joints with a typical torque, (n,) [N m]: physical values, (n, parameters) each."""
-    return [(effect, _probe_values(effect, point, effort / PROBED_EFFORT)) for point in probe_points(effect)]
+def probe_values(
+    effect: type[Effect], effort: torch.Tensor, model: JointModel
+) -> list[tuple[type[Effect], torch.Tensor]]:
+    """An effect's probes on a model's joints with a typical torque, (n,) [N m]: physical values, (n, parameters) each.
 
-
-def _probe_values(effect: type[Effect], point: dict[str, float], size: torch.Tensor) -> torch.Tensor:
-    """A probe's physical values on each joint, (n, parameters): small torques for drives of a small size, (n,)."""
-    values = start_values(effect, point).repeat(len(size), 1)
-    for k, parameter in enumerate(effect.parameters):
-        if parameter.unit == "N m" and parameter.null == 0.0:
-            values[:, k] *= size.clamp(max=1.0)
-    return values
+    Torques are small for small drives.
+    """
+    small = (effort / PROBED_EFFORT).clamp(max=1.0)[:, None]
+    torques = torch.tensor([p.unit == "N m" and p.null == 0.0 for p in effect.parameters])
+    size = torch.where(torques, small, 1.0)
+    return [(effect, size * model.at_point(effect, point)) for point in probe_points(effect)]
 
 
 def starts_of(probe: Probe, cfg: CandidatesCfg) -> torch.Tensor:

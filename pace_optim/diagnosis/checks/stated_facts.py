@@ -1,4 +1,4 @@
-"""Effects that measured facts exclude: they would say that what was measured is wrong."""
+"""Effects that facts exclude: they would say that what was measured is wrong, or follow what was not logged."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import torch
 
 from pace_actuators.effects import Effect
 from pace_optim.recording import Recording
+from pace_optim.recording.dataset import Dataset
 from pace_optim.terminal.choices import MEASURED_FACTS
+
+_PLACES = 33
+"""Instants of a recording at which it is looked at whether a condition changes."""
 
 
 def excluded_effects(
@@ -35,3 +39,13 @@ def excluded_effects(
         {effect: every for effect in found},
         [f"{effect.name} was not tried: {by_effect[effect.name]}." for effect in found],
     )
+
+
+def unlogged_effects(dataset: Dataset, effects: Iterable[type[Effect]]) -> dict[type[Effect], torch.Tensor]:
+    """Effects of a condition that was not logged or does not change, with the joints where that is so, (n,) bool."""
+    result: dict[type[Effect], torch.Tensor] = {}
+    for effect in (each for each in effects if each.condition):
+        logged = dataset.condition(effect.condition, _PLACES)
+        every = torch.ones(dataset.measured.shape[-1], dtype=torch.bool)
+        result[effect] = every if logged is None else ~logged.varies
+    return result

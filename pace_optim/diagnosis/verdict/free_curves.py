@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.joint_units import JointType, units_for
+from pace_optim.diagnosis.checks.stated_facts import unlogged_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.selection.comparison import within
@@ -22,6 +24,7 @@ from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.model import COLUMN
 from pace_optim.joints.simulation.problem import TwinProblem
+from pace_optim.recording.keys import CONDITIONS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,9 +80,12 @@ def fit_curves(
     say("fitting curves of any form instead of effects")
     ranges = _ranges(outcome.problem, outcome.base, outcome.cfg.verdict.reached)
     every = (get_effect(name) for name in available_effects())
-    effects = [each for each in every if issubclass(each, FreeForm) and each.variable in ranges]
+    curves = [each for each in every if issubclass(each, FreeForm) and each.variable in ranges]
+    unlogged = unlogged_effects(outcome.problem.dataset, curves)
+    varies = {effect: joints & ~unlogged.get(effect, torch.zeros_like(joints)) for effect in curves}
+    effects = [effect for effect in curves if bool(varies[effect].any())]
     without = Fitted.start(outcome.base.model, outcome.base.physical)
-    starts = [without, *(_start(outcome.base, effect, joints, ranges[effect.variable]) for effect in effects)]
+    starts = [without, *(_start(outcome.base, each, varies[each], ranges[each.variable]) for each in effects)]
     models, errors = fits.on_joints(outcome.problem, starts, joints, outcome.base_errors)
     above = torch.stack([(each.mse - floor**2).clamp(min=0.0) for each in errors])
     explained = torch.where(joints, 1 - above[1:] / above[0].clamp(min=1e-30), 0.0)
@@ -137,6 +143,7 @@ def error_map(
         effect, part = curves.effects[k], float(curves.explained[k, j])
         before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
         types, told = joint_types[j : j + 1], not within(before**2, after**2, cfg.alike)
+        formula = _formula(curves.models[k], effect, j) if told else ""
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,
@@ -144,20 +151,68 @@ def error_map(
             "kind": {"torque": "missing torque"}.get(effect.kind, effect.kind),
             "validation_rmse_before": before,
             "validation_rmse_after": after,
-            "sentence": units_for(_sentence(effect, part, 1e3 * before, 1e3 * after), types) if told else _NONE,
+            "sentence": units_for(_sentence(effect, part, 1e3 * before, 1e3 * after, formula), types)
+            if told
+            else _NONE,
             "curve": _curve(curves.models[k], effect, j) if told else None,
+            "formula": units_for(formula, types),
         }
     return joints
 
 
 _NONE = "no curve over a single variable carries the error."
+_PLACES = 33
+"""Instants of a recording at which the range of a condition is looked at."""
+_SMOOTH = 0.1
+"""A formula stands for a curve where it is this near (RMS), as a part of the curve's own."""
+_MOST_POWERS = 3
+"""Highest power of a formula."""
 
 
-def _sentence(effect: type[FreeForm], part: float, before: float, after: float) -> str:
+def _sentence(effect: type[FreeForm], part: float, before: float, after: float, formula: str) -> str:
     return (
         f"a curve of {effect.kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the "
-        f"floor ({before:.3g} to {after:.3g} mrad)."
+        f"floor ({before:.3g} to {after:.3g} mrad)." + (f" It is smooth: {formula}." if formula else "")
     )
+
+
+def _formula(fitted: Fitted, effect: type[FreeForm], joint: int) -> str:
+    """The polynomial of fewest powers that stands for a curve, with units; empty where none of three powers does.
+
+    Knots count by what they move, where that is known.
+    """
+    columns = fitted.model.columns(effect)
+    values = fitted.physical[joint, columns]
+    named = dict(zip([p.name for p in effect.parameters], values.tolist(), strict=True))
+    curve, own = effect.curve(named), torch.tensor([p.null is not None for p in effect.parameters])
+    moves = torch.ones(int(own.sum()), dtype=torch.float64)
+    if fitted.jacobian is not None:
+        moves = fitted.jacobian[columns, ..., joint].double().flatten(1).norm(dim=1)[own]
+    each = iter(moves.tolist())
+    weights = np.array([float(moves.max()) if knot == effect.zero else next(each) for knot in effect.knots])
+    middle = named.get("center", 0.0)
+    x, y = np.array(curve["at"]) - middle, np.array(curve["torque"])
+    reach = float(np.abs(x).max())
+    for power in range(1, _MOST_POWERS + 1):
+        powers = np.arange(1 if effect.zero is not None else 0, power + 1)
+        columns_of = (x[:, None] / reach) ** powers
+        size = np.linalg.lstsq(weights[:, None] * columns_of, weights * y, rcond=None)[0]
+        left = weights * (y - columns_of @ size)
+        if np.sqrt(np.mean(left**2)) <= _SMOOTH * np.sqrt(np.mean((weights * y) ** 2)):
+            return _written(effect, size / reach**powers, powers, middle)
+    return ""
+
+
+def _written(effect: type[FreeForm], sizes: np.ndarray, powers: np.ndarray, middle: float) -> str:
+    """A polynomial as text, with the unit of each coefficient."""
+    unit, over = effect.parameters[0].unit, effect.parameters[-1].unit
+    x = f"({effect.variable} - {middle:.3g} {over})" if middle else effect.variable
+    terms = []
+    for size, power in zip(sizes.tolist(), powers.tolist(), strict=True):
+        raised = f"^{power}" if power > 1 else ""
+        of = f"{unit}/({over}){raised}" if power else "" if unit == "1" else unit
+        terms.append(" ".join(filter(None, [f"{size:.3g}", of, f"{x}{raised}" if power else ""])))
+    return f"{effect.equation.split(',')[0]} with f = {' + '.join(terms)}".replace("+ -", "- ")
 
 
 def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list[float]]:
@@ -206,7 +261,12 @@ def _ranges(problem: TwinProblem, base: Fitted, reached: float) -> dict[str, tor
     seen = {"position": path.position, "torque": effort, "speed": path.speed(), "load on the gear": effort - load}
     time = data.session_start + problem.control_dt * torch.arange(len(path.position))[:, None]
     seen["time"] = time[..., None].expand(path.position.shape)
-    return {name: _quantiles(values, data.train, reached) for name, values in seen.items()}
+    ranges = {name: _quantiles(values, data.train, reached) for name, values in seen.items()}
+    for name in CONDITIONS:
+        if (logged := data.condition(name, _PLACES)) is not None:
+            values = logged.values[data.trained()].transpose(1, 2).flatten(0, 1)
+            ranges[name] = torch.stack([values.amin(dim=0), values.amax(dim=0)])
+    return ranges
 
 
 def _quantiles(values: torch.Tensor, where: torch.Tensor, reached: float) -> torch.Tensor:

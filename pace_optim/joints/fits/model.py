@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
-from pace_actuators.effects import Effect, EffectParameter
+from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectParameter
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND
 from pace_optim.problem.box import Box
 from pace_optim.problem.problem import Problem
@@ -41,6 +41,8 @@ class JointModel:
     """Between which positions each joint moves, (n, 2) [rad]: effects' positions are sought there."""
     efforts: torch.Tensor
     """The largest torque of each joint's drive, (n,) [N m]; infinite where it is not known."""
+    loops: torch.Tensor
+    """The stiffness of each joint's position loop, (n,) [N m/rad]."""
     barred: Mapping[type[Effect], torch.Tensor] = field(default_factory=dict)
     """Effects that some joints cannot get, (n,) bool."""
     shared: frozenset[type[Effect]] = frozenset()
@@ -64,6 +66,10 @@ class JointModel:
             ),
             efforts=torch.tensor(
                 [sim2real.joint_efforts.get(joint, math.inf) for joint in problem.joint_names], dtype=torch.float64
+            ),
+            loops=torch.tensor(
+                [sim2real.joint_stiffness.get(joint, PROBED_STIFFNESS) for joint in problem.joint_names],
+                dtype=torch.float64,
             ),
         )
 
@@ -123,6 +129,7 @@ class JointModel:
             slides=self.slides[joints],
             ranges=self.ranges[joints],
             efforts=self.efforts[joints],
+            loops=self.loops[joints],
             barred={effect: barred[joints] for effect, barred in self.barred.items()},
         )
         return model, entries
@@ -201,17 +208,19 @@ class JointModel:
 
     def _declared(self, effect: type[Effect]) -> tuple[torch.Tensor, torch.Tensor]:
         """The bounds of an effect on each joint, as it declares them, (n, parameters) each."""
-        places = zip(*self.ranges.T.tolist(), self.efforts.tolist(), strict=True)
-        bounds = [[p.reaching(*place) for p in effect.parameters] for place in places]
+        places = zip(self.loops.tolist(), *self.ranges.T.tolist(), self.efforts.tolist(), strict=True)
+        bounds = [[p.on_loop(loop).reaching(*place) for p in effect.parameters] for loop, *place in places]
         own = torch.tensor(bounds, dtype=torch.float64).reshape(self.num_joints, -1, 2)
         return own[..., 0], own[..., 1]
 
     def _widest(self, parameter: EffectParameter, joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The widest bounds of an effect's parameter on some joints, (n,) bool; physical, one for each of them."""
         friction = self.upper[joints, COLUMN["friction"]].tolist()
-        bounds = torch.tensor([parameter.widest(each) for each in friction], dtype=torch.float64).reshape(-1, 2)
-        places = zip(*self.ranges[joints].T.tolist(), self.efforts[joints].tolist(), strict=True)
-        own = torch.tensor([parameter.reaching(*place) for place in places], dtype=torch.float64).reshape(-1, 2)
+        each = [parameter.on_loop(loop) for loop in self.loops[joints].tolist()]
+        widest = [p.widest(level) for p, level in zip(each, friction, strict=True)]
+        places = zip(each, *self.ranges[joints].T.tolist(), self.efforts[joints].tolist(), strict=True)
+        reaches = [p.reaching(*place) for p, *place in places]
+        bounds, own = (torch.tensor(values, dtype=torch.float64).reshape(-1, 2) for values in (widest, reaches))
         return torch.minimum(bounds[:, 0], own[:, 0]), torch.maximum(bounds[:, 1], own[:, 1])
 
     def is_wide(self, effect: type[Effect]) -> torch.Tensor:
@@ -294,6 +303,12 @@ class JointModel:
                 result[row] |= has & ((physical[:, column] < least) | (physical[:, column] > most))
         return result
 
+    def at_point(self, effect: type[Effect], values: Mapping[str, float]) -> torch.Tensor:
+        """Physical entries of an effect at one of its points on each joint, (n, parameters), inside their bounds."""
+        follows = torch.tensor([p.follows_loop for p in effect.parameters])
+        sizes = (self.loops / PROBED_STIFFNESS)[:, None]
+        return start_values(effect, values) * torch.where(follows, sizes, 1.0)
+
     @property
     def box(self) -> Box:
         """Bounds and scales."""
@@ -308,7 +323,7 @@ class JointModel:
         return self.box.to_normalised(physical).clamp(-1.0, 1.0)
 
 
-def start_values(effect: type[Effect], values: dict[str, float]) -> torch.Tensor:
+def start_values(effect: type[Effect], values: Mapping[str, float]) -> torch.Tensor:
     """Physical entries of an effect, (parameters,), inside their bounds."""
     return torch.tensor(
         [min(max(values.get(p.name, p.start), p.lower), p.upper) for p in effect.parameters], dtype=torch.float64

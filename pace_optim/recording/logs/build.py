@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.text import listed
-from pace_optim.recording.keys import COMMAND_SERIES, MEASURED_SERIES
+from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, MEASURED_SERIES
 from pace_optim.recording.resample import interpolate_linear, interpolate_smooth
 
 from .base import base_fields
@@ -33,7 +33,7 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
     parts = {
         series: {name: _scaled(log, series, columns.joints[name][series]) for name in joint_names
                  if series in columns.joints[name]}
-        for series in (*MEASURED_SERIES, *COMMAND_SERIES)
+        for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES)
     }  # fmt: skip
     clocks = [parts["dof_pos"][name][0] for name in joint_names]
     time, notes = clocks[0], []
@@ -46,8 +46,8 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         raise ValueError(f"{log.name}: the positions of {listed(joint_names)} have no time in common. Check the log.")
     first = float(time[0])
     fields: dict[str, Any] = {"joint_names": list(joint_names)}
-    for series in MEASURED_SERIES:
-        interpolate = interpolate_linear if series == "dof_effort" else interpolate_smooth
+    for series in (*MEASURED_SERIES, *CONDITIONS):
+        interpolate = interpolate_smooth if series in ("dof_pos", "dof_vel") else interpolate_linear
         if parts[series]:
             fields[series] = _columns(parts[series], joint_names, lambda p, how=interpolate: _at(p, time, how))  # type: ignore[misc]
     if _is_measured(columns, joint_names):  # a measurement changes between its samples, as no held command does
@@ -153,7 +153,7 @@ def _union(clocks: Sequence[np.ndarray]) -> np.ndarray:
 def rates_of(log: Log, columns: ColumnMap) -> list[str]:
     """What was understood, a line for each series: where from, unit, rate and longest gap."""
     lines = []
-    for series in (*MEASURED_SERIES, *COMMAND_SERIES):
+    for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES):
         by = {name: sources[series] for name, sources in columns.joints.items() if series in sources}
         for names, source, channel in _alike(log, by):
             gap = float(np.diff(channel.time).max()) if len(channel.time) > 1 else 0.0

@@ -25,7 +25,7 @@ class Source:
     """Where a series of a joint comes from.
 
     Positions and speeds: ``sign * value * unit / gear_ratio + offset``; torques, with ``factor`` [N m/A] for currents:
-    ``sign * value * unit * factor * gear_ratio + offset``.
+    ``sign * value * unit * factor * gear_ratio + offset``. Temperatures and voltages: as positions.
     """
 
     channel: str

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from pace_actuators.joint_units import JointType
 from pace_actuators.text import listed
-from pace_optim.recording.keys import COMMAND_SERIES, JOINT_SERIES, MEASURED_SERIES
+from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, MEASURED_SERIES
 
 from .base import guess_base
 from .column_map import ColumnMap, Source
@@ -107,7 +107,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
         for (table, of), group in groups.items():
             if of != series:
                 continue
-            if series in GAINS.values() and [each.label for each in group] == [""]:  # one for all
+            if _one_for_all(series, group, names):
                 pairs = [(name, 0.3, group[0]) for name in names]
             else:
                 pairs = _by_name(group, names, robot.wanted)
@@ -138,6 +138,13 @@ def guess_map(log: Log, robot: Robot) -> Guess:
         unit_stated=tuple(name for name, by in picked.items() if "dof_pos" in by and by["dof_pos"].unit),
         facts_from=tuple(facts_from),
     )
+
+
+def _one_for_all(series: str, group: Sequence[_Candidate], names: Sequence[str]) -> bool:
+    """Whether a column is of all joints: a gain without a joint's name, the voltage of a battery."""
+    if series in GAINS.values():
+        return [each.label for each in group] == [""]
+    return series in CONDITIONS and len(group) == 1 and not match(group[0].label, names)
 
 
 def _enable(channels: Sequence[Channel]) -> tuple[str, list[str]]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import listed
+from pace_optim.recording.keys import CONDITIONS
 from pace_optim.recording.noise import noise_floor
 
 from .log import Channel
@@ -72,6 +73,8 @@ def guessed_units(
     Raises:
         UnitUnknown: If a joint may be in either of two units.
     """
+    if series in CONDITIONS:
+        return dict.fromkeys(known, next(iter(UNITS[series]))), []
     joint_type = next(iter(known.values())).joint_type
     channels = {name: joint.given[series] for name, joint in known.items()}
     if series == "dof_pos":

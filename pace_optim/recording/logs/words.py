@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 POSITION, VELOCITY, EFFORT = "dof_pos", "dof_vel", "dof_effort"
+TEMPERATURE, VOLTAGE = "temperature", "voltage"
 
 UNITS: dict[str, dict[str, float]] = {
     POSITION: {
@@ -20,6 +22,8 @@ UNITS: dict[str, dict[str, float]] = {
     EFFORT: {
         "N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3, "%": 1e-2, "permille": 1e-3,
     },
+    TEMPERATURE: {"°C": 1.0, "0.1 °C": 0.1},
+    VOLTAGE: {"V": 1.0, "0.1 V": 0.1, "mV": 1e-3},
 }  # fmt: skip
 """Units of each quantity, in SI units; those of ``NEED_FACTOR`` want a factor too."""
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -73,15 +77,24 @@ _EFFORT = {
 }  # fmt: skip
 _AMPERES = {"amp", "amps", "ampere", "amperes", "iq", "currents", "curr"}
 _OTHER = {
-    "error", "err", "errors", "temp", "temperature", "voltage", "volt", "volts", "ki", "gain", "gains", "duty",
+    "error", "err", "errors", "ki", "gain", "gains", "duty",
     "accel", "acc", "acceleration", "accelerations", "ddq", "qdd", "imu", "quat", "quaternion", "gyro", "index",
     "frame", "episode", "task", "limit", "min", "max", "status", "fault", "mode", "std", "pwm", "power", "id",
     "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum", "last", "prev", "previous",
     "column", "tcp", "pose", "orientation",
 }  # fmt: skip
+_CONDITIONS = {
+    **dict.fromkeys(("temp", "temps", "temperature", "temperatures"), TEMPERATURE),
+    **dict.fromkeys(("voltage", "voltages", "volt", "volts", "vbus"), VOLTAGE),
+}
+_NOT_OF_DRIVES = {"ambient", "room", "air", "cpu", "gpu", "board", "mcu", "ntc", "cell", "cells"}
+"""Words of temperatures and voltages of other things than drives."""
 _GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
 _SIDES = {"l": "left", "r": "right"}
 _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
+    (r"°c\b|\bdeg(rees?)?[ _]?c(elsius)?\b|\bcelsius\b|[\[(]c[\])]", TEMPERATURE, "°C"),
+    (r"\bmv\b|millivolts?", VOLTAGE, "mV"),
+    (r"[\[(]v[\])]", VOLTAGE, "V"),
     (r"deg(rees?)?[ _]?(/|per)[ _]?s(ec)?|deg_s\b|dps\b|°/s", VELOCITY, "deg/s"),
     (r"m?rad(ians?)?[ _]?(/|per)[ _]?s(ec)?|rad_s\b", VELOCITY, "rad/s"),
     (r"\brpm\b", VELOCITY, "rpm"),
@@ -115,7 +128,7 @@ class Meaning:
     """What a name says; "" and () where it says nothing."""
 
     quantity: str
-    """`dof_pos`, `dof_vel`, `dof_effort`, `torque_enable`, `stiffness`, `damping` or ""."""
+    """`dof_pos`, `dof_vel`, `dof_effort`, `temperature`, `voltage`, `torque_enable`, `stiffness`, `damping` or ""."""
     commanded: bool
     unit: str
     joint: tuple[str, ...]
@@ -151,11 +164,14 @@ def meaning(name: str, table: str = "") -> Meaning:
         or bool(set(around) & _AMPERES and not said & (_POSITION | _VELOCITY | _EFFORT))
     )
     spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(around)
+    spoken |= set(_CONDITIONS)
     others = said & _OTHER
     if others == {"index"} and any(word.isalpha() for word in said - others - spoken - _GENERIC):
         others = set()  # a finger's
     if others:
         quantity = ""
+    elif said & set(_CONDITIONS):
+        quantity = _condition(own, set(around))
     elif said & {"enabled", "enable"} or ("on" in said and said & {"torque", "servo", "motor", "drive", "power"}):
         quantity = "torque_enable"
     elif gain := [GAINS[word] for word in own if word in GAINS]:
@@ -169,6 +185,7 @@ def meaning(name: str, table: str = "") -> Meaning:
     else:
         quantity = of_unit or _of_table(said, set(around))
     commanded = bool((said | set(around)) & _COMMAND) and not (said & _MEASURED - {"current"} and not said & _COMMAND)
+    commanded = commanded and quantity not in (TEMPERATURE, VOLTAGE)
     if quantity == EFFORT and said & {"ff", "feedforward"}:
         commanded = True
     if of_unit == EFFORT and unit in ("%", "permille") and quantity != EFFORT:
@@ -181,6 +198,14 @@ def meaning(name: str, table: str = "") -> Meaning:
     if not unit and quantity == EFFORT and said & _EFFORT == {"load"}:
         unit, of_unit = "%", EFFORT  # a servo's register, of a duty or of its largest torque
     return Meaning(quantity=quantity, commanded=commanded, unit=unit if of_unit in ("", quantity) else "", joint=joint)
+
+
+def _condition(own: Sequence[str], around: set[str]) -> str:
+    """What a temperature or a voltage is: of no drive, and of one that is commanded, nothing is read."""
+    said, quantity = set(own), next(_CONDITIONS[word] for word in own if word in _CONDITIONS)
+    commanded = said & (_COMMAND - {"input"}) and not said & _MEASURED  # "present input voltage" is the supply's
+    of_battery = quantity == TEMPERATURE and (said | around) & {"battery", "imu"}
+    return "" if commanded or of_battery or said & _NOT_OF_DRIVES else quantity
 
 
 def is_time(name: str) -> bool:

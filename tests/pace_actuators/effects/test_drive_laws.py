@@ -60,6 +60,27 @@ def test_a_torque_constant_falls_with_the_heat_of_the_session():
     assert drive.one(5.0) == pytest.approx(500.0 * (1 - 400 / 1600), rel=0.01)
 
 
+def test_friction_and_torque_follow_a_logged_temperature_and_voltage():
+    data = joint_alone().problem.dataset
+    warm = [replace(each, temperature=np.linspace(20.0, 60.0, len(each.time))[:, None]) for each in data.recordings]
+    data = replace(data, recordings=tuple(warm))
+    logged = data.condition("temperature", 9)
+    assert data.condition("voltage", 9) is None and logged.varies.tolist() == [True]
+    assert logged.values[0, 0].tolist() == pytest.approx(np.linspace(20.0, 60.0, 9).tolist())
+    line = torch.tensor([[[1.0, 0.5]]]), torch.linspace(20.0, 60.0, 9)[None, None]
+    for name, values, torque, friction in (
+        ("thermal_torque", {"slope": -0.01}, 10.0 * 0.85, 0.5),
+        ("thermal_friction", {"slope": -0.01}, 10.0, 0.5 * 0.85),
+        ("supply_voltage", {"share": 1.0, "nominal": 50.0}, 8.0, 0.5),
+        ("gain_over_voltage", {"share_3": 0.25, "center": 30.0, "reach": 20.0}, 12.5, 0.5),
+    ):
+        drive = Drive([name], {f"{name}.{key}": value for key, value in values.items()})
+        drive.motor.notice(lambda condition, places, rows, logged=line: logged)
+        drive.motor.set_session_time(torch.full((1, 1), 3.0))  # half of the way: 40 °C, or 40 V
+        assert drive.one(0.1) == pytest.approx(torque)
+        assert float(drive.motor.joint_friction) == pytest.approx(friction)
+
+
 @pytest.mark.parametrize(
     ("name", "method", "values"),
     [

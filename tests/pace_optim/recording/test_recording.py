@@ -124,14 +124,14 @@ def test_facts_may_lie_in_a_json_beside_any_format(tmp_path, suffix):
 
 
 def test_unknown_columns_are_noted_and_columns_may_come_in_any_order(tmp_path):
-    rows = ["torque_enable/b,des_dof_pos/b,voltage/b,time,dof_pos/a,dof_pos/b,des_dof_pos/a,torque_enable/a"]
+    rows = ["torque_enable/b,des_dof_pos/b,torsion/b,time,dof_pos/a,dof_pos/b,des_dof_pos/a,torque_enable/a"]
     rows += [f"{i % 2},{i + 0.5},7.3,{i * 0.0025},{i},{-i},{i + 0.25},{i % 2}" for i in range(30)]
     (path := tmp_path / "leg.csv").write_text("\ufeff" + "\n".join(rows) + "\n")
     loaded = load_recording(path)
     assert loaded.joint_names == ("a", "b")
     assert loaded.des_dof_pos[3].tolist() == [3.25, 3.5] and loaded.dof_pos[3].tolist() == [3.0, -3.0]
     assert loaded.torque_enable.tolist() == [bool(i % 2) for i in range(30)]
-    assert any("voltage" in note for note in loaded.notes)
+    assert any("torsion" in note for note in loaded.notes)
 
 
 def test_feet_of_one_force_each_are_columns_of_their_names(tmp_path):
@@ -317,7 +317,7 @@ def test_each_fault_of_the_content_has_its_message(tmp_path, changes, words):
 
 
 def test_keys_that_are_not_ours_are_noted(tmp_path):
-    assert "temperature" in load_recording(written(tmp_path, temperature=30.0)).notes[0]
+    assert "humidity" in load_recording(written(tmp_path, humidity=30.0)).notes[0]
 
 
 # Against the robot ------------------------------------------------------------------------------------------

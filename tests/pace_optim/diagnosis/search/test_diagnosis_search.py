@@ -140,7 +140,8 @@ def two_joints(bench):
     one = JointModel.base(bench.problem)
     none = torch.zeros(0, 2, dtype=torch.bool)
     bounds = {side: getattr(one, side).repeat(2, 1) for side in ("lower", "upper", "ranges")}
-    return replace(one, has=none, slides=one.slides.repeat(2), efforts=one.efforts.repeat(2), **bounds)
+    drives = {name: getattr(one, name).repeat(2) for name in ("slides", "efforts", "loops")}
+    return replace(one, has=none, **drives, **bounds)
 
 
 @pytest.mark.parametrize("stood_out", [True, False])  # beside neighbours that moved wrongly

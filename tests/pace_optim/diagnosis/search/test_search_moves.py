@@ -211,6 +211,7 @@ def test_joints_take_over_a_trimmed_fit_where_it_is_better_on_validation_recordi
             slides=torch.zeros(2, dtype=torch.bool),
             ranges=torch.zeros(2, 2),
             efforts=torch.full((2,), torch.inf),
+            loops=torch.full((2,), 85.0),
         )
         jacobian, error = (torch.full(shape, value) for shape in ((bounds.shape[1], 3, 1, 2), (3, 1, 2)))
         return Fitted(model=model, x=value * bounds, score=score, jacobian=jacobian, error=error)

@@ -178,7 +178,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     spring, curve = get_effect("parallel_spring"), get_effect("friction_over_speed")
     one, four = JointModel.base(run.problem), torch.arange(4)
     all_of_them = {side: getattr(one, side).expand(4, -1) for side in ("lower", "upper", "ranges")}
-    all_of_them["efforts"] = one.efforts.expand(4)
+    all_of_them |= {"efforts": one.efforts.expand(4), "loops": one.loops.expand(4)}
     all_of_them["slides"] = one.slides.expand(4)
     model = replace(one, has=torch.zeros(0, 4, dtype=torch.bool), **all_of_them)
     values = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64).expand(4, -1)

@@ -127,6 +127,7 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
         upper=base.upper.repeat(2, 1),
         ranges=base.ranges.repeat(2, 1),
         efforts=base.efforts.repeat(2),
+        loops=base.loops.repeat(2),
     )
     model, physical = base.extended(robot.truth_values.repeat(2, 1), GAIN, both, torch.ones(2, 1).double())
     generator = torch.Generator().manual_seed(0)

@@ -328,6 +328,7 @@ def test_a_descent_ends_when_every_joint_has_once_come_to_its_end(bench):
         upper=one.upper.repeat(2, 1),
         ranges=one.ranges.repeat(2, 1),
         efforts=one.efforts.repeat(2),
+        loops=one.loops.repeat(2),
     )
     small = 1e-5
     gains = [[small, 0.5], [small, 0.5], [0.5, small], [0.5, small], [0.5, 0.5]]  # the first joint gains again later
@@ -345,6 +346,7 @@ def test_a_neighbour_moves_another_entry_of_each_joint(bench):
         upper=one.upper.repeat(2, 1),
         ranges=one.ranges.repeat(2, 1),
         efforts=one.efforts.repeat(2),
+        loops=one.loops.repeat(2),
     )
     two = two.with_effect(GAIN, torch.tensor([True, False])).with_effect(STRIBECK, torch.tensor([False, True]))
     size, most = two.size, len(BASE) + len(STRIBECK.parameters)

@@ -48,6 +48,7 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
         upper=one.upper.repeat(2, 1),
         ranges=one.ranges.repeat(2, 1),
         efforts=one.efforts.repeat(2),
+        loops=one.loops.repeat(2),
     )
     values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
     model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
@@ -66,6 +67,7 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
         upper=base.upper.repeat(2, 1),
         ranges=base.ranges.repeat(2, 1),
         efforts=base.efforts.repeat(2),
+        loops=base.loops.repeat(2),
     )
     both = torch.tensor([True, True])
     found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)

@@ -55,6 +55,7 @@ def fitted():
             slides=torch.zeros(1, dtype=torch.bool),
             ranges=torch.zeros(1, 2),
             efforts=torch.full((1,), torch.inf),
+            loops=torch.full((1,), 85.0),
         )
         start = Fitted.start(model, 0 * bounds)
         result = Fits(batch=landscape).side_by_side(None, [start], 25, rough=rough)[0]

@@ -13,7 +13,7 @@ import pytest
 from recordings import says
 
 from pace_optim.commands import import_log
-from pace_optim.recording import load_recording
+from pace_optim.recording import load_recording, save_recording
 from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
 from pace_optim.recording.logs.messages import rows_of
 from pace_optim.recording.logs.words import meaning
@@ -225,6 +225,7 @@ def test_an_unknown_message_type_is_read_by_its_fields(tmp_path):
             write("LowCmd", "motor_cmd", ns, DES[k])
     (recording,) = load_recordings(tmp_path / "leg", ROBOT)
     check(recording, atol=1e-6)
+    assert np.all(recording.temperature == 30.0)
 
 
 def test_a_damaged_bag_and_one_without_joints_have_their_messages(tmp_path, monkeypatch):
@@ -279,6 +280,17 @@ def test_csv_of_any_names_units_and_stamps(tmp_path, header, stamp, scale, absol
         (recording,) = load_recordings(path, ROBOT)
     check(recording, atol=1e-6, absolute=absolute)
     assert recording.des_time is None
+
+
+def test_temperatures_of_motors_and_the_voltage_of_a_battery_are_read(tmp_path):
+    names = ["time", "hip pos", "knee pos", "hip cmd", "knee cmd", "hip temp [°C]", "knee temperature", "imu temp", "battery_voltage"]
+    columns = [STAMPS / 1e9, *POS.T, *HELD.T, *(40.0 + POS).T, 0.0 * STAMPS, 24.0 - POS[:, 0]]
+    rows(names, columns, tmp_path / "log.csv")
+    (recording,) = load_recordings(tmp_path / "log.csv", ROBOT)
+    assert recording.temperature == pytest.approx(40.0 + POS)
+    assert recording.voltage == pytest.approx(24.0 - POS[:, [0, 0]])
+    saved = load_recording(save_recording(tmp_path / "saved.csv", recording))
+    assert np.array_equal(saved.temperature, recording.temperature)
 
 
 def test_empty_cells_give_columns_clocks_of_their_own(tmp_path):
