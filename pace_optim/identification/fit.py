@@ -12,7 +12,7 @@ from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
 from pace_optim.estimate.search import agree_to_stop, search
 from pace_optim.identification.conclude import conclude
-from pace_optim.identification.optimization import Optimization
+from pace_optim.identification.optimization import Optimization, with_structures
 from pace_optim.identification.own_objective import conclude_own
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
@@ -179,6 +179,8 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg, tell_nobody)
     problem = problem if loop in (None, problem.loop_dt) else problem.with_loop(loop)
+    if len(around):
+        problem = with_structures(problem, None, around)
     searcher = make_searcher(problem.for_search(device), settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
     optimizer.restore(history, line_generation)

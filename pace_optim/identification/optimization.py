@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,17 +37,20 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
+STRUCTURE, MIXED, FOUND = "structure {:g}, ", "structure of each joint, ", "found structure, "
+"""What the stages' names begin with, with another structure of effects: of all joints, of each joint, and the best."""
 OTHER_LOOP, FINER_STEP, FURTHER, TORQUE_NOISE, POSITIONS, WEIGHED = (
     "loop of {:g} s, ", "step of {:g} s, ", "further {}, ", "torque noise {}, ", "positions, ", "torque noise, ",
 )  # fmt: skip
-"""What the stages' names begin with: with another loop, at a finer step, where pieces had not ended, by the noise that
-torques have, without torques, and by that noise from a vector that is known."""
+"""The same with another loop, at a finer step, where pieces had not ended, by the noise that torques have, without
+torques, and by that noise from a vector that is known."""
 _TORQUE_ATTEMPTS = 3
 """Times that the noise of torques is set."""
 _BY_CHANCE = 2.0
 """Times the number of parameters by which χ² of the positions may rise because torques are followed too."""
-_LOOP_IN_DOUBT = 1.5
-"""Times the noise above which pieces with an assumed loop rate are fitted with another."""
+_IN_DOUBT = 1.5
+"""Times the noise above which pieces are fitted with another structure of effects, and with another loop rate where it
+is assumed."""
 _STEP_IN_DOUBT = 1.3
 """Times the noise above which a fit may go on at half its physics step ..."""
 _OF_THE_STEP = 0.25
@@ -106,6 +110,8 @@ class Optimization:
             processes: Who shares the search's candidates.
         """
         self.settings = settings
+        if not settings.only_searches:
+            problem = with_structures(problem, settings.start)
         self.problem = problem
         self.folder = folder
         self.progress = progress
@@ -171,7 +177,10 @@ class Optimization:
 
     def _elsewhere(self, best: Descent) -> WayDown | None:
         """The way of other facts, begun at the best end on pieces: another loop rate, the noise that torques have."""
-        way = self._with_other_loop(best)
+        way = self._with_structure(best)
+        if way is not None:
+            best = min(way.descents, key=lambda d: d.score)
+        way = self._with_other_loop(best) or way
         if self.problem.dataset.torques is None:
             return way
         if way is not None:
@@ -248,6 +257,48 @@ class Optimization:
         """Of what a run that is resumed simulates once more: it was counted before."""
         return evaluator.again() if self._restored else nullcontext()
 
+    def _with_structure(self, best: Descent) -> WayDown | None:
+        """The way with another structure of effects, begun at their probes, if it leads further on pieces.
+
+        All joints take each structure in turn, then each joint the one with which it ended best.
+        """
+        structures, noise = self.problem.structures, noise_score(self.problem)
+        if not structures or best.score <= _IN_DOUBT**2 * noise:
+            return None
+        bases = [self.problem.space.to_physical(x) for x in (best.x, self.problem.space.start)]
+        tried = [(self._in_use, best)]
+
+        def go(values: Mapping[str, float], starts: Sequence[torch.Tensor], name: str) -> None:
+            course = self._course(self.problem.holding(values), name)
+            tried.append((course, course.way.begin([course.problem.space.to_normalised(each) for each in starts])))
+
+        for value in sorted({each for values in structures.values() for each in values}):
+            self.progress.say(f"above the noise: fitting {', '.join(structures)} at {value:g}")
+            values = {label: value if value in own else own[0] for label, own in structures.items()}
+            starts = [start for base in bases for start in self.problem.at_probes(base, value)]
+            go(values, starts, STRUCTURE.format(value))
+        scores, names = [self._joint_scores(*each) for each in tried], self.problem.joint_names
+        ends = [course.problem.space.to_physical(end.x) for course, end in tried]
+        mixed, places = ends[0].clone(), self.problem.space.owners([[name] for name in names])
+        for entry, j in enumerate(places):
+            left = [float(own.sum() if j is None else own[j]) for own in scores]
+            mixed[entry] = ends[left.index(min(left))][entry]
+        if not any(torch.equal(mixed, end) for end in ends):
+            go({label: float(mixed[self.problem.space.labels.index(label)]) for label in structures}, [mixed], MIXED)
+        course, end = min(tried, key=lambda each: each[1].score)
+        if course is tried[0][0] or best.score - end.score <= UNEXPLAINED * (best.score - noise):
+            return None
+        found = self._course(course.problem, FOUND)  # a way that goes on has one start
+        found.way.begin([end.x])
+        self._use(found)
+        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
+        return found.way
+
+    def _joint_scores(self, course: _Course, end: Descent) -> torch.Tensor:
+        """What each joint has left on pieces, (n,) [rad²]."""
+        with self._found_again(course.way.pieces):
+            return course.way.pieces.residuals(course.problem.space.to_physical(end.x)[None]).joint_score[0]
+
     def _with_other_loop(self, best: Descent) -> WayDown | None:
         """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
         problem, noise = self.problem, noise_score(self.problem)
@@ -255,7 +306,7 @@ class Optimization:
             return None
         found, least = None, best
         for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
-            if period == problem.loop_dt or least.score <= _LOOP_IN_DOUBT**2 * noise:
+            if period == problem.loop_dt or least.score <= _IN_DOUBT**2 * noise:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
             self.progress.say(f"above the noise: fitting loops that run {rate}, as their rate is not stated")
@@ -468,3 +519,20 @@ class Optimization:
         if self.optimizer is not None and self.optimizer.generation:
             return self._best_of(self.optimizer)
         return self.problem.space.start
+
+
+def with_structures(problem: Problem, start: Mapping[str, Any] | None, around: torch.Tensor | None = None) -> Problem:
+    """The problem with the structures of its effects held where a fit begins.
+
+    Args:
+        problem: What is fitted.
+        start: Parameters that it begins at; ``None``: at the space's start.
+        around: The same as a physical vector (size,), if that is known.
+    """
+    if not (structures := problem.structures):
+        return problem
+    if around is None:
+        around = problem.space.to_physical(problem.space.start if start is None else as_vector(problem, dict(start)))
+    own = {label: float(around[problem.space.labels.index(label)]) for label in structures}
+    nearest = {label: min((abs(v - own[label]), v) for v in values)[1] for label, values in structures.items()}
+    return problem.holding(nearest)

@@ -14,7 +14,7 @@ import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import LinkInertia
-from pace_actuators.effects import EffectCfg, effect_cfgs
+from pace_actuators.effects import PROBED_STIFFNESS, EffectCfg, effect_cfgs, probe_points
 from pace_actuators.joint_units import JointType
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT, physics_steps
@@ -145,6 +145,40 @@ class Problem:
         """The same recordings with other effects."""
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    @property
+    def structures(self) -> dict[str, tuple[float, ...]]:
+        """Values that parameters can have between which no descent leads, by label (see ``Effect.structural``)."""
+        result: dict[str, tuple[float, ...]] = {}
+        every = (cfg.effect_class for cfg in effect_cfgs(self.env_cfg.sim2real.effects))
+        for effect in dict.fromkeys(each for each in every if each.structural):
+            name = f"{effect.name}.{effect.structural}"
+            values = tuple(sorted({point[effect.structural] for point in probe_points(effect)}))
+            result |= {label: values for label in self.space.labels if label.split("/")[0] == name}
+        return result
+
+    def at_probes(self, physical: torch.Tensor, structure: float) -> list[torch.Tensor]:
+        """A physical vector (size,) with effects at each of their probes that has a value of their structure."""
+        sim2real, result = self.env_cfg.sim2real, []
+        for effect in dict.fromkeys(cfg.effect_class for cfg in effect_cfgs(sim2real.effects)):
+            points = probe_points(effect) if effect.structural else []
+            for point in (each for each in points if each[effect.structural] == structure):
+                own = physical.clone()
+                for parameter in effect.parameters:
+                    name = f"{effect.name}.{parameter.name}"
+                    keys = next(p.keys for p in self.space.parameters if p.name == name)
+                    loops = [sim2real.joint_stiffness.get(key, PROBED_STIFFNESS) for key in keys]
+                    sizes = [loop / PROBED_STIFFNESS if parameter.follows_loop else 1.0 for loop in loops]
+                    own[self.space[name]] = point[parameter.name] * torch.tensor(sizes, dtype=own.dtype)
+                result.append(own)
+        return result
+
+    def holding(self, values: Mapping[str, float]) -> Problem:
+        """The same with some entries held at physical values, by label."""
+        physical = self.space.to_physical(self.space.start)
+        for label, value in values.items():
+            physical[self.space.labels.index(label)] = value
+        return replace(self, space=self.space.holding(tuple(values), physical))
 
     def reaching(self, bounds: Mapping[str, tuple[float, float]]) -> Problem:
         """The same, its base parameters sought as far as another problem sought them too.

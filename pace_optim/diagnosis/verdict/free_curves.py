@@ -164,7 +164,9 @@ _NONE = "no curve over a single variable carries the error."
 _PLACES = 33
 """Instants of a recording at which the range of a condition is looked at."""
 _SMOOTH = 0.1
-"""A formula stands for a curve where it is this near (RMS), as a part of the curve's own."""
+"""A formula stands for a curve where it is this near (RMS), as a part of how the curve varies."""
+_SMALL = 1e-3
+"""Part of the largest term that a term must have."""
 _MOST_POWERS = 3
 """Highest power of a formula."""
 
@@ -193,25 +195,28 @@ def _formula(fitted: Fitted, effect: type[FreeForm], joint: int) -> str:
     middle = named.get("center", 0.0)
     x, y = np.array(curve["at"]) - middle, np.array(curve["torque"])
     reach = float(np.abs(x).max())
+    level = 0.0 if effect.zero is not None else np.average(y, weights=weights**2)
     for power in range(1, _MOST_POWERS + 1):
         powers = np.arange(1 if effect.zero is not None else 0, power + 1)
         columns_of = (x[:, None] / reach) ** powers
         size = np.linalg.lstsq(weights[:, None] * columns_of, weights * y, rcond=None)[0]
-        left = weights * (y - columns_of @ size)
-        if np.sqrt(np.mean(left**2)) <= _SMOOTH * np.sqrt(np.mean((weights * y) ** 2)):
-            return _written(effect, size / reach**powers, powers, middle)
+        left, whole = (weights * each for each in (y - columns_of @ size, y - level))
+        if left @ left <= _SMOOTH**2 * (whole @ whole):
+            return _written(effect, size, powers, reach, middle)
     return ""
 
 
-def _written(effect: type[FreeForm], sizes: np.ndarray, powers: np.ndarray, middle: float) -> str:
-    """A polynomial as text, with the unit of each coefficient."""
+def _written(effect: type[FreeForm], sizes: np.ndarray, powers: np.ndarray, reach: float, middle: float) -> str:
+    """A polynomial in parts of the reach as text, with the unit of each coefficient."""
     unit, over = effect.parameters[0].unit, effect.parameters[-1].unit
     x = f"({effect.variable} - {middle:.3g} {over})" if middle else effect.variable
     terms = []
     for size, power in zip(sizes.tolist(), powers.tolist(), strict=True):
+        if abs(size) < _SMALL * np.abs(sizes).max():
+            continue
         raised = f"^{power}" if power > 1 else ""
         of = f"{unit}/({over}){raised}" if power else "" if unit == "1" else unit
-        terms.append(" ".join(filter(None, [f"{size:.3g}", of, f"{x}{raised}" if power else ""])))
+        terms.append(" ".join(filter(None, [f"{size / reach**power:.3g}", of, f"{x}{raised}" if power else ""])))
     return f"{effect.equation.split(',')[0]} with f = {' + '.join(terms)}".replace("+ -", "- ")
 
 

@@ -94,6 +94,25 @@ def test_a_replay_begins_where_the_encoder_was_on_whichever_side(effect, values,
         assert seen - link == pytest.approx(side * twist(load), abs=1e-6)
 
 
+def test_a_fit_finds_which_side_of_an_elastic_shaft_the_encoder_is_on(tmp_path):
+    problem = problem_with(["joint_elasticity"], record(chirp(1.2), CALM))
+    truth = {"stiffness": 600.0, "damping": 1.0, "encoder_side": 1.0}
+    seen = replay(problem, {**CALM, **{f"joint_elasticity.{name}": value for name, value in truth.items()}})
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(seen[:, 0].shape)
+    recording = record(chirp(1.2), CALM)
+    recording = dataclasses.replace(
+        recording,
+        time=recording.time[: len(seen)],
+        des_dof_pos=recording.des_dof_pos[: len(seen)],
+        dof_pos=seen[:, 0].numpy() - CALM["encoder_bias"] + noise,
+    )
+    data = save_recording(tmp_path / "seen.npz", recording)
+    options = {"effects": ["joint_elasticity"], "optimizer": "least_squares", "physics_dt": DT}
+    result, _ = fit(FitSettings(task=BENCH, data=[str(data)], log_dir=str(tmp_path), **options))
+    assert result.parameters["joint_elasticity.encoder_side"] == {"servo": 1.0}
+    assert result.parameters["joint_elasticity.stiffness"]["servo"] == pytest.approx(600.0, rel=0.02)
+
+
 TWIN_CASES = {
     "stribeck_friction": {"effort": 1.5, "velocity": 0.5},
     "load_dependent_friction": {"coefficient": 0.2},

@@ -1,5 +1,6 @@
 """Curves of any form: what they are, and where they take the place of effects that do not explain the error."""
 
+import math
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.findings import summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.free_curves import Curves, error_map, fit_curves, take_curves
+from pace_optim.diagnosis.verdict.free_curves import Curves, _formula, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.names import Names
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.base_fit import fit_base
@@ -29,7 +30,7 @@ from pace_optim.joints.fits.model import BASE, JointModel
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
 
-CURVES = [name for name in available_effects() if get_effect(name).free_form]
+CURVES = [name for name in available_effects() if get_effect(name).free_form and not get_effect(name).condition]
 YES = torch.tensor([True])
 FLOOR = torch.tensor([1e-4], dtype=torch.float64)
 
@@ -59,6 +60,26 @@ def test_a_curve_is_straight_between_its_knots_and_constant_beyond_them():
     assert values_at(odd, -20.0, -0.15, 0.0, 0.15, 3.0) == pytest.approx([-6, -0.5, 0, 0.5, 4])
     points = odd.curve({p.name: float(getattr(odd, p.name)) for p in odd.parameters})
     assert points["torque"] == pytest.approx(values_at(odd, *points["at"])) and len(points["at"]) == 13
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "expected"),
+    [
+        ("torque_over_position", lambda x: 2.0 - 3.0 * (x - 1.0) ** 3, "τ + f(q) with f = 2 N m - "),
+        ("torque_over_position", lambda x: math.sin(9 * x), ""),
+        ("friction_over_temperature", lambda x: -0.01 * (x - 40.0), "with f = -0.01 1/(°C) (temperature - 40 °C)"),
+    ],
+)
+def test_a_smooth_curve_has_a_formula(name, at, expected):
+    effect, reach, center = get_effect(name), 15.0 if "temperature" in name else 0.8, 40.0 if "temp" in name else 1.0
+    values = [at(center + reach * knot) for knot in effect.knots if knot != effect.zero]
+    fitted = SimpleNamespace(
+        jacobian=None,
+        physical=torch.tensor([[*values, reach, center]]),
+        model=SimpleNamespace(columns=lambda _: slice(None)),
+    )
+    formula = _formula(fitted, effect, 0)
+    assert (expected in formula) if expected else not formula
 
 
 def test_no_diagnosis_looks_for_curves():
