@@ -27,7 +27,8 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
 
     Returns:
         ``{"effect", "parameter", "joint", "value", "std", "unit", "factor", "at_bound"}`` each. ``std`` is ``None``
-        where a value is held or at a bound, or the joint ends far from the floor. It is that of all joints together
+        where a value is held or at a bound, or the joint ends far from the floor, or above it with a stiff effect. It is
+        that of all joints together
         where they share one; ``factor`` says what was stated is multiplied by, if it is that.
     """
     now = outcome.final
@@ -38,7 +39,10 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
         now = fits.looked_at(outcome.problem, [now])[0]
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
     std = torch.where(std > 0, torch.hypot(std, _step_shares(fits, outcome.problem, now)), std)
-    far = outcome.far(floor).tolist()
+    stiff = now.model.has & torch.tensor([effect.is_stiff for effect in now.model.effects]).bool()[:, None]
+    # contacts make the error rough: above the floor its derivatives say little of how sure a size is
+    above = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.alike * floor
+    far = (outcome.far(floor) | (stiff.any(dim=0) & above)).tolist()
     result = []
     for effect, has in zip(now.model.effects, found, strict=True):
         columns = now.model.columns(effect)
