@@ -281,13 +281,13 @@ class Problem:
         """An evaluator of candidates on all recordings."""
         return Evaluator(self.make_env, self.dataset, self.space, self.trees)
 
-    def training_evaluator(self, like: Problem | None = None) -> Evaluator:
-        """An evaluator of candidates on the recordings that are trained on; derivatives take the longest step.
+    def training_evaluator(self) -> Evaluator:
+        """An evaluator of candidates on the recordings that are trained on; derivatives take the longest step."""
+        return self.evaluator_like(self)
 
-        Args:
-            like: Whose derivatives serve; the default: this problem's.
-        """
-        like, data, nearby = like or self, self.dataset.select(self.dataset.trained()), None
+    def evaluator_like(self, like: Problem) -> Evaluator:
+        """The same by derivatives of a problem that moves almost alike."""
+        data, nearby = self.dataset.select(self.dataset.trained()), None
         if like.coarsest_dt > self.physics_dt:
             nearby = Evaluator(like.with_physics_dt(like.coarsest_dt).make_env, data, self.space, self.trees)
         return Evaluator(self.make_env, data, self.space, self.trees, nearby=nearby)

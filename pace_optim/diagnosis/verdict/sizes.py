@@ -27,9 +27,9 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
 
     Returns:
         ``{"effect", "parameter", "joint", "value", "std", "unit", "factor", "at_bound"}`` each. ``std`` is ``None``
-        where a value is held or at a bound, or the joint ends far from the floor, or above it with a stiff effect. It is
-        that of all joints together
-        where they share one; ``factor`` says what was stated is multiplied by, if it is that.
+        where a value is held or at a bound, or the joint ends far from the floor, or above it with a stiff effect. It
+        is that of all joints together where they share one; ``factor`` says what was stated is multiplied by, if it is
+        that.
     """
     now = outcome.final
     found = now.model.has & torch.tensor([not effect.free_form for effect in now.model.effects]).bool()[:, None]

@@ -217,7 +217,7 @@ class _Refit:
 def _refitted(pieces: Problem, like: Problem, start: Descent, colouring: Colouring) -> _Refit | None:
     """A fit from the end of one with another period, by derivatives like another's; ``None`` where it diverges."""
     begin = Descent(x=start.x.clone(), hessian=start.hessian)
-    end = least_squares(pieces.training_evaluator(like), colouring, [begin], _REFIT)[0]
+    end = least_squares(pieces.evaluator_like(like), colouring, [begin], _REFIT)[0]
     if not math.isfinite(end.score):
         return None
     physical = pieces.space.to_physical(end.x)
