@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,9 @@ _LOAD_STEPS = 6
 
 _LARGEST = 50_000_000
 """Positions that are kept at once, at most: 400 MB."""
+
+_READ_AT_ONCE = 256
+"""Samples that are read between steps at once: what is computed for them needs ten times their memory."""
 
 
 class Rollout:
@@ -226,11 +230,10 @@ class Rollout:
         Args:
             at: Control steps of the samples, ascending, the last one that counts among them.
         """
-        if self.dataset.sample_offset is None and self.observation_lag(self.duration_steps) is None:
+        reading = self._reading(self.duration_steps)
+        if reading is None:
             return self._in_one_go(at)
-        wanted = set(at.tolist())
-        shown = self.samples(simulated=lambda steps: self._in_one_go(torch.arange(steps)))
-        return torch.stack([position.clone() for k, position in shown if k in wanted])
+        return self._shown(reading, at, lambda steps: self._in_one_go(torch.arange(steps)))
 
     def positions_and_torques(self, at: torch.Tensor, sensed: Torques) -> tuple[torch.Tensor, torch.Tensor]:
         """The same, and the motors' torques as late as sensors show them, both (len(at), num_envs, n) [rad, N m].
@@ -250,12 +253,8 @@ class Rollout:
             torques.append(torch.zeros(shape, dtype=self.env.dtype))
             return self._in_one_go(torch.arange(steps + beyond), torque=torques[0])[:steps]
 
-        lag = self.observation_lag(last)
-        if lag is None and offset is None:
-            positions = simulated(last)[at]
-        else:
-            wanted = set(at.tolist())
-            positions = torch.stack([shown.clone() for k, shown in self.samples(simulated) if k in wanted])
+        lag, reading = self.observation_lag(last), self._reading(last)
+        positions = simulated(last)[at] if reading is None else self._shown(reading, at, simulated)
         after = after if offset is None else after + offset[at]
         when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
         if lag is not None:
@@ -324,35 +323,55 @@ class Rollout:
         Args:
             simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
         """
-        simulated = simulated or self.simulated
-        steps, offset = self.duration_steps, self.dataset.sample_offset
-        lag = self.observation_lag(steps)
-        if lag is None and offset is None:
+        simulated, steps = simulated or self.simulated, self.duration_steps
+        reading = self._reading(steps)
+        if reading is None:
             yield from enumerate(simulated(steps))
             return
-        if lag is None:
-            lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
-        # a sample of step k is taken at k - lag + offset: some steps are simulated ahead, some are remembered
-        most = 0.0 if offset is None else float(offset.abs().max())
-        ahead = max(0, math.ceil(most - float(lag.min()))) + 2
-        behind = max(0, math.ceil(most + float(lag.max()))) + 2
-        length = ahead + behind + 1
+        length = reading.ahead + reading.behind + 1
         shape = length, self.env.num_envs, self.robot.num_joints
         seen = torch.zeros(shape, dtype=self.env.dtype, device=self.env.device)
-        moved = (lag != 0).any(dim=2).any(dim=0)
-        late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
-        first = lag[0, late]
-        rate = (lag[-1, late] - first) / max(1, steps - 1)  # lags are linear in time
-        for j, position in enumerate(simulated(steps + ahead)):
+        for j, position in enumerate(simulated(steps + reading.ahead)):
             seen[j % length] = position
             if j == 0:
                 seen[:] = position
-            if (k := j - ahead) >= 0:
-                shown, at = seen[k % length].clone(), k - (first + rate * k)
-                if offset is not None:
-                    at = at + self._rows(offset[k, :, None])
-                shown[late] = between_steps(seen[:, late], at[None], ring=True)[0]
+            if (k := j - reading.ahead) >= 0:
+                shown = seen[k % length].clone()
+                at = self._taken_at(reading, torch.tensor([k], device=self.env.device))
+                shown[reading.late] = between_steps(seen[:, reading.late], at, ring=True)[0]
                 yield k, shown
+
+    def _shown(self, reading: _Reading, at: torch.Tensor, simulated: Callable[[int], torch.Tensor]) -> torch.Tensor:
+        """The same at some steps, read between those that are simulated at once, (len(at), num_envs, n) [rad]."""
+        seen = simulated(self.duration_steps + reading.ahead)
+        shown, own = seen[at], seen[:, reading.late]
+        for rows in torch.arange(len(at)).split(_READ_AT_ONCE):
+            shown[rows[:, None], reading.late] = between_steps(own, self._taken_at(reading, at[rows]))
+        return shown
+
+    def _reading(self, steps: int) -> _Reading | None:
+        """How samples are taken between steps; ``None``: at the steps themselves."""
+        lag, offset = self.observation_lag(steps), self.dataset.sample_offset
+        if lag is None and offset is None:
+            return None
+        if lag is None:
+            lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
+        most = 0.0 if offset is None else float(offset.abs().max())
+        moved = (lag != 0).any(dim=2).any(dim=0)
+        late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
+        return _Reading(
+            late=late,
+            first=lag[0, late],
+            rate=(lag[-1, late] - lag[0, late]) / max(1, steps - 1),
+            ahead=max(0, math.ceil(most - float(lag.min()))) + 2,
+            behind=max(0, math.ceil(most + float(lag.max()))) + 2,
+        )
+
+    def _taken_at(self, reading: _Reading, steps: torch.Tensor) -> torch.Tensor:
+        """When the late samples of some steps are taken, (len(steps), late, n) [control steps]."""
+        k = steps[:, None, None].to(self.env.dtype)
+        at, offset = k - (reading.first + reading.rate * k), self.dataset.sample_offset
+        return at if offset is None else at + offset[steps].repeat(1, self.num_candidates)[:, reading.late, None]
 
     def observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
@@ -515,6 +534,20 @@ class Rollout:
             apply_load(self.env, rows, load)
         for body, mass in recording.load.added_mass.items():
             self.robot.add_body_mass(body, mass, rows, place=recording.load.added_mass_at.get(body))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reading:
+    """Samples of step k are taken at k - lag + offset: some steps are simulated ahead, some are remembered."""
+
+    late: torch.Tensor
+    """Environments whose samples are not taken at the steps."""
+    first: torch.Tensor
+    """Their lag at the first step, (late, n) [control steps]."""
+    rate: torch.Tensor
+    """What it grows by with each: lags are linear in time."""
+    ahead: int
+    behind: int
 
 
 def _changes(enable: torch.Tensor | None) -> frozenset[int]:
