@@ -57,7 +57,7 @@ class EndEffector(CMAESOptimizer):
 
 @pytest.fixture(scope="module")
 def recording():
-    return record(chirp(0.5), noise=1e-4)
+    return record(chirp(0.3), noise=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_scores_of_a_wrong_shape_are_refused(recording):
 
 
 def test_error_bars_of_squared_positions_are_those_of_least_squares():
-    problem = make_problem(record(chirp(3.0), noise=1e-4))
+    problem = make_problem(record(chirp(2.0), noise=1e-4))
     evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
     x = least_squares(evaluator, colouring, [problem.space.start], LeastSquaresCfg())[0].x
     expected = assess(problem, problem.evaluator(), colouring, x).uncertainty
@@ -128,7 +128,7 @@ def test_a_fit_takes_a_class_and_writes_all_that_a_fit_writes(file, tmp_path):
         data=[str(file)],
         optimizer=PositionAndVelocity,
         num_envs=16,
-        max_iteration=25,
+        max_iteration=20,
         log_dir=str(tmp_path),
     )
     result, folder = fit(settings, Silent())
@@ -140,27 +140,12 @@ def test_a_fit_takes_a_class_and_writes_all_that_a_fit_writes(file, tmp_path):
     assert any(name.startswith("events.out") for name in names)
     record_ = json.loads((folder / "settings.json").read_text())["environment"]["code"]
     assert any(Path(entry["file"]) == Path(__file__) for entry in record_.values())
-    more, _ = resume(folder, max_iteration=27, progress=Silent())
-    assert more.generations == 27
+    more, _ = resume(folder, max_iteration=22, progress=Silent())
+    assert more.generations == 22
     report = (folder / "report.html").read_text()
     assert f"<dd>{more.objective['train']:.2e}</dd>" in report
     assert f"Mean over the training samples of the objective {__name__}:PositionAndVelocity." in report
     assert "score [rad²]" not in report
-
-
-def test_positions_and_velocities_find_the_truth_that_positions_find(recording):
-    problem = make_problem(record(chirp(0.25, 2.0, 8.0)))
-    cfg = CMAESOptimizerCfg(max_iteration=60)
-    optimizer = PositionAndVelocity(problem.space, 16, cfg, seed=0)
-    rollout = problem.evaluator().rollout(16)
-    while not optimizer.finished():
-        optimizer.ask()
-        optimizer.update_simulator(rollout)
-        for sample in rollout:
-            optimizer.tell(*sample)
-        optimizer.evolve()
-    found = problem.space.to_dict(problem.space.to_physical(optimizer.best))
-    assert found["armature"]["servo"] == pytest.approx(TRUTH["armature"], abs=0.01)
 
 
 # ---- end effector and contacts
@@ -193,7 +178,7 @@ def test_poses_survive_every_format_and_resampling(tmp_path, recording):
     for suffix in (".npz", ".pt", ".csv"):
         path = save_recording(tmp_path / f"r{suffix}", with_pose(recording, poses))
         assert np.array_equal(load_recording(path).real_ee_pose, poses)
-    with pytest.raises(ValueError, match=r"real_ee_pose has shape \(201, 4\); expected \(201, 3\)"):
+    with pytest.raises(ValueError, match=r"real_ee_pose has shape \(121, 4\); expected \(121, 3\)"):
         load_recording(save_recording(tmp_path / "bad.npz", with_pose(recording, poses[:, :4])))
     problem = make_problem(with_pose(recording, poses[:, :3]))
     assert torch.equal(problem.dataset.ee_pose[:, 0], torch.as_tensor(poses[:, :3]))
@@ -336,7 +321,7 @@ def test_a_killed_fit_of_an_own_objective_resumes_to_the_same_result(warm, file,
         "        self.scores += torch.sum(error.abs(), dim=1)\n",
     )
     words = [ROOT / "scripts/fit.py", "--task", BENCH, "--data", file, "--num_envs", 16]
-    words += ["--optimizer", f"{path}:Mine", "--max_iteration", 12]
+    words += ["--optimizer", f"{path}:Mine", "--max_iteration", 8]
     env = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
     whole = warm.run(*words, "--log_dir", tmp_path / "whole", env=env)
     assert whole.returncode == 0, whole.stderr
