@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from problems import BENCH, CALM, DT, chirp, env_cfg, make_problem, physical, record
+from problems import BENCH, CALM, DT, chirp, env_cfg, make_problem, physical, replayed
 from run_folders import JOINTS, make_result
 
 from pace_actuators.effects import Effect, get_effect
@@ -166,7 +166,7 @@ def joint_alone() -> SimpleNamespace:
     """A short chirp without noise, its problem with a twin of each joint, and the truth. Made once: change nothing."""
     fine = env_cfg()  # what the robot does, not what a coarse step makes of it
     set_physics_dt(fine, DT / 10)
-    recordings = [record(target, CALM, cfg=fine) for target in (chirp(3.0), chirp(2.5, 0.2, 3.0))]
+    recordings = [replayed(target, CALM, fine) for target in (chirp(3.0), chirp(2.5, 0.2, 3.0))]
     problem = make_problem(recordings[:1], validation=recordings[1:]).with_physics_dt(DT / 2)
     truth = physical(problem, CALM)
     return SimpleNamespace(

@@ -14,7 +14,7 @@ from diagnoses import FITS, hidden_run, joint_alone
 from drive_laws import CASES, OUTSIDE, table
 from drive_laws_plant import Law, Plan, simulate
 from effect_envs import Drive
-from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
+from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record, replayed
 
 from pace_actuators.effects import EffectCfg, comb_grid, get_effect
 from pace_envs import set_physics_dt
@@ -160,7 +160,7 @@ def rippling(periods=61.0, size=0.5):
         "torque_ripple.periods": {"servo": periods},
     }
     waves = [np.sin(2 * np.pi * rate * np.arange(0, 3, DT))[:, None] for rate in (0.3, 0.5)]
-    return [record(wave, truth, cfg=fine, noise=1e-4, seed=i) for i, wave in enumerate(waves)]
+    return [replayed(wave, truth, fine, noise=1e-4, seed=i) for i, wave in enumerate(waves)]
 
 
 def test_the_frequency_of_a_comb_is_found_among_all_its_valleys():
@@ -215,7 +215,7 @@ def test_a_diagnosis_begins_with_the_effects_of_the_run():
 
 @pytest.mark.slow
 def test_a_run_that_has_what_is_missing_is_told_so(tmp_path):
-    run = hidden_run(tmp_path, "torque_offset", duration=3.0)
+    run = hidden_run(tmp_path, "torque_offset", duration=2.0)
     result = FitResult.load(run.folder)
     more = {"torque_offset.effort": {"servo": 0.5}}
     replace(

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from problems import CALM, DT, chirp, env_cfg, make_problem, physical, record
+from problems import CALM, DT, chirp, env_cfg, make_problem, physical, replayed
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
@@ -29,7 +29,7 @@ def bench():
     """A long and a short recording, the latter with measured speeds and half as many samples, and one to validate."""
     fine = env_cfg()
     set_physics_dt(fine, DT / 4)
-    long, short, other = (record(chirp(t, amplitude=0.4), CALM, cfg=fine) for t in (DURATION, 3.2, 1.0))
+    long, short, other = (replayed(chirp(t, amplitude=0.4), CALM, fine) for t in (DURATION, 3.2, 1.0))
     speed = torch.as_tensor(short.dof_pos)[:, 0].diff(prepend=torch.zeros(1, dtype=torch.float64)) / DT
     half = slice(None, None, 2)
     short = replace(short, time=short.time[half], dof_pos=short.dof_pos[half], dof_vel=speed[half, None].numpy())

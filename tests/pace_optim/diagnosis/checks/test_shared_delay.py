@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diagnoses import FITS
-from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, record
+from problems import ANYMAL, DT, env_cfg, legs_chirp, make_problem, physical, replayed
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
@@ -38,7 +38,7 @@ def legs():
     set_physics_dt(cfg, DT / 5)
     target = legs_chirp(cfg, 2.5)
     target = np.concatenate([np.repeat(target[:1], 20, axis=0), target])
-    return [record(factor * target, TRUTH, cfg=cfg, noise=1e-4, seed=i) for i, factor in enumerate((1.0, 0.7))]
+    return [replayed(factor * target, TRUTH, cfg, noise=1e-4, seed=i) for i, factor in enumerate((1.0, 0.7))]
 
 
 def fitted(legs, change=lambda recording: recording):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
+from problems import BENCH, CALM, chirp, env_cfg, make_problem, record, replayed
 
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.derivatives import colour
@@ -28,7 +28,7 @@ def recorded_at(period, duration=1.0, noise=1e-4):
     for drive in cfg.scene.robot.actuators.values():
         drive.drive_dt = period
     set_drive_rate(cfg)
-    problem = make_problem(record(chirp(duration), CALM, cfg=cfg, drive=GAINS, noise=noise))
+    problem = make_problem(replayed(chirp(duration), CALM, cfg, drive=GAINS, noise=noise))
     return dataclasses.replace(problem, assumed_loop=problem.loop_dt)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from linear_problems import linear
-from problems import BENCH, CALM, chirp, env_cfg, make_problem, record
+from problems import BENCH, CALM, chirp, env_cfg, make_problem, replayed
 
 from pace_envs import set_physics_dt
 from pace_envs.task_source import EnvironmentRecord
@@ -57,7 +57,7 @@ def test_a_recording_that_the_step_itself_made_has_no_share():
 
 def end_of(recorded, duration=2.0):
     """A fit at 2.5 ms to a recording of the bench: its problem, error, vector and what is known there."""
-    problem = make_problem(record(chirp(duration), CALM, cfg=recorded, noise=1e-4))
+    problem = make_problem(replayed(chirp(duration), CALM, recorded, noise=1e-4))
     colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
     truth = problem.space.from_dict(CALM)
     start = problem.space.to_normalised(truth)
@@ -94,7 +94,7 @@ def log(tmp_path_factory):
     recorded = env_cfg()
     set_physics_dt(recorded, 0.0003125)
     path = tmp_path_factory.mktemp("log") / "log.npz"
-    return save_recording(path, record(chirp(1.0, high=10.0), CALM, cfg=recorded, noise=1e-4))
+    return save_recording(path, replayed(chirp(1.0, high=10.0), CALM, recorded, noise=1e-4))
 
 
 @pytest.mark.parametrize(("stated", "finest"), [(None, 0.00125), (0.0025, 0.0025)])
@@ -112,7 +112,7 @@ def test_a_step_that_shows_in_the_error_is_halved_unless_it_is_stated(log, tmp_p
 def test_a_fit_goes_on_at_a_finer_step_where_its_step_shows(tmp_path):
     recorded = env_cfg()
     set_physics_dt(recorded, 0.0003125)
-    problem = make_problem(record(chirp(1.0), CALM, cfg=recorded, noise=4e-5))
+    problem = make_problem(replayed(chirp(1.0), CALM, recorded, noise=4e-5))
     settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path))
     run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
     result = conclude(run, EnvironmentRecord.of(BENCH, problem.env_cfg), run.run())

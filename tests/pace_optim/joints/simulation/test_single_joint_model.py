@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from models import FINGER, FOUR_BAR
-from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, record
+from problems import ANYMAL, CALM, chirp, env_cfg, legs_chirp, make_problem, record, replayed
 
 from pace_envs import set_physics_dt
 from pace_envs.coulomb import turned
@@ -54,7 +54,7 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     set_physics_dt(fine, 0.00025)
     fine.set_effects(effects)
     truth = {**TRUTH, "load_dependent_friction.coefficient": 0.1, "payload.ratio": payload}
-    recording = record(legs_chirp(fine, 0.5), truth, cfg=fine)
+    recording = replayed(legs_chirp(fine, 0.5), truth, fine)
     whole = make_problem(recording, cfg=env_cfg(ANYMAL)).with_effects(effects)
     sought = whole.space.from_dict(truth)
     path = reference_path(whole.with_physics_dt(0.00025), sought, ["payload"])
@@ -117,10 +117,10 @@ def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_b
     set_physics_dt(fine, 0.00025)
     target, names = legs_chirp(cfg, 0.5), cfg.sim2real.joint_order
     truth = {**TRUTH, "friction": {name: 3.0 if name == "LF_KFE" else 0.1 for name in names}}
-    problem = make_problem(record(target, truth, cfg=fine, noise=1e-4), cfg=cfg).with_physics_dt(0.00025)
+    problem = make_problem(replayed(target, truth, fine, noise=1e-4), cfg=cfg).with_physics_dt(0.00025)
     twins = twin_problem(problem, reference_path(problem, problem.space.from_dict(TRUTH)))
     moved = moved_by(twins, problem.space.from_dict(truth))[:, 0].numpy()
-    off = np.sqrt(np.mean((moved - record(target, truth, cfg=fine).dof_pos) ** 2, axis=0))
+    off = np.sqrt(np.mean((moved - replayed(target, truth, fine).dof_pos) ** 2, axis=0))
     assert off[[names.index("LF_HAA"), names.index("LF_HFE")]].max() < 5e-5  # 3e-4 along the wrong knee's motion
 
 
