@@ -155,7 +155,7 @@ TWIN_CASES = {
 @pytest.fixture(scope="module")
 def bench_and_twin():
     """At physics steps of 0.5 ms, where the integrators' own errors are small."""
-    problem = make_problem(record(chirp(0.6, high=6.0), CALM), cfg=env_cfg())
+    problem = make_problem(record(chirp(0.4, high=8.0), CALM), cfg=env_cfg())
     cfg = copy.deepcopy(problem.plain_cfg)
     set_physics_dt(cfg, 0.0005)
     problem = dataclasses.replace(problem, env_cfg=cfg)

@@ -92,7 +92,7 @@ def test_no_diagnosis_looks_for_curves():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A short battery of a joint whose friction goes with its position."""
-    return hidden_run(tmp_path_factory.mktemp("run"), "friction_map", seed=1, duration=4.0)
+    return hidden_run(tmp_path_factory.mktemp("run"), "friction_map", seed=1, duration=2.5)
 
 
 @pytest.fixture(scope="module")
