@@ -23,7 +23,7 @@ from pace_optim.recording.dataset import make_dataset
 from pace_optim.terminal.cli import run_cli
 
 BENCH = ("--task", "Pace-TestBench-v0")
-SHORT = ("--duration", "1", "--no_plot")
+SHORT = ("--duration", "0.6", "--no_plot")
 EXACT = 1e-12  # [rad²]
 
 
@@ -56,7 +56,7 @@ def replay_score(recording, task: str, *, parameters=None, physics_dt=None, dela
     rollout = Rollout(env, make_dataset([conformed], train_fraction=1), space)
     rollout.start(truth[None])
     score = torch.zeros(1, len(cfg.joint_order), dtype=torch.float64)
-    for sim_dof_pos, real_dof_pos in rollout:
+    for sim_dof_pos, real_dof_pos in rollout.at_once():
         score += rollout.weight * (sim_dof_pos - truth[space["encoder_bias"]] - real_dof_pos) ** 2
     env.close()
     return float(score.sum())

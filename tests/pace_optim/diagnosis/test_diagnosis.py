@@ -267,7 +267,7 @@ def test_the_ranking_begins_with_what_was_added_in_any_round():
 
 @pytest.mark.slow
 def test_a_hidden_effect_is_named(tmp_path):
-    run = hidden_run(tmp_path, "stribeck_friction", duration=3.0).folder
+    run = hidden_run(tmp_path, "stribeck_friction", duration=2.0).folder
     done = run_script("diagnose", run, "--no_refit", "--max_effects", 1)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0] == "verdict: effect"
@@ -310,7 +310,7 @@ class Lean(Effect):
 
 @pytest.mark.slow
 def test_an_effect_of_one_s_own_is_named_and_kept_when_its_refit_is_broken_off(warm, tmp_path):
-    run = hidden_run(tmp_path, "torque_offset", duration=2.5).folder
+    run = hidden_run(tmp_path, "torque_offset", duration=2.0).folder
     broken = """
 import importlib, runpy, sys
 module = importlib.import_module("pace_optim.diagnosis.diagnose")
