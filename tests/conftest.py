@@ -1,6 +1,7 @@
 """What holds for all tests: nothing is remembered of the code that they name."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -15,6 +16,12 @@ if "PACE_TEST_STATE" not in os.environ:  # processes that tests start share it
 from warm_python import WarmPython, warm_python
 
 from pace_actuators.effects import registry
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector leave alone what was imported and collected: all of it stays."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
