@@ -60,7 +60,7 @@ def bounds_corners(name):
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_at_their_null_all_effects_are_the_base_model_bit_for_bit(delay_mode, calls, integrator):
     options = {"base": CALM, "delay_mode": delay_mode, "calls": calls, "integrator": integrator, "load": HEAVY}
-    targets = MOVING[200:220]
+    targets = MOVING[200:210]
     expected = Bench(**options).follow(targets, sensed=True)
     for effects in [[name] for name in EFFECTS] + [list(EFFECTS)]:
         assert torch.equal(Bench(effects, **options).follow(targets, sensed=True), expected), effects
@@ -93,7 +93,7 @@ def write_rows(bench, values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("integrator", "seconds"), [("implicitfast", 2.5), ("leapfrog", 5.0)]
+    ("integrator", "seconds"), [("implicitfast", 1.0), ("leapfrog", 1.5)]
 )  # the harder one for longer
 def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, seconds):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
@@ -119,7 +119,7 @@ def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, 
 @pytest.mark.parametrize("name", FAST)
 def test_the_extremes_stay_finite_on_a_robot_with_legs(name, calls, integrator):
     values, count = bounds_corners(name)
-    targets = legs_chirp(env_cfg(ANYMAL), 2.0)
+    targets = legs_chirp(env_cfg(ANYMAL), 1.0)
     base = {"armature": 0.1, "viscous_friction": 1.0, "friction": 1.0, "encoder_bias": 0.0, "delay": 1.0}
     steps = {"calls": calls, "integrator": integrator}
     reached = Bench([name], values, num_envs=count, task=ANYMAL, base=base, **steps).follow(targets)
@@ -151,9 +151,10 @@ def mechanical_energy(bench, load, base):
 
 
 @pytest.mark.parametrize(
-    ("calls", "integrator"), [(1, "implicitfast"), (5, "implicitfast"), (2, "leapfrog"), (5, "leapfrog")]
+    ("calls", "integrator", "seconds"),
+    [(1, "implicitfast", 2.5), (5, "implicitfast", 1.0), (2, "leapfrog", 2.5), (5, "leapfrog", 1.0)],
 )
-def test_a_free_swing_never_gains_energy(calls, integrator):
+def test_a_free_swing_never_gains_energy(calls, integrator, seconds):
     load = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.0}
     base = {"armature": 0.1, "viscous_friction": 0.05, "friction": 0.1, "encoder_bias": 0.0, "delay": 0.0}
     cfgs, values = [], []
@@ -166,7 +167,7 @@ def test_a_free_swing_never_gains_energy(calls, integrator):
     write_rows(bench, values)
     bench.disable()
     bench.start(1.5)
-    for step in range(round(2.5 / DT)):
+    for step in range(round(seconds / DT)):
         bench.robot.sensed_joint_pos()  # brings the motor to the present
         energy = mechanical_energy(bench, load, base)
         if step == 3:  # the spring has taken up the load
@@ -176,7 +177,7 @@ def test_a_free_swing_never_gains_energy(calls, integrator):
             assert not gains, (step * DT, [values[i] for i in gains])
             lowest = torch.minimum(lowest, energy)
         bench.env.simulate(torch.zeros(len(values), 1, dtype=torch.float64))
-    held = (energy >= 0.9 * start).nonzero()[:, 0].tolist()
+    held = (energy >= (1.0 - 0.04 * seconds) * start).nonzero()[:, 0].tolist()
     assert not held, [values[i] for i in held]
     bench.env.close()
 
@@ -204,9 +205,9 @@ def test_an_effect_acts_only_on_its_rows_and_joints():
 def test_environments_with_different_values_do_not_mix():
     for name in ("stribeck_friction", "joint_elasticity", "drive_bandwidth", "other_delay", "payload"):
         values, count = bounds_corners(name)
-        together = Bench([name], values, num_envs=count).follow(MOVING[:200])
+        together = Bench([name], values, num_envs=count).follow(MOVING[:100])
         for i in range(count):
-            alone = Bench([name], {key: v[i] for key, v in values.items()}).follow(MOVING[:200])
+            alone = Bench([name], {key: v[i] for key, v in values.items()}).follow(MOVING[:100])
             assert rms(together[:, i], alone[:, 0]) < 1e-12, (name, i)
 
 
@@ -216,18 +217,18 @@ def test_the_reset_of_an_environment_forgets_its_history_only(name):
     start = {f"{name}.{p.name}": p.start for p in get_effect(name).parameters}
     bench = Bench([name], start, num_envs=3, base={**TRUTH, "delay": 0.0})
     bench.start(0.0)
-    run = [torch.as_tensor(t) for t in MOVING[:150]]
-    for target in run[:70]:
+    run = [torch.as_tensor(t) for t in MOVING[:80]]
+    for target in run[:40]:
         bench.env.simulate(target.expand(3, 1))
     fresh, untouched = (Bench([name], start, base={**TRUTH, "delay": 0.0}) for _ in range(2))
     fresh.start(0.0)
     untouched.start(0.0)
-    for target in run[:70]:
+    for target in run[:40]:
         untouched.env.simulate(target.expand(1, 1))
     bench.env.scene.reset(torch.tensor([1]))
     bench.robot.write_joint_state_to_sim(torch.zeros(1, 1), torch.zeros(1, 1), env_ids=torch.tensor([1]))
     bench.env.sim.forward()
-    for target in run[70:]:
+    for target in run[40:]:
         bench.env.simulate(target.expand(3, 1))
         fresh.env.simulate(target.expand(1, 1))
         untouched.env.simulate(target.expand(1, 1))
@@ -310,7 +311,7 @@ PAIRS = [
 
 @pytest.mark.parametrize(("effects", "values"), PAIRS, ids=lambda x: "+".join(x))
 def test_effects_compose_in_any_order(effects, values):
-    moving = MOVING[:250]
+    moving = MOVING[:150]
     one = Bench(effects, values).follow(moving, sensed=True)
     other = Bench(effects[::-1], values).follow(moving, sensed=True)
     assert bool(one.isfinite().all())
@@ -322,7 +323,7 @@ def test_effects_compose_in_any_order(effects, values):
 
 
 def test_the_stiffest_transmission_is_the_rigid_drive_the_more_the_finer_the_step():
-    calm = 0.15 * MOVING
+    calm = 0.15 * MOVING[:200]
     values = {"joint_elasticity.stiffness": 2e4, "joint_elasticity.damping": 20.0}
     apart = [
         rms(Bench(["joint_elasticity"], values, calls=n).follow(calm), Bench(calls=n).follow(calm)) for n in (1, 5)
@@ -347,7 +348,7 @@ def test_the_resonance_of_two_masses_has_its_frequency(calls, integrator, tolera
     bench.robot.sensed_joint_pos()
     bench.robot.write_joint_state_to_sim(torch.zeros(1, 1), torch.full((1, 1), 0.5))
     deflection = []
-    for _ in range(800):
+    for _ in range(400):
         bench.robot.sensed_joint_pos()
         effect = bench.effects.effects[0]
         deflection.append(float(effect._angle[0, 0] - bench.robot.data.joint_pos[0, 0]))
@@ -361,13 +362,13 @@ def test_the_resonance_of_two_masses_has_its_frequency(calls, integrator, tolera
     assert frequency == pytest.approx(expected, rel=tolerance)
 
 
-@pytest.mark.parametrize(("task", "moving"), [(BENCH, MOVING), (ANYMAL, None)], ids=["bench", "legs"])
+@pytest.mark.parametrize(("task", "moving"), [(BENCH, MOVING[:150]), (ANYMAL, None)], ids=["bench", "legs"])
 def test_finer_steps_with_a_stiff_effect_converge(task, moving):
     """On all joints, also on those without it."""
     cfgs = [EffectCfg(effect="joint_elasticity", joint_names_expr=".*" if task == BENCH else "LF_.*")]
     values = {"joint_elasticity.stiffness": 300.0, "joint_elasticity.damping": 1.0}
     base = {"armature": 0.1, "viscous_friction": 4.0, "friction": 0.0, "encoder_bias": 0.0, "delay": 0.0}
-    targets = legs_chirp(env_cfg(ANYMAL), 1.0) if moving is None else moving
+    targets = legs_chirp(env_cfg(ANYMAL), 0.4) if moving is None else moving
     reached = [
         Bench(cfgs, values, task=task, base=base, calls=n, integrator="leapfrog").follow(targets)[:, 0]
         for n in (2, 4, 16)
@@ -387,9 +388,9 @@ def test_the_gap_is_seen_at_a_reversal():
         ["backlash"], values, base=base, calls=5, load={"load_mass": 0.001, "load_length": 0.2, "arm_mass": 0.0}
     )
     bench.start(0.0)
-    t = np.arange(900) * DT
+    t = np.arange(450) * DT
     deflection = []
-    for target in 0.3 * np.sin(2 * np.pi * 0.5 * t):
+    for target in 0.3 * np.sin(2 * np.pi * t):
         bench.robot.sensed_joint_pos()
         effect = bench.effects.effects[0]
         deflection.append(float(effect._angle[0, 0] - bench.robot.data.joint_pos[0, 0]))
