@@ -53,7 +53,7 @@ ARGUMENTS = {
 """What ``simulate`` gets, eight bytes each. Then the leaves of each drive, with the memory of its delays behind it."""
 
 _WHERE = {name: "d" for name in (*STATE, "qfrc_applied")} | {name: "m" for name in WRITTEN if name.startswith("dof")}
-_BEGIN = "#include <mujoco/mujoco.h>\n#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n" + PRELUDE
+_BEGIN = "#include <mujoco/mjdata.h>\n#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n" + PRELUDE
 
 
 @dataclass(frozen=True, kw_only=True)
