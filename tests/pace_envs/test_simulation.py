@@ -2,6 +2,7 @@
 
 import math
 import os
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -152,6 +153,7 @@ def test_finer_steps_are_of_second_order_with_fast_dynamics_of_a_drive_too():
     assert cfg.scene.robot.actuators["servo"].control_decimation == 5
 
 
+@cache
 def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
     """Positions every 10 ms of a joint that a slow torque swings against friction, by steps of second order."""
     cfg = load_env_cfg("Pace-TestBench-v0")

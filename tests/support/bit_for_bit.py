@@ -13,12 +13,12 @@ from pace_optim.estimate.way_down import WayDown
 def main() -> None:
     """Compare; the argument is the number of threads."""
     torch.set_num_threads(int(sys.argv[1]))
-    coarse = make_problem(record(chirp(1.0), noise=1e-4))
+    coarse = make_problem(record(chirp(0.5), noise=1e-4))
     problem = coarse.with_physics_dt(coarse.physics_dt / 2)
     colouring = colour(problem.space, problem.trees, problem.joint_names)
 
     def way(**options):
-        pieces = problem.on_pieces(0.5).training_evaluator()
+        pieces = problem.on_pieces(0.25).training_evaluator()
         return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
 
     kept: list = []
