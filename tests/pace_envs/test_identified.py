@@ -367,7 +367,7 @@ def test_error_bars_without_a_result_are_refused():
 def anymal_run(tmp_path_factory):
     """A fit of a noisy recording with a hidden effect: its error is that of the noise and of what is missing."""
     folder = tmp_path_factory.mktemp("anymal")
-    words = ["--task", "Pace-AnymalD-v0", "--duration", "3", "--noise", "0.0005", "--output", str(folder / "r.npz")]
+    words = ["--task", "Pace-AnymalD-v0", "--duration", "1.5", "--noise", "0.0005", "--output", str(folder / "r.npz")]
     assert run_script("data_collection", *words, cwd=ROOT).returncode == 0
     settings = FitSettings(
         task="Pace-AnymalD-v0", data=[str(folder / "r.npz")], optimizer="least_squares", log_dir=str(folder)

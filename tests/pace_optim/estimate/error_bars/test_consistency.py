@@ -32,7 +32,7 @@ def checked(recordings):
 @pytest.fixture(scope="module")
 def recordings():
     return [
-        record(chirp(1.0), drive={"stiffness": kp, "damping": kd}, name=name, noise=1e-4, seed=seed)
+        record(chirp(0.6), drive={"stiffness": kp, "damping": kd}, name=name, noise=1e-4, seed=seed)
         for seed, (name, (kp, kd)) in enumerate(GAINS.items())
     ]
 
