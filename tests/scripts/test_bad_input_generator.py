@@ -6,8 +6,8 @@ import re
 import pytest
 from places import SUPPORT
 
-TRIALS = 40
-"""They take some 8 s of a processor, a folder to damage and all imports included."""
+TRIALS = 60
+"""They take some 25 s of a processor, a folder to damage and all imports included."""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="trials are forked processes")
