@@ -225,7 +225,7 @@ class Dataset:
         """Where there is a sample that is not trained on, (T, R) bool."""
         return self.sampled & ~self.train if self.settling is None else self.sampled & ~self.train & ~self.settling
 
-    def condition(self, name: str, places: int) -> Condition | None:
+    def condition(self, name: str, places: int = 33) -> Condition | None:
         """A condition of the drives over each recording; ``None`` where some recording has none of it.
 
         Args:

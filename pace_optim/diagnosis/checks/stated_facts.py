@@ -11,9 +11,6 @@ from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset
 from pace_optim.terminal.choices import MEASURED_FACTS
 
-_PLACES = 33
-"""Instants of a recording at which it is looked at whether a condition changes."""
-
 
 def excluded_effects(
     recordings: Sequence[Recording], effects: Sequence[type[Effect]], measured: Iterable[str], num_joints: int
@@ -45,7 +42,7 @@ def unlogged_effects(dataset: Dataset, effects: Iterable[type[Effect]]) -> dict[
     """Effects of a condition that was not logged or does not change, with the joints where that is so, (n,) bool."""
     result: dict[type[Effect], torch.Tensor] = {}
     for effect in (each for each in effects if each.condition):
-        logged = dataset.condition(effect.condition, _PLACES)
+        logged = dataset.condition(effect.condition)
         every = torch.ones(dataset.measured.shape[-1], dtype=torch.bool)
         result[effect] = every if logged is None else ~logged.varies
     return result

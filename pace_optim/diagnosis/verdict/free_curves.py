@@ -143,7 +143,7 @@ def error_map(
         effect, part = curves.effects[k], float(curves.explained[k, j])
         before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
         types, told = joint_types[j : j + 1], not within(before**2, after**2, cfg.alike)
-        formula = _formula(curves.models[k], effect, j) if told else ""
+        formula = _formula(curves.models[k], effect, j, cfg.alike - 1) if told else ""
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},
             "best": effect.name,
@@ -161,14 +161,6 @@ def error_map(
 
 
 _NONE = "no curve over a single variable carries the error."
-_PLACES = 33
-"""Instants of a recording at which the range of a condition is looked at."""
-_SMOOTH = 0.1
-"""A formula stands for a curve where it is this near (RMS), as a part of how the curve varies."""
-_SMALL = 1e-3
-"""Part of the largest term that a term must have."""
-_MOST_POWERS = 3
-"""Highest power of a formula."""
 
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float, formula: str) -> str:
@@ -178,10 +170,14 @@ def _sentence(effect: type[FreeForm], part: float, before: float, after: float, 
     )
 
 
-def _formula(fitted: Fitted, effect: type[FreeForm], joint: int) -> str:
-    """The polynomial of fewest powers that stands for a curve, with units; empty where none of three powers does.
+def _formula(fitted: Fitted, effect: type[FreeForm], joint: int, near: float) -> str:
+    """The polynomial of fewest powers that stands for a curve, with units; empty where none does.
 
-    Knots count by what they move, where that is known.
+    Args:
+        fitted: A model with the curve. Knots count by what they move, where it has derivatives.
+        effect: The curve.
+        joint: Of which joint.
+        near: What it may leave (RMS), as a part of how the curve varies.
     """
     columns = fitted.model.columns(effect)
     values = fitted.physical[joint, columns]
@@ -196,12 +192,12 @@ def _formula(fitted: Fitted, effect: type[FreeForm], joint: int) -> str:
     x, y = np.array(curve["at"]) - middle, np.array(curve["torque"])
     reach = float(np.abs(x).max())
     level = 0.0 if effect.zero is not None else np.average(y, weights=weights**2)
-    for power in range(1, _MOST_POWERS + 1):
+    for power in range(1, len(x) // 2 + 1):
         powers = np.arange(1 if effect.zero is not None else 0, power + 1)
         columns_of = (x[:, None] / reach) ** powers
         size = np.linalg.lstsq(weights[:, None] * columns_of, weights * y, rcond=None)[0]
         left, whole = (weights * each for each in (y - columns_of @ size, y - level))
-        if left @ left <= _SMOOTH**2 * (whole @ whole):
+        if left @ left <= near**2 * (whole @ whole):
             return _written(effect, size, powers, reach, middle)
     return ""
 
@@ -212,7 +208,7 @@ def _written(effect: type[FreeForm], sizes: np.ndarray, powers: np.ndarray, reac
     x = f"({effect.variable} - {middle:.3g} {over})" if middle else effect.variable
     terms = []
     for size, power in zip(sizes.tolist(), powers.tolist(), strict=True):
-        if abs(size) < _SMALL * np.abs(sizes).max():
+        if abs(size) < np.finfo(np.float32).eps:
             continue
         raised = f"^{power}" if power > 1 else ""
         of = f"{unit}/({over}){raised}" if power else "" if unit == "1" else unit
@@ -268,7 +264,7 @@ def _ranges(problem: TwinProblem, base: Fitted, reached: float) -> dict[str, tor
     seen["time"] = time[..., None].expand(path.position.shape)
     ranges = {name: _quantiles(values, data.train, reached) for name, values in seen.items()}
     for name in CONDITIONS:
-        if (logged := data.condition(name, _PLACES)) is not None:
+        if (logged := data.condition(name)) is not None:
             values = logged.values[data.trained()].transpose(1, 2).flatten(0, 1)
             ranges[name] = torch.stack([values.amin(dim=0), values.amax(dim=0)])
     return ranges

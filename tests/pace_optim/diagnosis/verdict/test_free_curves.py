@@ -66,7 +66,7 @@ def test_a_curve_is_straight_between_its_knots_and_constant_beyond_them():
     ("name", "at", "expected"),
     [
         ("torque_over_position", lambda x: 2.0 - 3.0 * (x - 1.0) ** 3, "τ + f(q) with f = 2 N m - "),
-        ("torque_over_position", lambda x: math.sin(9 * x), ""),
+        ("torque_over_position", lambda x: math.sin(30 * x), ""),
         ("friction_over_temperature", lambda x: -0.01 * (x - 40.0), "with f = -0.01 1/(°C) (temperature - 40 °C)"),
     ],
 )
@@ -78,7 +78,7 @@ def test_a_smooth_curve_has_a_formula(name, at, expected):
         physical=torch.tensor([[*values, reach, center]]),
         model=SimpleNamespace(columns=lambda _: slice(None)),
     )
-    formula = _formula(fitted, effect, 0)
+    formula = _formula(fitted, effect, 0, 0.1)
     assert (expected in formula) if expected else not formula
 
 
