@@ -9,6 +9,7 @@ from pace_actuators.identified import RIG_EFFECTS, IdentifiedDrives
 from pace_actuators.text import listed
 
 if TYPE_CHECKING:
+    from pace_actuators.effects.effect import Effect
     from pace_actuators.pace_dc_motor import PaceDCMotor
 
 
@@ -61,11 +62,9 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
     notes = [] if world.bodies else link_notes(drives)
     for cfg in drives.effects:
         kind = cfg.effect_class
-        if kind.name in RIG_EFFECTS:
-            notes.append(f"{kind.name} is of what held the robot during the recording: it is left out.")
+        if note := of_the_recording(kind):
+            notes.append(note)
             continue
-        if kind.stage == "recording":
-            notes.append(f"{kind.name} is about the recording's time stamps: it has no influence on a policy.")
         if kind.overrides("write_model") and not world.bodies:
             notes.append(
                 f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
@@ -85,6 +84,15 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             if world.friction_hook:
                 notes.append(f"{kind.name} changes the joint's friction at every physics step: {world.friction_hook}.")
     return notes
+
+
+def of_the_recording(kind: type[Effect]) -> str:
+    """Why an effect is left out wherever the drive runs, in words; empty if it is the drive's."""
+    if kind.name in RIG_EFFECTS:
+        return f"{kind.name} is of what held the robot during the recording: it is left out."
+    if kind.stage == "recording":
+        return f"{kind.name} is about the recording's time stamps: it has no influence on a policy."
+    return ""
 
 
 def link_notes(drives: IdentifiedDrives) -> list[str]:

@@ -13,7 +13,9 @@ import torch
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.base_parameters import BASE_PARAMETERS
+from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
+from pace_actuators.effects.command import GravityCompensation
 from pace_actuators.effects.fading_friction import SoftFriction
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
@@ -22,7 +24,14 @@ from pace_envs.model_file import compile_model, missing_files, read_model_file
 from pace_envs.motor_coordinates import DrivenJoints, add_motors
 from pace_envs.robot_spec import load_robot_spec
 from pace_optim.export.mjcf_drives import write_drives
-from pace_optim.export.plain_drive import GAIN_EFFECTS, PlainDrive, effect_notes, is_undetermined, plain_drives
+from pace_optim.export.plain_drive import (
+    GAIN_EFFECTS,
+    JOINT_EFFECTS,
+    PlainDrive,
+    effect_notes,
+    is_undetermined,
+    plain_drives,
+)
 
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
 
@@ -72,11 +81,24 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         actuators, more = _in_plain_steps(spec, actuators, drives.at.physics_dt)
         notes += more
         notes += write_drives(spec, actuators, drives.at.physics_dt, couplings)
-        held += GAIN_EFFECTS
+        held += [*GAIN_EFFECTS, *JOINT_EFFECTS, *_compensated(spec, drives, notes)]
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def _compensated(spec: mujoco.MjSpec, drives: IdentifiedDrives, notes: list[str]) -> list[str]:
+    """Let MuJoCo compensate the weight of all bodies if the drives do so alike; returns the effect that it holds."""
+    name = GravityCompensation.name
+    shares = drives.parameters.get(f"{name}.share", {})
+    alike = set(shares.values())
+    if len(alike) != 1 or not ({ALL} == set(shares) or set(drives.joint_names) <= set(shares)):
+        return []
+    for body in spec.bodies[1:]:
+        body.gravcomp = alike.copy().pop()
+    notes.append(f"{name} is gravcomp of all bodies: of their weight, not of other joints' motion; beside the limits.")
+    return [name]
 
 
 def pulled_notes(drives: IdentifiedDrives) -> list[str]:

@@ -5,7 +5,9 @@
 A drive with a torque-speed line is a ``dcmotor`` with its on-board controller. Its terminal voltage, back-EMF and
 current limit are exactly the four-quadrant clip of ``PaceDCMotor``. A drive without that line is a ``position`` servo
 (``velocity`` if kp is 0, ``motor`` if kd is 0 too). The encoder's bias is in the joint's ``ref``: positions, targets
-and sensors of the model are what the encoder shows.
+and sensors of the model are what the encoder shows. Torques beside the drive's are the joint's (of a motor that moves
+several, its tendon's): ``stiffness`` with ``springref``, the second coefficient of ``damping``, and an actuator
+``NAME_offset`` of constant force.
 """
 
 from __future__ import annotations
@@ -67,6 +69,7 @@ def write_drives(
                 tendon.wrap_joint(joint, ratio)
             first.target, first.trntype = tendon.name, mujoco.mjtTrn.mjTRN_TENDON
         _write(first, drive, dt)
+        _write_beside(spec, name, drive, notes)
     if keys:
         notes.append("control values of keyframes were those of other actuators: they are left out.")
         for key in keys:
@@ -118,6 +121,34 @@ def _write(actuator: mujoco.MjsActuator, drive: PlainDrive, dt: float) -> None:
         actuator.delay, actuator.nsample = 0.0, 0
 
 
+def _write_beside(spec: mujoco.MjSpec, name: str, drive: PlainDrive, notes: list[str]) -> None:
+    """Torques that act beside the drive's; positions of the model are the encoder's already."""
+    carrier, is_joint = spec.joint(name) or spec.tendon(name), bool(spec.joint(name))
+    if drive.quadratic:
+        carrier.damping = [carrier.damping[0], drive.quadratic, *carrier.damping[2:]]
+    if drive.spring:
+        unit = math.degrees(1.0) if is_joint and spec.compiler.degree and _turns(carrier) else 1.0
+        before, length = carrier.stiffness[0], carrier.springref if is_joint else np.mean(carrier.springlength)
+        both = before + drive.spring
+        rest = (before * length / unit + drive.spring * (drive.rest - drive.encoder_bias)) / (both or 1.0)
+        carrier.stiffness = [both, *carrier.stiffness[1:]]
+        if is_joint:
+            carrier.springref = rest * unit
+        else:
+            carrier.springlength = [rest, rest]
+    if drive.offset:
+        offset = spec.add_actuator(name=f"{name}_offset", target=name, trntype=_OF_JOINT[0])
+        if not is_joint:
+            offset.trntype = mujoco.mjtTrn.mjTRN_TENDON
+        offset.gainprm, offset.biastype = np.zeros_like(offset.gainprm), mujoco.mjtBias.mjBIAS_AFFINE
+        offset.biasprm = [drive.offset, *np.zeros(len(offset.biasprm) - 1)]
+        notes.append(f"torque_offset of {name} is the actuator {offset.name}; its control does nothing.")
+
+
+def _turns(joint: mujoco.MjsJoint) -> bool:
+    return joint.type == mujoco.mjtJoint.mjJNT_HINGE
+
+
 def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes: list[str], couplings: Rows) -> None:
     """Let joint positions be what the encoders show: q - bias; joints that follow a drive's move with it."""
     if not any(drive.encoder_bias for drive in drives.values()):
@@ -133,7 +164,7 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
     addresses = {name: int(model.joint(name).qposadr[0]) for name in shifted} if spec.keys else {}
     for name, bias in shifted.items():
         joint = spec.joint(name)
-        is_degree = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        is_degree = spec.compiler.degree and _turns(joint)
         own = math.degrees(bias) if is_degree else bias
         joint.ref, joint.springref = joint.ref - own, joint.springref - own
         if np.any(joint.range):

@@ -21,6 +21,8 @@ from pace_optim.export.plain_drive import (
     whole_steps_note,
 )
 
+HELD = (*GAIN_EFFECTS, "parallel_spring", "quadratic_friction")
+"""Effects that the page holds."""
 _START = "# --- the page starts here\n"
 
 
@@ -31,12 +33,17 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         ValueError: If the environment of the identification is not available.
     """
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS), *link_notes(drives)]
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
     calls = [mjlab_actuator(drives, joint, drive) for joint, drive in plain.items()]
     values = {
         "_ABOUT_": about(drives, ", for mjlab 1.6 alone", notes),
         "_PHYSICS_DT_": drives.at.physics_dt,
         "_ACTUATORS_": tuple(calls),
+        "_BESIDE_": {
+            joint: {name: digits(getattr(drive, name)) for name in ("spring", "rest", "quadratic")}
+            for joint, drive in plain.items()
+            if drive.spring or drive.quadratic
+        },
         "_BIAS_": {joint: digits(-drive.encoder_bias) for joint, drive in plain.items() if drive.encoder_bias},
     }
     classes = ", ".join(sorted({call.name for call in calls}))
@@ -62,6 +69,9 @@ ARTICULATION = EntityArticulationInfoCfg(actuators=ACTUATORS)
 
 ENCODER_BIAS = _BIAS_
 """mjlab's encoder shows q + these [rad, of slides m]."""
+
+BESIDE = _BESIDE_
+"""Torques beside the drives: spring k [N m/rad] and rest q₀ [rad], quadratic b₂: - k (q - q₀) - b₂ v |v|."""
 '''
 
 
@@ -104,7 +114,7 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
     dt, notes = drives.at.physics_dt, whole_steps_note(drives, plain)
     most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
     notes.append(f"encoder bias (up to {most:.3g} rad): add EVENTS to the environment's events.")
-    notes.append("Coulomb friction is soft by default: call stiffen_friction(spec) in your spec_fn.")
+    notes.append("Coulomb friction is soft by default: call write_joints(spec) in your spec_fn, for springs too.")
     rates = {drive.run_dt for drive in plain.values()}
     if 0.0 in rates and any(drive.has_line for drive in plain.values()):
         notes.append(

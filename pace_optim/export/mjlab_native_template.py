@@ -12,6 +12,7 @@ from typing import Any
 PHYSICS_DT: float = 0.0
 ACTUATORS: tuple[Any, ...] = ()
 ENCODER_BIAS: dict[str, float] = {}
+BESIDE: dict[str, dict[str, float]] = {}
 EventTermCfg: Any = dict
 SceneEntityCfg: Any = dict
 dr: Any = type("dr", (), {"encoder_bias": None})
@@ -29,15 +30,24 @@ EVENTS = {
 """For the environment's events, in place of an encoder_bias of yours; the robot's name in the scene is robot."""
 
 
-def stiffen_friction(spec):
-    """Give the joints' Coulomb friction the solver parameters of the identification; MuJoCo's default is soft.
+def write_joints(spec):
+    """Give the joints what no actuator of mjlab has: springs, and Coulomb friction that is not soft.
+
+    The friction's solver parameters are those of the identification.
 
     Args:
         spec: The mujoco.MjSpec that your spec_fn returns; it is changed.
     """
+    import math
     import re
 
     for joint in spec.joints:
         if any(re.fullmatch(name, joint.name) for actuator in ACTUATORS for name in actuator.target_names_expr):
             joint.solref_friction = [2 * PHYSICS_DT, 1.0]
             joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
+        beside = BESIDE.get(joint.name)
+        if beside:
+            unit = math.degrees(1.0) if spec.compiler.degree and joint.type.name == "mjJNT_HINGE" else 1.0
+            before, both = joint.stiffness[0], joint.stiffness[0] + beside["spring"]
+            joint.springref = (before * joint.springref + beside["spring"] * beside["rest"] * unit) / (both or 1.0)
+            joint.stiffness[0], joint.damping[1] = both, beside["quadratic"]

@@ -20,19 +20,22 @@ from pace_optim.export.plain_drive import (
     whole_steps_note,
 )
 
+HELD = (*GAIN_EFFECTS, "parallel_spring", "torque_offset")
+"""Effects that the page holds."""
 _START = "# --- the page starts here\n"
 
 
 def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """A page that needs Newton alone: drives for a ``newton.ModelBuilder``, or for a USD stage.
 
-    The encoder's bias is a constant torque before the clamps, kp · bias: exact, as targets are the encoder's.
+    The encoder's bias is a constant torque before the clamps, kp · bias: exact, as targets are the encoder's. So is a
+    torque offset, but where a clamp acts. A spring beside the drive is the joint's.
 
     Raises:
         ValueError: If the environment of the identification is not available.
     """
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, GAIN_EFFECTS), *link_notes(drives)]
+    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
     names = {"armature": "armature", "friction": "friction", "viscous_friction": "damping"}
     joints = {
         joint: {
@@ -40,7 +43,8 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
             for parameter, name in names.items()
             if not is_undetermined(drives, parameter, joint)
         }
-        for joint in plain
+        | ({"stiffness": drive.spring, "rest_q": drive.rest} if drive.spring else {})
+        for joint, drive in plain.items()
     }
     values = {
         "_ABOUT_": about(drives, ", for Newton 1.8", notes),
@@ -58,7 +62,9 @@ PHYSICS_DT = _PHYSICS_DT_
 """Step of the identification [s]."""
 
 JOINTS = _JOINTS_
-"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]; of a slide [kg], [N], [N s/m]."""
+"""Armature [kg m²], Coulomb friction [N m], damping [N m s/rad]; of a slide [kg], [N], [N s/m].
+
+A spring beside the drive: stiffness [N m/rad] and rest_q [rad]."""
 
 DRIVES = _DRIVES_
 """Delay [s], control law and clamp, in SI units."""
@@ -67,7 +73,7 @@ DRIVES = _DRIVES_
 
 def _parts(drive: PlainDrive) -> dict[str, float]:
     parts = {"delay_s": drive.delay_s, "kp": drive.stiffness, "kd": drive.damping}
-    parts["const_effort"] = drive.stiffness * drive.encoder_bias
+    parts["const_effort"] = drive.stiffness * drive.encoder_bias + drive.offset
     limit = drive.effort_limit
     if drive.has_line:
         parts |= {"saturation_effort": drive.saturation_effort, "velocity_limit": drive.velocity_limit}
@@ -84,6 +90,10 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
         f"encoder bias (up to {most:.3g} rad, of slides m): in const_effort. Targets are the encoder's, joint "
         "positions are true: observe q - bias."
     )
+    if any(drive.spring for drive in plain.values()):
+        notes.append("parallel_spring: add_actuators writes it; a USD stage has no place for it.")
+    if any(drive.offset for drive in plain.values()):
+        notes.append("torque_offset: in const_effort, which the limits clamp too.")
     rates = {drive.run_dt for drive in plain.values()}
     if 0.0 in rates:
         notes.append("the drive ran continuously (implicit): use Newton's implicit effort mode.")

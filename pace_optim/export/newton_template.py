@@ -34,7 +34,7 @@ def add_actuators(builder, dt=PHYSICS_DT):
             raise ValueError(f"The joint {label} has {end - v} degrees of freedom, expected 1.")
         drive, steps = DRIVES[name], delay_steps(name, dt)
         for parameter, value in JOINTS[name].items():
-            getattr(builder, "joint_" + parameter)[v] = value
+            getattr(builder, "joint_" + parameter)[q if parameter == "rest_q" else v] = value
         builder.joint_target_ke[v] = builder.joint_target_kd[v] = 0.0  # the solver's own drive
         motor = {key: drive[key] for key in ("saturation_effort", "velocity_limit", "max_motor_effort") if key in drive}
         box = {key: drive[key] for key in ("max_effort",) if key in drive}
@@ -73,7 +73,8 @@ def author_usd(stage, root="/", dt=PHYSICS_DT):
             prim.SetActive(False)
     for name, joint in found.items():
         per = math.radians(1.0) if joint.GetTypeName() == joints[0] else 1.0  # angular attributes of joints: degrees
-        apply(joint, ["NewtonJointAPI"], {k: v * per if k == "damping" else v for k, v in JOINTS[name].items()})
+        own = {k: v for k, v in JOINTS[name].items() if k not in ("stiffness", "rest_q")}
+        apply(joint, ["NewtonJointAPI"], {k: v * per if k == "damping" else v for k, v in own.items()})
         drive, steps = DRIVES[name], delay_steps(name, dt)
         schemas = ["NewtonPDControlAPI"]
         values = {"kp": drive["kp"], "kd": drive["kd"], "constEffort": drive["const_effort"]}

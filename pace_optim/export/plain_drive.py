@@ -1,4 +1,4 @@
-"""The part of an identified drive that a simulator's PD actuator can hold, joint by joint."""
+"""The part of an identified drive that a simulator's PD actuator and its joint can hold, joint by joint."""
 
 from __future__ import annotations
 
@@ -10,15 +10,25 @@ from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.joint_values import resolve_joint_values
+from pace_actuators.representable import of_the_recording
 from pace_optim.export.configs import drive_groups
 
-GAIN_EFFECTS = ("proportional_gain", "derivative_gain", "torque_gain", "torque_limit")
+GAIN_EFFECTS = ("proportional_gain", "derivative_gain", "torque_gain", "torque_limit", "torque_speed_limit")
 """Effects that are other gains and limits of the same drive."""
+JOINT_EFFECTS = {
+    "parallel_spring": ("stiffness", "rest"),
+    "torque_offset": ("effort",),
+    "quadratic_friction": ("coefficient",),
+}
+"""Effects that are torques on the joint beside the drive's, and their parameters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlainDrive:
-    """PD control with a DC motor's limits: τ = clip(kp (q* - q + bias) - kd q̇, limits)."""
+    """PD control with a DC motor's limits, and torques beside it.
+
+    τ = clip(kp (q* - q + bias) - kd q̇, limits) - k (q - q₀) + τ₀ - b₂ q̇ |q̇|
+    """
 
     stiffness: float
     """kp [N m/rad], with the effects that scale it."""
@@ -46,6 +56,18 @@ class PlainDrive:
 
     second_order: bool = False
     """Whether it was identified with steps of second order."""
+
+    spring: float = 0.0
+    """k [N m/rad]."""
+
+    rest: float = 0.0
+    """q₀, true as q is [rad]."""
+
+    offset: float = 0.0
+    """τ₀ [N m]."""
+
+    quadratic: float = 0.0
+    """b₂ ≥ 0 [N m s²/rad²]."""
 
     def for_steps_of(self, dt: float, viscous: float) -> tuple[PlainDrive, float]:
         """The same in a simulator that evaluates it at every step and updates speeds before positions.
@@ -85,6 +107,8 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
     """
     result: dict[str, PlainDrive] = {}
     own = {name: _of_effect(drives, name) for name in GAIN_EFFECTS}
+    line_effort = _of_effect(drives, "torque_speed_limit", "effort")
+    beside = {name: [_of_effect(drives, name, each) for each in each_of] for name, each_of in JOINT_EFFECTS.items()}
     commands = drives.delay_mode == "command"
     for cfg in drive_groups(drives).values():
         joints = drives.find_joints(cfg.joint_names_expr)
@@ -105,7 +129,13 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
         early = 0.5 * drives.at.physics_dt if exact else 0.0
         for i, joint in enumerate(joints):
             gain = own["torque_gain"].get(joint, 1.0)
+            speed, stall = own["torque_speed_limit"].get(joint, math.inf), line_effort.get(joint, math.inf)
+            if math.isfinite(speed) and math.isfinite(stall):
+                found["velocity_limit"][i], found["saturation_effort"][i] = speed, stall
             line = math.isfinite(found["saturation_effort"][i]) and math.isfinite(found["velocity_limit"][i])
+            (spring, rest), (offset,), (quadratic,) = (
+                [values.get(joint, 0.0) for values in beside[name]] for name in JOINT_EFFECTS
+            )
             result[joint] = PlainDrive(
                 stiffness=found["stiffness"][i] * own["proportional_gain"].get(joint, 1.0) * gain,
                 damping=found["damping"][i] * own["derivative_gain"].get(joint, 1.0) * gain,
@@ -116,6 +146,10 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 delay_s=drives.delay_s + early if commands else 0.0,
                 run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
                 second_order=cfg.second_order,
+                spring=spring,
+                rest=rest,
+                offset=offset,
+                quadratic=max(0.0, quadratic),
             )
     notes = []
     if not commands and drives.delay_s > 0:
@@ -135,7 +169,9 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
     """
     notes = []
     for kind in (cfg.effect_class for cfg in drives.effects):
-        if kind.name in held:
+        if note := of_the_recording(kind):
+            notes.append(note)
+        elif kind.name in held:
             notes.append(f"{kind.name} is held.")
         else:
             notes.append(f"{kind.name} ({_what(kind)}): not held.")
@@ -147,10 +183,11 @@ def is_undetermined(drives: IdentifiedDrives, parameter: str, joint: str) -> boo
     return not {f"{parameter}/{joint}", f"{parameter}/{ALL}"}.isdisjoint(drives.undetermined)
 
 
-def _of_effect(drives: IdentifiedDrives, name: str) -> dict[str, float]:
+def _of_effect(drives: IdentifiedDrives, name: str, parameter: str = "") -> dict[str, float]:
+    """An effect's parameter on the joints that have it, the first where none is named."""
     for cfg in drives.effects:
         if cfg.effect_class.name == name:
-            parameter = cfg.effect_class.parameters[0].name
+            parameter = parameter or cfg.effect_class.parameters[0].name
             return drives.values(f"{name}.{parameter}", cfg.joints(drives.joint_names))
     return {}
 

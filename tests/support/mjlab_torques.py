@@ -107,7 +107,7 @@ def adapter(robot: str, cfgs, data) -> dict[str, np.ndarray]:
 
 def native(robot: str, space: dict, data) -> dict[str, np.ndarray]:
     """mjlab's own drive, with the values that were identified."""
-    world = World(robot, *space["ARTICULATION"].actuators, change=space["stiffen_friction"])
+    world = World(robot, *space["ARTICULATION"].actuators, change=space["write_joints"])
     for event in space["EVENTS"].values():
         event.params["asset_cfg"].resolve(world.scene)
         event.func(world, None, **event.params)

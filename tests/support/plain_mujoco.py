@@ -44,6 +44,7 @@ def replay(model: mujoco.MjModel, joints: Sequence[str], targets: np.ndarray, st
 
 
 def drive_of(model: mujoco.MjModel, joint: str) -> int:
-    """The joint's one actuator."""
-    (drive,) = np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)
+    """The joint's one actuator that a control moves."""
+    moves = (model.actuator_gaintype != mujoco.mjtGain.mjGAIN_FIXED) | (model.actuator_gainprm[:, 0] != 0)
+    (drive,) = np.flatnonzero((model.actuator_trnid[:, 0] == model.joint(joint).id) & moves)
     return int(drive)

@@ -55,6 +55,7 @@ def identified_motion(path: Path, targets: np.ndarray) -> tuple[np.ndarray, np.n
     (drive,) = cfg.scene.robot.actuators.values()
     drive.stiffness, drive.damping = drives.drive["stiffness"], drives.drive["damping"]
     set_physics_dt(cfg, drives.at.physics_dt)
+    cfg.set_effects([effect.label for effect in drives.effects])
     env = ManagerBasedRLEnv(cfg)
     env.reset()
     space = ParameterSpace.of(cfg.sim2real)
@@ -110,6 +111,48 @@ def test_plain_mujoco_replays_the_motion_of_the_identification(tmp_path, delay, 
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
     assert min(worse(change) for change in (soft, undelayed, implicit)) > 3 * error  # each of them is needed
+
+
+BESIDE = {
+    "quadratic_friction": {"coefficient": 0.3},
+    "parallel_spring": {"stiffness": 9.0, "rest": 0.4},
+    "torque_offset": {"effort": -1.5},
+    "payload": {"ratio": 0.2},
+    "com_offset": {"angle": 0.1},
+    "torque_speed_limit": {"effort": 140.0, "velocity": 8.5},
+}
+
+
+@pytest.mark.parametrize(
+    ("names", "error"), [([*BESIDE][1:], 1e-6), (["quadratic_friction"], 4e-4)], ids=["exact", "within_a_step"]
+)
+def test_effects_that_a_joint_or_a_body_holds_move_the_model_as_in_the_identification(tmp_path, names, error):
+    """On every other joint, with bias and delay. Steps of MuJoCo take the slope of a quadratic friction too."""
+    result = without_effects(write_result(tmp_path / "result.json", delay=3.0))
+    own, content = JOINTS[::2], json.loads(result.read_text())
+    values = {f"{name}.{p}": dict.fromkeys(own, v) for name in names for p, v in BESIDE[name].items()}
+    values["measurement_delay.delay"] = dict.fromkeys(JOINTS, 0.01)
+    effects = [*(f"{name}@{'|'.join(own)}" for name in names), "measurement_delay"]
+    changed(result, effects=effects, parameters=content["parameters"] | values)
+    targets = 0.1 * chirp(len(JOINTS))
+    expected, _ = identified_motion(result, targets)
+    exported, newton = export(result, "mjcf"), export(result, "newton")
+    found = replay(fixed_in_the_air(exported.text), JOINTS, targets, targets[0])
+    bare = replay(fixed_in_the_air(export(without_effects(result), "mjcf").text), JOINTS, targets, targets[0])
+    assert np.abs(found - expected).max() < error < 0.1 * np.abs(bare - expected).max()
+    said = " ".join(exported.notes)
+    assert all(f"{name} is held" in said for name in names) and "not held" not in said
+    assert "measurement_delay is about the recording's time stamps" in said
+    page: dict = {}
+    exec(newton.text, page)
+    joint, drive = page["JOINTS"][own[0]], page["DRIVES"][own[0]]
+    if "parallel_spring" in names:
+        assert (joint["stiffness"], joint["rest_q"]) == (9.0, 0.4) and "parallel_spring is held" in " ".join(
+            newton.notes
+        )
+        assert drive["const_effort"] == pytest.approx(85.0 * 0.08 - 1.5)
+    else:
+        assert "stiffness" not in joint and "quadratic_friction (τ - b2 v |v|): not held" in " ".join(newton.notes)
 
 
 def test_the_actuators_give_the_drives_torque(result):
