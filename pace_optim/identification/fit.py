@@ -1,13 +1,15 @@
-"""A fit from settings to a run's folder: load, search, refine, conclude, write."""
+"""A fit from settings to a run's folder: load, search, refine, conclude, write; with torques where these decide."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pace_actuators.effects import effect_modules
+from pace_actuators.text import listed
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
 from pace_optim.estimate.search import agree_to_stop, search
@@ -16,6 +18,7 @@ from pace_optim.identification.optimization import Optimization, with_structures
 from pace_optim.identification.own_objective import conclude_own
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
+from pace_optim.recording.torque import NoTorqueError
 from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.inputs import (
@@ -29,14 +32,18 @@ from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, assumptions
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds
+from pace_optim.terminal.cli import command
 from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
 _NOTE = "note: "
+_INTERRUPTED = "interrupted"
 _NOISY = 1.5
-"""Times the noise above which a fit leaves something that other facts may explain."""
+"""Times the noise above which a fit leaves something that torques may explain."""
 _BETTER = 0.9
-"""Part of the error that facts from torques must leave at most, to be used instead of those that are stated."""
+"""Part of the error that a fit by torques must leave at most, to be kept."""
+_WHITE = 1.5
+"""Times their own noise that is left of torques at most, where the fit's drives are theirs."""
 
 
 def fit(
@@ -93,10 +100,12 @@ def fit(
 def fit_with_torques(
     settings: FitSettings, progress: ProgressLine | None = None, processes: Processes | None = None
 ) -> tuple[FitResult, Path]:
-    """Identify a robot; where recordings' torques contradict what is stated, by that which fits better.
+    """Identify a robot; by its torques too, where facts of its drives depend on them and the fit is better so.
 
-    A fit with what is stated comes first. If it ends at the noise, the torques are not needed. Else another one takes
-    the facts from the torques, and is kept if it leaves less.
+    A fit of positions comes first. If it ends at the noise, it is the result. Else, where facts were read from the
+    torques or contradict these, another fit follows the torques beside the positions. It is kept if positions are
+    followed better, and what is left of the torques is their own noise: a filtered torque is not the drive's. Facts
+    that contradict it are then tried with the torques' values alone.
 
     Args:
         settings: As for :func:`fit`; so are the others.
@@ -105,19 +114,56 @@ def fit_with_torques(
     """
     progress = progress or ProgressLine()
     result, folder = fit(settings, progress, processes=processes, tell=progress.tell)
-    alone = processes is None or processes.count == 1
-    if not result.contested or not alone or "interrupted" in result.stop_reasons or (result.times_noise or 0) < _NOISY:
-        return result, folder
-    facts = ", ".join(result.contested)
-    progress.tell(f"The torques in the recordings contradict stated facts ({facts}): fitting with the torques' values.")
-    unknown = [*settings.unknown, *(fact for fact in result.contested if fact not in settings.unknown)]
-    other, other_folder = fit(replace(settings, unknown=unknown), progress, tell=tell_nobody)
-    before, after = (1e3 * each.rmse["train"]["all"] for each in (result, other))
-    if after < _BETTER * before:
-        progress.tell(f"With {facts} from the torques the error is {after:.4g}, not {before:.4g} mrad: they are used.")
-        return other, other_folder
-    progress.tell(f"With {facts} from the torques the error is {after:.4g}, not {before:.4g} mrad: they are not used.")
-    return result, folder
+    return _by_torques(result, folder, settings, progress, processes)
+
+
+def _by_torques(
+    first: FitResult, folder: Path, settings: FitSettings, progress: ProgressLine, processes: Processes | None
+) -> tuple[FitResult, Path]:
+    """A fit of positions, or the better one by its torques."""
+    several = processes is not None and processes.count > 1
+    depends = bool(first.contested or first.from_torques)
+    if several or not depends or _INTERRUPTED in first.stop_reasons or (first.times_noise or 0.0) < _NOISY:
+        return first, folder
+    for facts, other in _attempts(first, folder, settings):
+        progress.tell(f"The fit is at {first.times_noise:.3g} times the noise: fitting with {facts}.")
+        try:
+            result, path = fit(other, progress, tell=tell_nobody)
+        except NoTorqueError:
+            continue
+        if _INTERRUPTED in result.stop_reasons:
+            progress.tell(f"The fit with {facts} was broken off: {command('fit')} --resume {shlex.quote(str(path))}.")
+            return first, folder
+        if _is_better(result, first, facts, progress):
+            return result, path
+    return first, folder
+
+
+def _attempts(first: FitResult, folder: Path, settings: FitSettings) -> Iterator[tuple[str, FitSettings]]:
+    """What is fitted by torques, in words and as settings: beside positions, then by their values alone."""
+    unknown = [*settings.unknown, *(fact for fact in first.contested if fact not in settings.unknown)]
+    other = replace(settings, unknown=unknown, instead_of=str(folder.absolute()))
+    if not settings.residual and not settings.only_searches:
+        facts = listed([*first.contested, *first.from_torques])
+        yield f"torques beside positions, as {facts} depend on them", replace(other, residual=["position", "effort"])
+    if first.contested:
+        yield f"{listed(first.contested)} by the torques, which contradict what is stated", other
+
+
+def _is_better(result: FitResult, first: FitResult, facts: str, progress: ProgressLine) -> bool:
+    """Whether a fit by torques is kept in place of that of positions, which is said with the reason."""
+    before, after = (1e3 * each.rmse["train"]["all"] for each in (first, result))
+    said = f"With {facts.split(',')[0]} the error is {after:.4g}, not {before:.4g} mrad"
+    floors = result.torque_floor
+    most = max((noise / max(floors[joint], 1e-300) for joint, noise in result.torque_noise.items()), default=0.0)
+    if after >= _BETTER * before:
+        progress.tell(f"{said}: the fit of positions is kept.")
+    elif most > _WHITE:
+        progress.tell(f"{said}, but {most:.3g} times the torques' noise is left of them: the fit of positions is kept.")
+    else:
+        progress.tell(f"{said}{', and their noise is left of the torques' if most else ''}: this fit is kept.")
+        return True
+    return False
 
 
 def resume(
@@ -145,7 +191,8 @@ def resume(
     folder = RunFolder(Path(path))
     checkpoint = folder.read_checkpoint()
     read_bounds(folder.path)
-    if (folder.path / "result.json").exists():  # of a fit that had ended: its report is made of more
+    ended = (folder.path / "result.json").exists() and _INTERRUPTED not in FitResult.load(folder.path).stop_reasons
+    if (folder.path / "result.json").exists():  # its report is made of more
         check_folder(folder.path)
     before = _reopened(folder.path, settings, task)
     check_unchanged(before)
@@ -156,7 +203,13 @@ def resume(
     check_same_configuration(before, problem)
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     run.restore(checkpoint)
-    return _finished(run, before.record)
+    result, path = _finished(run, before.record)
+    if ended or _INTERRUPTED in result.stop_reasons:
+        return result, path
+    if settings.instead_of is None:
+        return _by_torques(result, path, settings, run.progress, processes)
+    first = FitResult.load(settings.instead_of)
+    return (result, path) if _is_better(result, first, "torques", run.progress) else (first, Path(settings.instead_of))
 
 
 def help_fit(processes: Processes, device: str, path: str | None = None, task: str | None = None) -> None:

@@ -126,7 +126,7 @@ class Optimization:
         self._courses: list[_Course] = []
         self._halvings = 0
         self._use(self._course(problem))
-        self._steps_before = 0
+        self._steps_before = self._looks = self._looks_before = 0
         self._search_stop: list[str] = []
         self._searched = False
         self._saved: dict[str, list] = {"params": [], "scores": []}
@@ -254,8 +254,9 @@ class Optimization:
         return dict(zip(self.problem.joint_names, values, strict=False))
 
     def _found_again(self, evaluator: Evaluator) -> AbstractContextManager[None]:
-        """Of what a run that is resumed simulates once more: it was counted before."""
-        return evaluator.again() if self._restored else nullcontext()
+        """A look between descents: of those before an interruption, the steps were counted before."""
+        self._looks += 1
+        return evaluator.again() if self._looks <= self._looks_before else nullcontext()
 
     def _with_structure(self, best: Descent) -> WayDown | None:
         """The way with another structure of effects, begun at their probes, if it leads further on pieces.
@@ -359,7 +360,7 @@ class Optimization:
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
-        self._steps_before = int(checkpoint["simulated_steps"])
+        self._steps_before, self._looks_before = int(checkpoint["simulated_steps"]), int(checkpoint["looks"])
         self.history = self.folder.history_of(checkpoint)
         if checkpoint["history"].size:
             self._around = torch.as_tensor(checkpoint["search_around"])
@@ -432,7 +433,7 @@ class Optimization:
 
     def _write_checkpoint(self) -> None:
         self.folder.write_checkpoint(
-            self.optimizer, self._around, self.descents, self._search_stop, self.steps, self.history
+            self.optimizer, self._around, self.descents, self._search_stop, self.steps, self._looks, self.history
         )
 
     def _write_mean(self, optimizer: CMAESOptimizer) -> None:

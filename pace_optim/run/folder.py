@@ -53,6 +53,7 @@ _CHECKPOINT = {
     "line_generation": ("i", 0),
     "search_stop": ("U", 1),
     "simulated_steps": ("i", 0),
+    "looks": ("i", 0),
     "descents": ("U", 0),
     "descent_x": ("f", 2),
     "descent_hessian": ("f", 3),
@@ -150,9 +151,13 @@ class RunFolder:
         descents: Sequence[Descent],
         search_stop: Sequence[str],
         steps: int,
+        looks: int,
         scores: History,
     ) -> None:
-        """The state of the search and of the refinement, as plain numbers, and the scores so far."""
+        """The state of the search and of the refinement, as plain numbers, and the scores so far.
+
+        ``looks`` is the number of simulations between descents, whose steps are among ``steps``.
+        """
         history = np.stack(optimizer.history) if optimizer and optimizer.history else np.zeros((0, 0, 0))
         arrays = {
             "history": history,
@@ -160,6 +165,7 @@ class RunFolder:
             "line_generation": np.array(optimizer.line_generation if optimizer else -1),
             "search_stop": np.array(list(search_stop), dtype=str),
             "simulated_steps": np.array(steps),
+            "looks": np.array(looks),
             **checkpoint_of(descents),
             "scores": np.array(json.dumps(scores.to_dict())),
         }

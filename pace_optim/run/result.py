@@ -63,10 +63,14 @@ class FitResult(DriveResult):
     """What the torque in the recordings says of each drive, by joint and recording."""
     contested: list[str] = field(default_factory=list)
     """Facts that are stated and that the torque in a recording contradicts."""
+    from_torques: list[str] = field(default_factory=list)
+    """Facts that were read from the torques in the recordings."""
     torque_rmse: dict[str, dict[str, float]] = field(default_factory=dict)
     """Of torques that the fit follows, in ``train`` and ``validation``, by joint [N m]."""
     torque_noise: dict[str, float] = field(default_factory=dict)
     """Standard deviation of the noise that they are weighed by, by joint [N m]; empty: it follows none."""
+    torque_floor: dict[str, float] = field(default_factory=dict)
+    """That of their own noise, by joint [N m]: the spectrum above the motion."""
     imu_delays: dict[str, float] = field(default_factory=dict)
     """How much later than encoders the IMU of a base that moves is read, by recording [s]: the fit reads it earlier."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -287,9 +291,11 @@ def make_result(
             "validation": torque_rmse(residuals, data.torques, validation, problem.joint_names),
         },
         torque_noise=problem.torque_noise,
+        torque_floor=problem.torque_floor if problem.torque_noise else {},
         imu_delays=dict(problem.imu_delays),
         measured_drive=problem.measured.to_dict(),
         contested=list(problem.measured.contested),
+        from_torques=sorted(fact for fact, joints in problem.measured.taken.items() if joints),
         findings=whole_delay(problem, float(physical[space["delay"]]), std["delay"][ALL]),
         notes=assumptions(problem),
         links=_found_links(problem, values),

@@ -114,6 +114,10 @@ class FitSettings:
     log_dir: str = "logs/pace"
     """Where runs are kept."""
 
+    instead_of: str | None = None
+    """The run of positions alone in whose place this one, with torques, is kept if it is better; ``None``: there is
+    none."""
+
     def __post_init__(self) -> None:
         """Check what can be checked without reading anything, and leave out the JSON files beside recordings.
 

@@ -1,7 +1,15 @@
 """What the torque in a recording says of the drive: its gains, feed-forward, limit and delay; and its noise."""
 
-from .channel import TorqueChannel, torque_channel
+from .channel import NoTorqueError, TorqueChannel, torque_channel
 from .drives import MeasuredDrives, read_drives
 from .law import MeasuredLaw, read_law
 
-__all__ = ["MeasuredDrives", "MeasuredLaw", "TorqueChannel", "read_drives", "read_law", "torque_channel"]
+__all__ = [
+    "MeasuredDrives",
+    "MeasuredLaw",
+    "NoTorqueError",
+    "TorqueChannel",
+    "read_drives",
+    "read_law",
+    "torque_channel",
+]

@@ -18,6 +18,10 @@ _LARGEST_OFFSET = 0.5
 """Part of the largest torque that a sensor's offset is at most."""
 
 
+class NoTorqueError(ValueError):
+    """No recording has a torque that a fit can follow."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TorqueChannel:
     """Joints whose measured torques a fit follows, τ_m(t) = s τ(t - l) + o + noise, and what it begins with.
@@ -50,10 +54,10 @@ def torque_channel(recordings: Sequence[Recording], measured: MeasuredDrives, wh
         why_not: Why none can be followed; empty: they can.
 
     Raises:
-        ValueError: If no torque can be followed.
+        NoTorqueError: If no torque can be followed.
     """
     if not any(recording.dof_effort is not None for recording in recordings):
-        raise ValueError("--residual effort needs measured torques (dof_effort), and no recording has any.")
+        raise NoTorqueError("--residual effort needs measured torques (dof_effort), and no recording has any.")
     noise: dict[str, float] = {}
     known: dict[str, list[MeasuredLaw]] = {}
     out: dict[str, list[str]] = {}
@@ -65,7 +69,7 @@ def torque_channel(recordings: Sequence[Recording], measured: MeasuredDrives, wh
         else:
             noise[joint], known[joint] = max(law.residual for law in laws), laws
     if not noise:
-        raise ValueError(
+        raise NoTorqueError(
             f"--residual effort: no torque can be followed: {'; '.join(out)}. Fit with --residual position."
         )
     notes = [f"dof_effort of {listed(joints, 6)} is left out of the residuals: {why}." for why, joints in out.items()]

@@ -417,6 +417,6 @@ def test_a_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
         with pytest.raises(KeyboardInterrupt):
             least_squares(Rattling(), dense(3), descents, on_iteration=interrupt)
         folder = RunFolder(tmp_path)
-        folder.write_checkpoint(None, torch.zeros(0, dtype=torch.float64), descents, [], 0, History())
+        folder.write_checkpoint(None, torch.zeros(0, dtype=torch.float64), descents, [], 0, 0, History())
         on = least_squares(Rattling(), dense(3), Descent.restore(folder.read_checkpoint()))[0]
         assert torch.equal(on.x, whole.x) and on.scores == whole.scores and on.iteration == whole.iteration
