@@ -4,11 +4,13 @@
 
 Plants in plain MuJoCo, without code of the project: a differential wrist, a two-motor ankle (pitch and roll) and a belt
 whose second motor sits in the base. A PD loop at 1 kHz in the motors' coordinates, a delay of the commands, encoder
-noise of 0.1 mrad. The model file that the fit gets has the motors as fixed tendons, without their parameters.
+noise of 0.1 mrad. The model file that the fit gets has the motors as fixed tendons, without their parameters. Or it has
+the joints alone, and the log states the motors and their gains.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -39,8 +41,8 @@ class Case:
     truth: dict[str, tuple[float, float]]
     delay: float = 3.3e-3
 
-    def xml(self) -> str:
-        """The model file: links, tendons, and position servos on them."""
+    def xml(self, *, bare: bool = False) -> str:
+        """The model file: links, tendons, and position servos on them; or links alone."""
         tendons, servos = [], []
         for motor, row in self.rows.items():
             joints = "".join(f'<joint joint="{joint}" coef="{ratio}"/>' for joint, ratio in row.items())
@@ -49,11 +51,15 @@ class Case:
                 f'<position name="{motor}" tendon="{motor}" kp="{self.kp}" kv="{self.kd}" '
                 f'forcerange="{-self.limit} {self.limit}"/>'
             )
+        drives = f"<tendon>{''.join(tendons)}</tendon><actuator>{''.join(servos)}</actuator>"
         return (
             f'<mujoco model="{self.name}"><compiler angle="radian"/><option timestep="0.001"/>'
-            f"<worldbody>{self.bodies}</worldbody><tendon>{''.join(tendons)}</tendon>"
-            f"<actuator>{''.join(servos)}</actuator></mujoco>"
+            f"<worldbody>{self.bodies}</worldbody>{'' if bare else drives}</mujoco>"
         )
+
+    def facts(self) -> dict:
+        """What a log states beside such a file."""
+        return {"couplings": self.rows, "stiffness": self.kp, "damping": self.kd, "effort_limit": self.limit}
 
 
 CASES = (
@@ -173,14 +179,16 @@ def replay(xml: str, names: list[str], rows: np.ndarray, target: np.ndarray, sta
     return shown
 
 
-def _row(case: Case, folder: Path) -> str:
+def _row(case: Case, folder: Path, stated: bool) -> str:
     names, xml = list(case.rows), folder / f"{case.name}.xml"
-    xml.write_text(case.xml())
+    xml.write_text(case.xml(bare=stated))
     rows = np.array([[row.get(joint, 0.0) for joint in case.joints] for row in case.rows.values()])
     logs = [record(case, seed, 6.0) for seed in (0, 1)]
     for log, name in zip(logs, ("a", "b"), strict=True):  # of the joints, as a robot's state publisher logs them
         turned = {key: log[key] @ np.linalg.inv(rows).T for key in ("dof_pos", "des_dof_pos")}
         np.savez(folder / f"{name}.npz", time=log["time"], joint_names=np.array(case.joints), **turned)
+        if stated:
+            (folder / f"{name}.json").write_text(json.dumps(case.facts()))
     script = [sys.executable, str(ROOT / "scripts" / "fit.py"), "--task", str(xml), "--optimizer", "least_squares"]
     done = subprocess.run(
         [*script, "--drive_dt", "0.001", "--data", str(folder / "a.npz"), "--validation", str(folder / "b.npz"),
@@ -205,7 +213,13 @@ def _row(case: Case, folder: Path) -> str:
     cells = [f"{100 * each:.2g} %" for each in off.values()]
     late = 1e6 * abs(result["delay_s"] - case.delay)
     train, held_out = (1e3 * result["rmse"][key]["all"] for key in ("train", "validation"))
-    words = [case.name, *cells, f"{late:.0f} µs", f"{train:.4f} / {held_out:.4f}", f"{apart:.3f} mrad"]
+    words = [
+        f"{case.name}{', stated by the log' if stated else ''}",
+        *cells,
+        f"{late:.0f} µs",
+        f"{train:.4f} / {held_out:.4f}",
+        f"{apart:.3f} mrad",
+    ]
     return f"| {' | '.join(words)} |"
 
 
@@ -229,9 +243,9 @@ def main() -> None:
         "| robot | armature | viscous friction | friction | delay | error [mrad], fitted / held out | exported MJCF |"
     )
     print("|---|---|---|---|---|---|---|")
-    for case in CASES:
+    for case, stated in itertools.product(CASES, (False, True)):
         with tempfile.TemporaryDirectory() as folder:
-            print(_row(case, Path(folder)), flush=True)
+            print(_row(case, Path(folder), stated), flush=True)
 
 
 if __name__ == "__main__":

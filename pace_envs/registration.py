@@ -15,6 +15,7 @@ from pace_envs.gym_vector import PaceVectorEnv
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
 from pace_envs.model_file import is_model_file
+from pace_envs.motor_coordinates import Rows
 
 _TASKS = {
     "Pace-AnymalD-v0": "pace_envs.tasks.pace.anymal_d:anymal_d_pace_env_cfg",
@@ -74,12 +75,13 @@ def registered_by(task: str) -> str | None:
     return None if module.partition(".")[0] == "pace_envs" else module
 
 
-def load_env_cfg(task: str, control_dt: float | None = None) -> Any:
+def load_env_cfg(task: str, control_dt: float | None = None, motors: Rows | None = None) -> Any:
     """A fresh configuration of an environment; nothing is imported to find it.
 
     Args:
         task: Its registered name, also after ``module:`` or ``path/to/file.py:``; or a model file.
         control_dt: Time between two commands [s], of a model file; ``None``: 2.5 ms.
+        motors: Motors that move several joints of a model file and that it does not have, {motor: {joint: ratio}}.
 
     Raises:
         ValueError: If there is no such environment, or it states its control step itself.
@@ -87,7 +89,7 @@ def load_env_cfg(task: str, control_dt: float | None = None) -> Any:
     if is_model_file(task):
         from pace_envs.from_model import cfg_from_model  # its configuration is one of this package
 
-        return cfg_from_model(task) if control_dt is None else cfg_from_model(task, control_dt)
+        return cfg_from_model(task, motors=motors, **({} if control_dt is None else {"control_dt": control_dt}))
     if control_dt is not None:
         raise ValueError(
             f"control_dt is {control_dt:g} s, which only a model file (.xml, .urdf) needs: {task} states its "

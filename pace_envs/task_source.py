@@ -22,7 +22,7 @@ from pace_actuators.trusted_code import trust
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.registration import load_env_cfg, registered_by
 
-_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt", "held_joints")
+_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt", "held_joints", "motors")
 
 
 def use_task(text: str) -> str:
@@ -74,6 +74,9 @@ class EnvironmentRecord:
     held_joints: Mapping[str, float] = field(default_factory=dict)
     """Joints that are held, beside those that the task itself holds, and where [rad, of slides m]."""
 
+    motors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Motors that move several joints of a model file and that it does not have, {motor: {joint: ratio}}."""
+
     @classmethod
     def of(cls, task: str, cfg: Any, effects: Iterable[str] = (), folder: str | None = None) -> EnvironmentRecord:
         """The record of a task that is known.
@@ -96,6 +99,7 @@ class EnvironmentRecord:
             files={str(file): file_digest(file) for file in files},
             control_dt=cfg.sim.dt * cfg.decimation if is_model_file(task) else None,
             held_joints=dict(cfg.scene.robot.held_joints),
+            motors=_stated_motors(cfg.scene.robot) if is_model_file(task) else {},
         )
 
     @classmethod
@@ -115,12 +119,19 @@ class EnvironmentRecord:
             ("files", Mapping),
             ("control_dt", float | None),
             ("held_joints", Mapping),
+            ("motors", Mapping),
         ):
             if key in values and not isinstance(values[key], kind):
                 raise TypeError(f"environment.{key} is {values[key]!r}")
         held = values.get("held_joints", {})
         if not all(isinstance(place, (int, float)) for place in held.values()):
             raise TypeError(f"environment.held_joints is {held!r}")
+        rows = values.get("motors", {})
+        if not all(
+            isinstance(row, Mapping) and all(isinstance(ratio, (int, float)) for ratio in row.values())
+            for row in rows.values()
+        ):
+            raise TypeError(f"environment.motors is {rows!r}")
         checked_record(content)
         return cls(**{"task": task} | values)
 
@@ -154,13 +165,23 @@ class EnvironmentRecord:
         """A fresh configuration of the environment; relative paths begin where the run was started."""
         known = self.use(where, task)
         try:
-            cfg = load_env_cfg(known, self.control_dt if is_model_file(known) else None)
+            of_file = (self.control_dt, self.motors) if is_model_file(known) else ()
+            cfg = load_env_cfg(known, *of_file)
         except ValueError as error:  # what the record says, unless the user names another
             raise ValueError(str(error) if task is not None else f"{where}: {error}") from None
         path = Path(cfg.scene.robot.mjcf_path)
         if self.folder and not path.is_absolute() and not path.is_file():
             cfg.scene.robot.mjcf_path = Path(self.folder) / path
         return cfg.holding(self.held_joints) if self.held_joints and hasattr(cfg, "holding") else cfg
+
+
+def _stated_motors(robot: Any) -> dict[str, dict[str, float]]:
+    """Motors that a robot's model file does not have, and joints of these that keep a drive of their own."""
+    rows = dict(robot.couplings)
+    spec = read_model_file(robot.mjcf_path).spec if rows else None
+    stated = {m: dict(row) for m, row in rows.items() if spec and not (spec.joint(m) or spec.tendon(m))}
+    turned = {joint for row in stated.values() for joint in row}
+    return {joint: {joint: 1.0} for joint in robot.joint_order or () if joint in turned} | stated
 
 
 def model_files(path: Path, *, touches: bool = False) -> list[Path]:

@@ -32,7 +32,7 @@ from pace_envs.from_model.scaling import (
     start_values,
 )
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
-from pace_envs.motor_coordinates import DrivenJoints
+from pace_envs.motor_coordinates import DrivenJoints, Rows, add_motors
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -60,20 +60,23 @@ class Robot:
     """What was assumed and what was left out, in plain sentences."""
 
 
-def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Robot:
+def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT, motors: Rows | None = None) -> Robot:
     """Read a robot from a model file.
 
     Args:
         path: MJCF or URDF.
         control_dt: Time between two commands [s].
+        motors: Motors that move several joints and that the file does not have; drives that it has of these joints are
+            left out.
 
     Raises:
         ValueError: If the file is missing, is no model, or has no joints that a drive could move.
     """
-    file = read_model_file(path)
+    file, motors = read_model_file(path), motors or {}
+    add_motors(file.spec, motors, path)
     model = compile_model(file.spec, path, file.notes if file.urdf is None else ())
     drives, notes = read_drives(model)
-    names = [drive.joint for drive in drives] or _to_drive(model, file)
+    names = _with_motors([drive.joint for drive in drives] or _to_drive(model, file), motors)
     if not names:
         raise ValueError(f"The model {path} has no hinge or slide joint that a drive could move.")
     home, key = home_posture(model)
@@ -98,7 +101,9 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> Rob
     )
 
 
-def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) -> PaceSim2realEnvCfg:
+def cfg_from_model(
+    path: str | Path, control_dt: float = defaults.CONTROL_DT, motors: Rows | None = None
+) -> PaceSim2realEnvCfg:
     """The identification environment of the robot in a model file, its base held in the air.
 
     Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
@@ -108,6 +113,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).
         control_dt: Time between two commands [s], which no file says.
+        motors: Motors that move several joints, {motor: {joint: ratio}}, where the file does not have them.
 
     Raises:
         ValueError: If the file cannot be used; the message says what to do.
@@ -117,7 +123,7 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
             f"control_dt is {control_dt:g} s, expected a time above 0 and up to {defaults.LONGEST_DELAY:g} s, such as "
             "0.001 for commands at 1 kHz."
         )
-    robot = read_robot(path, control_dt)
+    robot = read_robot(path, control_dt, motors)
     joints, names = robot.joints, tuple(joint.name for joint in robot.joints)
     position, orientation = _base_pose(robot)
     continuous = runs_continuously(joints, robot.model, control_dt)
@@ -127,7 +133,8 @@ def cfg_from_model(path: str | Path, control_dt: float = defaults.CONTROL_DT) ->
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
-        couplings={joint.name: dict(joint.drive.row) for joint in joints if joint.drive and joint.drive.row},
+        couplings={joint.name: dict(joint.drive.row) for joint in joints if joint.drive and joint.drive.row}
+        | {name: dict(row) for name, row in (motors or {}).items() if name in names and name not in row},
     )
     bounds = {name: [base_bounds(joint)[name] for joint in joints] for name in PER_JOINT}
     moves = [motion(joint) for joint in joints]
@@ -231,10 +238,14 @@ def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous
 
 def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
     """What to drive where the file has no actuators: joints that it names, else all that follow no other; motors."""
-    motors = {} if file.urdf is None else file.urdf.motors
-    result = _joints_to_drive(model, file)
+    return _with_motors(_joints_to_drive(model, file), {} if file.urdf is None else file.urdf.motors)
+
+
+def _with_motors(names: Sequence[str], motors: Rows) -> list[str]:
+    """The names of what is driven, with motors in place of joints that they turn and that have no row of their own."""
+    result = list(names)
     for motor, row in motors.items():
-        if motor not in result and (place := next((joint for joint in row if joint in result), "")):
+        if motor not in result and (place := next((j for j in row if j in result and j not in motors), "")):
             result[result.index(place)] = motor
     return result
 

@@ -20,6 +20,7 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg, set_physics_dt
 from pace_envs.from_model.defaults import SHORTEST_CONTROL_DT, physics_steps
 from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
+from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
 from pace_optim.problem.base_path import BasePath, base_path
@@ -48,6 +49,7 @@ from pace_optim.problem.start import start_by_torques, widen_bounds
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
+from pace_optim.recording.files import stated_couplings
 from pace_optim.recording.parts import affordable
 from pace_optim.recording.torque import MeasuredDrives, TorqueChannel, read_drives, torque_channel
 from pace_optim.recording.windows import Windows
@@ -324,6 +326,8 @@ class Facts:
     """Whether commands come as fast as the log's: nothing states the control step of a model file."""
     logged_rate: bool = False
     """Whether they do."""
+    motors: Rows = field(default_factory=dict)
+    """Motors that move several joints, as recordings state them."""
 
     @classmethod
     def read(
@@ -335,13 +339,15 @@ class Facts:
         delay_mode: str | None = None,
         physics_dt: float | None = None,
         drive_dt: float | None = None,
+        motors: Rows | None = None,
     ) -> Facts:
         """Read what a task says of its robot; the arguments are those of :func:`load_problem`.
 
         Raises:
             ValueError: If it is no identification task, or the delay's mode or bounds are unusable.
         """
-        cfg = load_env_cfg(task, control_dt) if env_cfg is None else copy.deepcopy(env_cfg)
+        of_file = motors if is_model_file(task) else None
+        cfg = load_env_cfg(task, control_dt, of_file) if env_cfg is None else copy.deepcopy(env_cfg)
         if not isinstance(cfg, PaceSim2realEnvCfg):
             raise ValueError(f"{task} is no identification task. Choose one with scripts/list_envs.py.")
         if delay_mode is not None and delay_mode not in DELAY_MODES:
@@ -364,6 +370,7 @@ class Facts:
             delay_mode=delay_mode,
             physics_dt=physics_dt,
             drive_dt=drive_dt,
+            motors=motors or {},
             follows_log=env_cfg is None and control_dt is None and is_model_file(task),
         )
 
@@ -382,6 +389,7 @@ class Facts:
                 delay_mode=self.delay_mode,
                 physics_dt=self.physics_dt,
                 drive_dt=self.drive_dt,
+                motors=self.motors,
             )
             facts = replace(facts, logged_rate=True)
         if not logs.held and not logs.note:
@@ -451,7 +459,13 @@ def load_problem(
         ValueError: If anything does not fit.
     """
     stated = Facts.read(
-        task, env_cfg, control_dt=control_dt, delay_mode=delay_mode, physics_dt=physics_dt, drive_dt=drive_dt
+        task,
+        env_cfg,
+        control_dt=control_dt,
+        delay_mode=delay_mode,
+        physics_dt=physics_dt,
+        drive_dt=drive_dt,
+        motors=stated_couplings([*data, *validation]),
     )
     env = stated.make_env()
     try:

@@ -10,7 +10,7 @@ import numpy as np
 from pace_actuators.text import listed
 
 from .data import Recording
-from .facts import as_array, check_one_line, drive_of, feet_of, imu_of, joint_names_of, load_of
+from .facts import as_array, check_one_line, couplings_of, drive_of, feet_of, imu_of, joint_names_of, load_of
 from .keys import BASE_COLUMNS, COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
 from .stamps import seconds_of, set_back, unrounded
 
@@ -280,6 +280,7 @@ def _base(fields: Mapping[str, Any], num_samples: int, source: str) -> dict[str,
         **result,
         **({"feet": feet} if of_feet else {}),
         "imu": imu_of(fields.get("imu"), source),
+        "couplings": couplings_of(fields.get("couplings"), source),
     }
 
 

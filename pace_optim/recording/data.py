@@ -104,6 +104,8 @@ class Recording:
     """Force on each foot, (T, feet) or (T, feet, 3) [N]."""
     feet: tuple[str, ...] = ()
     """Bodies, geoms, sites or legs that these are of."""
+    couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Motors that move several joints, {motor: {joint: ratio}}, where the robot's model does not have them."""
     imu: ImuPose = field(default_factory=ImuPose)
     """Where the IMU is."""
     time_origin: float = 0.0

@@ -117,6 +117,34 @@ def imu_of(value: Any, source: str) -> ImuPose:
     return ImuPose(body=str(value["body"]), **pose)
 
 
+def couplings_of(value: Any, source: str) -> dict[str, dict[str, float]]:
+    """Motors that move several joints, {motor: {joint: ratio}}; none where none are stated.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if isinstance(value, str):  # in an .npz
+        with suppress(ValueError):  # the message below shows what is no JSON
+            value = parsed_json(value)
+    rows = {} if value is None else value
+    if not isinstance(rows, Mapping) or not all(isinstance(row, Mapping) and row for row in rows.values()):
+        raise ValueError(
+            f"{source}: couplings is {value!r}; expected {{motor: {{joint: ratio}}}} (in an .npz as JSON text). "
+            'Write it as {"motor_a": {"pitch": 1.5, "roll": 1}, "motor_b": {"pitch": 1.5, "roll": -1}}.'
+        )
+    result: dict[str, dict[str, float]] = {}
+    for motor, row in rows.items():
+        check_one_line("a motor of couplings", str(motor), source)
+        for joint, ratio in row.items():
+            array = as_array(ratio)
+            if array.dtype.kind not in "iuf" or array.shape != () or not np.isfinite(array):
+                raise ValueError(
+                    f"{source}: couplings of {motor} has the ratio {ratio!r} of {joint}; expected a number."
+                )
+            result.setdefault(str(motor), {})[str(joint)] = float(array)
+    return result
+
+
 def feet_of(value: Any, count: int, source: str) -> tuple[str, ...]:
     """Names of the feet that contacts are of, () where none are given.
 

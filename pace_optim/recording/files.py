@@ -19,7 +19,7 @@ from pace_optim.terminal.arrays import read_arrays
 from .checks import check_recording
 from .csv_format import read_csv, write_csv
 from .data import ImuPose, Recording
-from .facts import as_array
+from .facts import as_array, couplings_of
 from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean
 
 SUFFIXES = (".pt", ".npz", ".csv")
@@ -51,6 +51,28 @@ def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording
     if rate and "time" not in fields and "dof_pos" in fields:
         fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
     return check_recording(fields, source=str(path), default_name=path.stem, found=found)
+
+
+def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[str, float]]:
+    """Motors that recordings and logs state, {motor: {joint: ratio}}: in themselves or in the JSON beside them.
+
+    Raises:
+        ValueError: If two of them contradict each other, or what one states is unusable.
+    """
+    found: dict[str, dict[str, float]] = {}
+    first = ""
+    for path in map(Path, paths):
+        read = {".npz": _read_npz, ".pt": _read_pt}.get(path.suffix.lower()) if path.is_file() else None
+        value = add_json_facts({}, path).get("couplings")
+        if value is None and read is not None:
+            value = read(path).get("couplings")
+        own = couplings_of(value, str(path))
+        if own and found and own != found:
+            raise ValueError(
+                f"{path}: couplings differ from those of {first}. One robot has one set: correct one of them."
+            )
+        found, first = (own, str(path)) if own else (found, first)
+    return found
 
 
 def without_fact_files(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
@@ -119,6 +141,8 @@ def _facts_of(recording: Recording) -> dict[str, Any]:
             facts[key] = value.tolist()
     if recording.feet:
         facts["feet"] = list(recording.feet)
+    if recording.couplings:
+        facts["couplings"] = {motor: dict(row) for motor, row in recording.couplings.items()}
     if recording.imu != ImuPose():
         imu = recording.imu
         pose = {"body": imu.body, "pos": list(imu.pos), "quat": list(imu.quat)}

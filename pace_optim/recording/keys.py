@@ -30,7 +30,7 @@ UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()} | {"temperature": "
 DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
 LOAD_FACTS = ("added_mass", "added_mass_at", *BENCH_FACTS)
-FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, *LOAD_FACTS, "feet", "imu", "comment")
+FACTS = ("name", "joint_names", "time_origin", *DRIVE_FACTS, *LOAD_FACTS, "feet", "imu", "couplings", "comment")
 
 _OTHER_WORDS = {
     "time": ("t", "timestamp", "timestamps", "stamp"),

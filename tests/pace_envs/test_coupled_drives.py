@@ -15,11 +15,13 @@ from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
 from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.robot_spec import load_robot_spec
+from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.export import export
 from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.problem.problem import load_problem
+from pace_optim.recording import load_recording, save_recording
 
 WRIST = coupled_drives.CASES[0]
 
@@ -159,6 +161,29 @@ def test_a_recording_of_joints_is_one_of_their_motors(wrist, tmp_path):
     assert torch.allclose(problem.dataset.measured, wrist.problem.dataset.measured, atol=1e-12)
     assert torch.allclose(problem.dataset.command, wrist.problem.dataset.command, atol=1e-12)
     assert "turned into their motors motor_a, motor_b" in " ".join(problem.dataset.recordings[0].notes)
+
+
+def test_a_log_states_the_motors_that_the_model_file_lacks(wrist, tmp_path):
+    """Of joints' columns; a run finds them again. A belt beside a joint's own drive has a row for that too."""
+    for case in (WRIST, coupled_drives.CASES[2]):
+        path = tmp_path / f"{case.name}.xml"
+        path.write_text(case.xml(bare=True))
+        log = coupled_drives.record(case, 0, 0.5, noise=2e-5)
+        turned = {key: log[key] @ np.linalg.inv(rows_of(case)).T for key in ("dof_pos", "des_dof_pos")}
+        file = tmp_path / f"{case.name}.npz"
+        np.savez(file, time=log["time"], joint_names=np.array(case.joints), **turned)
+        file.with_suffix(".json").write_text(json.dumps(case.facts()))
+        problem = load_problem(str(path), data=[file], drive_dt=1e-3, tell=lambda _: None)
+        assert problem.joint_names == tuple(case.rows)
+        assert np.allclose(problem.dataset.measured[:, 0].numpy(), log["dof_pos"][: len(problem.dataset.measured)])
+        record = EnvironmentRecord.of(str(path), problem.plain_cfg)
+        again = EnvironmentRecord.read(json.loads(json.dumps(record.to_dict())), str(path)).load_cfg("record")
+        assert again.sim2real.joint_order == tuple(case.rows)
+    save_recording(tmp_path / "saved.npz", load_recording(file))
+    assert load_recording(tmp_path / "saved.npz").couplings == case.rows
+    file.with_suffix(".json").write_text(json.dumps({"couplings": {"a": 2}}))
+    with pytest.raises(ValueError, match=r"expected \{motor: \{joint: ratio\}\}"):
+        load_recording(file)
 
 
 def test_a_fit_finds_the_motors(wrist):
