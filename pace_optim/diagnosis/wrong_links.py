@@ -1,4 +1,4 @@
-"""Which link of the model file is wrong, and what is wrong with it: mass, centre of mass or inertia.
+"""Which link of the model file is wrong, and what is wrong with it: mass, centre of mass, inertia, or a load it lacks.
 
 A robot's torque is linear in the pseudo-inertias of its links (:mod:`pace_envs.link_inertia`). So one set of
 derivatives along the measured motion covers all links: those of the whole robot's residuals r by the base parameters
@@ -7,6 +7,8 @@ joint. With H = JᵀJ and g = Jᵀr of the base parameters and of what is tried,
 
     Δ = gᵀ H⁻¹ g - (the same of the base parameters alone)
 
+A load at the place p of a link is one direction of its ten, [p, 1] [p, 1]ᵀ, and p is sought for the largest Δ.
+
 Parts that would explain most of the error, and more than any look-alike on a single joint, are fitted to the whole
 robot. Links are named if they lead near the noise on samples that were not fitted. A look-alike that leaves as little
 is reported instead.
@@ -14,6 +16,7 @@ is reported instead.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +39,10 @@ from pace_optim.problem.problem import Problem
 LOOK_ALIKES = ("torque_gain", "proportional_gain", "gravity_compensation", "parallel_spring", "torque_offset")
 """Effects on one joint that look like a wrong link."""
 _CHOICES = (("mass",), ("com",), ("mass", "com"), OF_BODY)
-"""What may be wrong with a link, the fewest parameters first."""
+"""What may be wrong with a link, the fewest parameters first; and it may carry a load."""
+_GRID, _STARTS, _NEAR, _FINER, _SHRINKS = 13, 8, 3, 24, 0.7
+"""Places of a load to a side of the grid, the best that are refined, and the places to a side about each of them: so
+often, each time so much nearer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +51,7 @@ class WrongLink:
 
     link: str
     parts: tuple[str, ...]
-    """Which of mass, com and inertia."""
+    """Which of mass, com and inertia; or load, which the file lacks."""
     values: list[dict[str, Any]]
     """Of each of its parameters ``parameter``, ``unit``, ``file``, ``found`` and ``std``."""
 
@@ -57,6 +63,10 @@ class WrongLink:
     @property
     def sentence(self) -> str:
         """What is wrong, in words."""
+        if self.parts == ("load",):
+            bars = (f"± {each['std']:.1g}" if math.isfinite(each["std"]) else "(not shown)" for each in self.values)
+            mass, *place = (f"{each['found']:.4g} {bar}" for each, bar in zip(self.values, bars, strict=True))
+            return f"The link {self.link} carries {mass} kg that the model file lacks, at ({', '.join(place)}) m."
         shown = [each for each in self.values if abs(each["found"] - each["file"]) > SURE * each["std"]] or self.values
         said = [
             f"{each['parameter'].removeprefix('link_').replace('_', ' ')} {each['found']:.4g} ± {each['std']:.1g} "
@@ -115,22 +125,21 @@ def find_wrong_links(
     base = _Fitted(problem, problem.space.to_normalised(physical), _held_out(problem, physical))
     if not noise > 0 or base.rmse < cfg.left * noise:
         return LinkFindings()
-    now, found, joint_of = base, tuple[Reference, ...](), dict[str, str]()
+    now, found, joint_of = base, tuple[Reference, ...](), None
     while len(found) < cfg.most and now.rmse > cfg.left * noise:
         say(f"screening the links of the model file ({len(found)} found to be wrong)")
         screened = _screened(now, found, cfg)
-        joint_of = joint_of or screened.joint_of
-        best = _best_addition(now, found, screened.links, noise, say, cfg)
+        joint_of = screened.joint_of if joint_of is None else joint_of
+        best = _best_addition(now, found, screened, noise, say, cfg)
         if best is None or best.rmse**2 > (1 - cfg.explains) * now.rmse**2 + cfg.explains * noise**2:
             break
-        now, found = best, best.problem.env_cfg.sim2real.links
+        now, found = _fit(best.problem, _values_of(best), cfg, whole=True), best.problem.env_cfg.sim2real.links
     if not found:
         return LinkFindings()
-    now = _fit(now.problem, _values_of(now), cfg, whole=True)
     if now.rmse > cfg.near * noise:
         return LinkFindings()
     say("fitting the links that may be wrong")
-    likes = _look_alikes(base, joint_of, cfg)
+    likes = _look_alikes(base, joint_of or {}, cfg)
     left = max(now.rmse, noise)
     if any(rmse * cfg.alike < left for rmse in likes.values()):
         return LinkFindings()
@@ -175,25 +184,32 @@ def _told(base: _Fitted, now: _Fitted, found: Sequence[Reference]) -> LinkFindin
 def _best_addition(
     now: _Fitted,
     found: tuple[Reference, ...],
-    candidates: Sequence[Reference],
+    screened: _Screened,
     noise: float,
     say: Callable[[str], None],
     cfg: LinksCfg,
 ) -> _Fitted | None:
-    """The model with one more wrong link that leaves least; of those alike, the one with the fewest parameters."""
-    problem, values = now.problem, _values_of(now)
-    fitted: list[tuple[int, _Fitted]] = []
-    for addition in sorted(candidates[: cfg.tried], key=lambda each: len(each.names)):
+    """The model with one more wrong link that leaves least; of those alike, the one with the fewest parameters.
+
+    A load on the axis of a joint is the same on both sides of it: of those that leave the same, the outermost.
+    """
+    problem, fitted = now.problem, list[tuple[int, _Fitted]]()
+    for addition in sorted(screened.links[: cfg.tried], key=lambda each: len(each.names)):
         if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
         say(f"fitting the links {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
+        values = _values_of(now) | screened.loads.get(addition.link, {})
         fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg)))
     if not fitted:
         return None
     least = max(min(each.rmse for _, each in fitted), noise)
     alike = [(size, each.rmse, each) for size, each in fitted if each.rmse <= cfg.alike * least]
-    return min(alike, key=lambda each: each[:2])[2] if alike else None
+    if not alike:
+        return None
+    size, rmse, _ = min(alike, key=lambda each: each[:2])
+    same = [each for own, other, each in alike if own == size and other <= cfg.same * rmse]
+    return max(same, key=lambda each: screened.order.index(each.problem.env_cfg.sim2real.links[-1].link))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +218,13 @@ class _Screened:
 
     links: list[Reference]
     """With what may be wrong about each, the most promising first."""
+    order: tuple[str, ...]
+    """All links, the outermost last."""
+    loads: dict[str, dict[str, dict[str, float]]]
+    """Where the load of a link is sought first, as values of parameters."""
     joint_of: dict[str, str]
-    """The joint on which each look-alike would explain most."""
+    """The joint on which each look-alike would explain most; none where all of them on a joint would explain too
+    little."""
 
 
 def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Screened:
@@ -211,16 +232,18 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
     problem = now.problem
     env = problem.make_env(1)
     every = sought_links(env.sim.model, problem.joint_names, [".*"])
+    body = {each.link: int(env.sim.model.body_weldid[env.sim.model.body(each.link).id]) for each in every}
     env.close()
     # what is found stays as the file has it: its parameters begin where the last round left them
     every = tuple(next((each for each in found if each.link == one.link), one) for one in every)
     had = {each.effect_class.name for each in effect_cfgs(problem.env_cfg.sim2real.effects)}
     likes = {effect: get_effect(effect).parameters for effect in LOOK_ALIKES if effect not in had}
     sizes = {effect: next(p for p in own if p.null is not None) for effect, own in likes.items()}
-    whole = problem.seeking(tuple(replace(each, names=TEN) for each in every))
+    whole = problem.seeking(tuple(replace(each, names=tuple(dict.fromkeys([*TEN, *each.names]))) for each in every))
     whole = whole.with_effects([*problem.effects, *likes])
     none = {f"{effect}.{p.name}": dict.fromkeys(problem.joint_names, p.null or 0.0) for effect, p in sizes.items()}
-    hessian, gradient, left = _look(whole, _values_in(whole, {**_values_of(now), **none}), cfg)
+    x = _values_in(whole, {**_values_of(now), **none})
+    hessian, gradient, left = _look(whole, x, cfg)
     place = {label: i for i, label in enumerate(whole.space.labels)}
     tried = {*NAMES, *(f"{effect}.{p.name}" for effect, own in likes.items() for p in own)}
     own = [i for label, i in place.items() if label.split("/")[0] not in tried]
@@ -238,20 +261,38 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
     least = cfg.explains * (left - score - noise_score(whole))
     single = max((each for gains in on_joints.values() for each in gains.values()), default=0.0)
     promising: list[tuple[float, Reference]] = []
+    loads: dict[str, dict[str, dict[str, float]]] = {}
+
+    is_fitted = left < cfg.left**2 * noise_score(whole)  # what is left where it was not fitted is no link's
+
+    def consider(explained: float, each: Reference) -> None:
+        if explained > max(least, single) and not is_fitted:
+            promising.append((explained / len(each.names) ** cfg.cost, each))
+
     for each in every:
         if any(each.link == known.link for known in found):
             continue
         for parts in _CHOICES:
             names = tuple(name for part in PARTS if part in parts for name in PARTS[part])
-            explained = gain([f"{name}/{each.link}" for name in names])
-            by_size = explained / len(names) ** cfg.cost
-            if explained > least and by_size > single:
-                promising.append((by_size, replace(each, names=names)))
+            consider(gain([f"{name}/{each.link}" for name in names]), replace(each, names=names))
+        if not any(body[each.link] == body[link] for link in loads):  # bodies that are welded carry it together
+            at = [place[f"{name}/{each.link}"] for name in TEN]
+            explained, values = _best_load(each, *_beside(hessian, gradient, own, at), whole.space.slope(x)[at])
+            loads[each.link] = {name: {each.link: value} for name, value in zip(PARTS["load"], values, strict=True)}
+            consider(explained, replace(each, names=PARTS["load"]))
     links: list[Reference] = []
     for _, each in sorted(promising, key=lambda each: -each[0]):
         if sum(each.link == other.link for other in links) < cfg.of_link:
             links.append(each)
-    return _Screened(links, {effect: max(gains, key=gains.__getitem__) for effect, gains in on_joints.items() if gains})
+    together = (
+        gain([label for effect, p in sizes.items() if (label := f"{effect}.{p.name}/{joint}") in place])
+        for joint in problem.joint_names
+    )
+    alike = {effect: gains for effect, gains in on_joints.items() if gains} if max(together) > least else {}
+    order = tuple(each.link for each in every)
+    return _Screened(
+        links, order, loads, {effect: max(gains, key=gains.__getitem__) for effect, gains in alike.items()}
+    )
 
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -268,6 +309,61 @@ def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[i
     at = torch.tensor([i for i in entries if float(hessian[i, i]) > 0])
     g = gradient[at].numpy()
     return float(g @ inverse_of(hessian[at[:, None], at].numpy())[0] @ g)
+
+
+def _beside(
+    hessian: torch.Tensor, gradient: torch.Tensor, known: Sequence[int], entries: Sequence[int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """H and g of some entries where the known ones follow, H_ee - H_ek H_kk⁻¹ H_ke and g_e - H_ek H_kk⁻¹ g_k."""
+    at, own = torch.tensor(entries), torch.tensor([i for i in known if float(hessian[i, i]) > 0])
+    follow = hessian[at[:, None], own] @ torch.as_tensor(inverse_of(hessian[own[:, None], own].numpy())[0])
+    return hessian[at[:, None], at] - follow @ hessian[own[:, None], at], gradient[at] - follow @ gradient[own]
+
+
+def _best_load(
+    reference: Reference, hessian: torch.Tensor, gradient: torch.Tensor, slope: torch.Tensor
+) -> tuple[float, list[float]]:
+    """The load on a link that would lower the score most: by how much, and its mass [kg] and place (3,) [m].
+
+    A load m at p adds m u uᵀ, u = [p, 1], to the pseudo-inertia J, which moves the ten parameters θ by m d, with d of
+    (∂J/∂θ) d = u uᵀ. To first order it lowers the score by (gᵀd)² / dᵀHd at the best mass m = -gᵀd / dᵀHd.
+
+    Args:
+        reference: The link.
+        hessian: H of its ten parameters, normalised, (10, 10).
+        gradient: g of these, (10,).
+        slope: ∂ physical / ∂ normalised of these, (10,).
+    """
+    file = torch.tensor(reference.values, dtype=torch.float64)
+    rows, columns = torch.triu_indices(4, 4)
+    of_ten = torch.func.jacrev(reference.pseudo_inertia)(file)[rows, columns, : len(TEN)]
+    turn = torch.linalg.inv(of_ten) / slope[:, None]
+    low, high = (torch.tensor(each) for each in zip(*map(reference.bounds, PARTS["load"][1:]), strict=True))
+
+    def tried(at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """By how much loads at places (…, 3) lower the score, and their masses."""
+        at = torch.cat([at, torch.ones_like(at[..., :1])], dim=-1)
+        d = (at[..., rows] * at[..., columns]) @ turn.T
+        slopes, curvatures = d @ gradient, ((d @ hessian) * d).sum(dim=-1).clamp(min=1e-300)
+        return torch.where(slopes < 0, slopes.square() / curvatures, 0.0), -slopes / curvatures
+
+    def grid(count: int) -> torch.Tensor:
+        steps = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
+        return torch.cartesian_prod(steps, steps, steps)
+
+    wide = (low + high) / 2 + (high - low) / 2 * grid(_GRID)
+    of_all = torch.linalg.lstsq(hessian @ turn, -gradient[:, None], driver="gelsd").solution[:, 0]
+    first = torch.stack([of_all[(rows == i) & (columns == 3)][0] for i in range(3)]) / of_all[-1]
+    best = wide[tried(wide)[0].topk(_STARTS).indices]
+    best = torch.cat([best, first.nan_to_num().clamp(low, high)[None]])
+    reach = (high - low) / (_GRID - 1)
+    for _ in range(_FINER):
+        near = best[:, None] + reach * grid(_NEAR)
+        best = near[torch.arange(len(best)), tried(near)[0].argmax(dim=1)]
+        reach = reach * _SHRINKS
+    falls, masses = tried(best)
+    k = int(falls.argmax())
+    return float(falls[k]), [float(masses[k]), *best[k].tolist()]
 
 
 def _look_alikes(base: _Fitted, joint_of: Mapping[str, str], cfg: LinksCfg) -> dict[str, float]:

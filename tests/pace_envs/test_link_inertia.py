@@ -15,10 +15,10 @@ from pace_actuators import IdentifiedDrives, PaceDCMotorCfg
 from pace_actuators.drive_result import LinkInertia
 from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_env_cfg
 from pace_envs.identified import use_identified
-from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, Reference
+from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, TEN, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
 from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
-from pace_optim.diagnosis.wrong_links import LinkFindings, find_wrong_links
+from pace_optim.diagnosis.wrong_links import LinkFindings, WrongLink, _best_load, find_wrong_links
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined
@@ -293,17 +293,42 @@ def test_nothing_is_sought_without_being_asked_for():
     assert env_cfg().sim2real.links == ()
 
 
+def test_a_load_is_found_among_the_ten_parameters_of_its_link():
+    """Residuals that are linear in the pseudo-inertia, as torques are: mass and place to the grid's last step."""
+    link, rng = reference("fore"), np.random.default_rng(0)
+    file = torch.tensor(link.values, dtype=torch.float64)
+    loaded = file.clone()
+    loaded[-4:] = torch.tensor([0.3, 0.05, -0.02, -0.31])
+    rows = torch.triu_indices(4, 4)
+    change = (link.pseudo_inertia(loaded) - link.pseudo_inertia(file))[rows[0], rows[1]]
+    of_ten = torch.func.jacrev(link.pseudo_inertia)(file)[rows[0], rows[1], : len(TEN)]
+    torques = torch.as_tensor(rng.normal(size=(40, 10))) / change.abs()
+    slope = torch.as_tensor(rng.uniform(0.5, 2.0, size=10))
+    jacobian, error = torques @ of_ten * slope, -torques @ change
+    explained, (mass, *place) = _best_load(link, jacobian.T @ jacobian, jacobian.T @ error, slope)
+    assert explained == pytest.approx(float(error @ error), rel=1e-3)
+    assert (mass, *place) == pytest.approx((0.3, 0.05, -0.02, -0.31), rel=0.02)
+
+
+def test_a_wrong_link_is_said_in_words():
+    value = {"parameter": "link_mass", "unit": "kg", "file": 0.8, "found": 0.92, "std": 0.001}
+    wrong = WrongLink(link="fore", parts=("mass",), values=[value])
+    said = "The model file is wrong about the link fore (mass): mass 0.92 ± 0.001 kg instead of 0.8."
+    assert (wrong.label, wrong.sentence) == ("fore@mass", said)
+
+
 @pytest.mark.slow
-def test_a_diagnosis_names_a_wrong_link_and_what_is_wrong_with_it(tmp_path, monkeypatch):
+def test_a_diagnosis_names_a_tool_that_the_file_lacks(tmp_path, monkeypatch):
     monkeypatch.setattr("pace_optim.diagnosis.wrong_links.LOOK_ALIKES", ("torque_gain",))
-    true = reference("fore").inertia({"link_mass": 0.92})
-    recording = recorded(tmp_path, {"fore": true}, noise=1e-4)
+    tool = Load(added_mass={"tool": 0.3}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
+    recording = dataclasses.replace(recorded(tmp_path, {}, tool, noise=1e-4), load=Load())
     problem = make_problem(recording, cfg=arm_cfg(tmp_path), train_fraction=0.6)
     x, _ = fit(problem)
     found = find_wrong_links(problem, problem.space.to_physical(x), cfg=LinksCfg(tried=2))
-    assert [each.label for each in found.wrong] == ["fore@mass"]
-    assert found.links["fore"].mass == pytest.approx(0.92, rel=1e-3) and found.after < 1.2e-4 < found.before
-    assert found.wrong[0].sentence.startswith("The model file is wrong about the link fore (mass): mass 0.92")
+    assert [each.label for each in found.wrong] == ["fore@load"]  # the tool is fixed to it
+    assert found.values["link_load_mass"]["fore"] == pytest.approx(0.3, rel=0.03)
+    assert found.after < 3e-4 < found.before  # a second of one motion
+    assert found.wrong[0].sentence.startswith("The link fore carries 0.") and "(not shown)" in found.wrong[0].sentence
 
 
 def test_what_one_number_on_a_joint_explains_as_well_is_no_wrong_link(tmp_path):
