@@ -176,7 +176,7 @@ class EnvironmentRecord:
 
 
 def _stated_motors(robot: Any) -> dict[str, dict[str, float]]:
-    """Motors that a robot's model file does not have, and joints of these that keep a drive of their own."""
+    """Motors that a robot's model file lacks, and joints of these that keep their drives."""
     rows = dict(robot.couplings)
     spec = read_model_file(robot.mjcf_path).spec if rows else None
     stated = {m: dict(row) for m, row in rows.items() if spec and not (spec.joint(m) or spec.tendon(m))}

@@ -66,8 +66,7 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT, motors
     Args:
         path: MJCF or URDF.
         control_dt: Time between two commands [s].
-        motors: Motors that move several joints and that the file does not have; drives that it has of these joints are
-            left out.
+        motors: Motors that move several joints and that the file lacks. Its drives of these joints are left out.
 
     Raises:
         ValueError: If the file is missing, is no model, or has no joints that a drive could move.
@@ -113,7 +112,7 @@ def cfg_from_model(
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).
         control_dt: Time between two commands [s], which no file says.
-        motors: Motors that move several joints, {motor: {joint: ratio}}, where the file does not have them.
+        motors: Motors that move several joints, {motor: {joint: ratio}}. The file lacks them.
 
     Raises:
         ValueError: If the file cannot be used; the message says what to do.
@@ -242,7 +241,7 @@ def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
 
 
 def _with_motors(names: Sequence[str], motors: Rows) -> list[str]:
-    """The names of what is driven, with motors in place of joints that they turn and that have no row of their own."""
+    """The driven names. Motors replace joints that they turn and that have no row."""
     result = list(names)
     for motor, row in motors.items():
         if motor not in result and (place := next((j for j in row if j in result and j not in motors), "")):

@@ -151,7 +151,7 @@ def _attempts(first: FitResult, folder: Path, settings: FitSettings) -> Iterator
 
 
 def _is_better(result: FitResult, first: FitResult, facts: str, progress: ProgressLine) -> bool:
-    """Whether a fit by torques is kept in place of that of positions, which is said with the reason."""
+    """Whether a fit by torques replaces that of positions; a line states the reason."""
     before, after = (1e3 * each.rmse["train"]["all"] for each in (first, result))
     said = f"With {facts.split(',')[0]} the error is {after:.4g}, not {before:.4g} mrad"
     floors = result.torque_floor

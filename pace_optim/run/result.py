@@ -70,7 +70,7 @@ class FitResult(DriveResult):
     torque_noise: dict[str, float] = field(default_factory=dict)
     """Standard deviation of the noise that they are weighed by, by joint [N m]; empty: it follows none."""
     torque_floor: dict[str, float] = field(default_factory=dict)
-    """That of their own noise, by joint [N m]: the spectrum above the motion."""
+    """Standard deviation of noise in the torques, by joint [N m]: their spectrum above the motion."""
     imu_delays: dict[str, float] = field(default_factory=dict)
     """How much later than encoders the IMU of a base that moves is read, by recording [s]: the fit reads it earlier."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)

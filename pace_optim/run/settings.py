@@ -115,8 +115,7 @@ class FitSettings:
     """Where runs are kept."""
 
     instead_of: str | None = None
-    """The run of positions alone in whose place this one, with torques, is kept if it is better; ``None``: there is
-    none."""
+    """The run of positions alone that this one, with torques, replaces if it is better; ``None`` replaces no run."""
 
     def __post_init__(self) -> None:
         """Check what can be checked without reading anything, and leave out the JSON files beside recordings.
