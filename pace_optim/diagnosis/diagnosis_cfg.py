@@ -111,6 +111,8 @@ class LinksCfg:
     explains: float = 0.3
     """A link is fitted if it would explain this part of the squared error above the noise, to first order, and is kept
     if it does: each of three wrong links may."""
+    together: float = 0.5
+    """Links are named if they explain this part of it together."""
     alike: float = 1.10
     """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
     same: float = 1.01

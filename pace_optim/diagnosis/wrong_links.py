@@ -136,7 +136,8 @@ def find_wrong_links(
         now, found = _fit(best.problem, _values_of(best), cfg, whole=True), best.problem.env_cfg.sim2real.links
     if not found:
         return LinkFindings()
-    if now.rmse > cfg.near * noise:
+    part = (base.rmse**2 - now.rmse**2) / max(base.rmse**2 - noise**2, 1e-300)
+    if now.rmse > cfg.near * noise or part < cfg.together:
         return LinkFindings()
     say("fitting the links that may be wrong")
     likes = _look_alikes(base, joint_of or {}, cfg)
