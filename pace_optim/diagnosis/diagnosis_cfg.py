@@ -119,6 +119,16 @@ class LinksCfg:
     """Errors up to this ratio apart are the same: of as many parameters, those of the outermost link are taken."""
     share: float = 0.25
     """Share of each recording that candidates are screened and compared on."""
+    places: int = 13
+    """Places to a side at which a load on a link is tried first."""
+    load_starts: int = 8
+    """The best of them that are refined ..."""
+    load_steps: int = 24
+    """... so often, ..."""
+    near_places: int = 3
+    """... each time among so many places to a side about it, ..."""
+    shrinks: float = 0.7
+    """... which are so much nearer each time."""
     step: float = 1e-2
     """Normalised step of the derivatives."""
     tried: int = 4

@@ -40,9 +40,6 @@ LOOK_ALIKES = ("torque_gain", "proportional_gain", "gravity_compensation", "para
 """Effects on one joint that look like a wrong link."""
 _CHOICES = (("mass",), ("com",), ("mass", "com"), OF_BODY)
 """What may be wrong with a link, the fewest parameters first; and it may carry a load."""
-_GRID, _STARTS, _NEAR, _FINER, _SHRINKS = 13, 8, 3, 24, 0.7
-"""Places of a load to a side of the grid, the best that are refined, and the places to a side about each of them: so
-often, each time so much nearer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +275,9 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
             consider(gain([f"{name}/{each.link}" for name in names]), replace(each, names=names))
         if not any(body[each.link] == body[link] for link in loads):  # bodies that are welded carry it together
             at = [place[f"{name}/{each.link}"] for name in TEN]
-            explained, values = _best_load(each, *_beside(hessian, gradient, own, at), whole.space.slope(x)[at])
+            explained, values = _best_load(
+                each, *_beside(hessian, gradient, own, at), whole.space.slope(x)[at], cfg=cfg
+            )
             loads[each.link] = {name: {each.link: value} for name, value in zip(PARTS["load"], values, strict=True)}
             consider(explained, replace(each, names=PARTS["load"]))
     links: list[Reference] = []
@@ -322,7 +321,7 @@ def _beside(
 
 
 def _best_load(
-    reference: Reference, hessian: torch.Tensor, gradient: torch.Tensor, slope: torch.Tensor
+    reference: Reference, hessian: torch.Tensor, gradient: torch.Tensor, slope: torch.Tensor, *, cfg: LinksCfg
 ) -> tuple[float, list[float]]:
     """The load on a link that would lower the score most: by how much, and its mass [kg] and place (3,) [m].
 
@@ -334,10 +333,12 @@ def _best_load(
         hessian: H of its ten parameters, normalised, (10, 10).
         gradient: g of these, (10,).
         slope: ∂ physical / ∂ normalised of these, (10,).
+        cfg: How finely places are tried.
     """
     file = torch.tensor(reference.values, dtype=torch.float64)
-    rows, columns = torch.triu_indices(4, 4)
-    of_ten = torch.func.jacrev(reference.pseudo_inertia)(file)[rows, columns, : len(TEN)]
+    changes = torch.func.jacrev(reference.pseudo_inertia)(file)
+    rows, columns = torch.triu_indices(*changes.shape[:2])
+    of_ten = changes[rows, columns, : len(TEN)]
     turn = torch.linalg.inv(of_ten) / slope[:, None]
     low, high = (torch.tensor(each) for each in zip(*map(reference.bounds, PARTS["load"][1:]), strict=True))
 
@@ -352,16 +353,16 @@ def _best_load(
         steps = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
         return torch.cartesian_prod(steps, steps, steps)
 
-    wide = (low + high) / 2 + (high - low) / 2 * grid(_GRID)
+    wide = (low + high) / 2 + (high - low) / 2 * grid(cfg.places)
     of_all = torch.linalg.lstsq(hessian @ turn, -gradient[:, None], driver="gelsd").solution[:, 0]
-    first = torch.stack([of_all[(rows == i) & (columns == 3)][0] for i in range(3)]) / of_all[-1]
-    best = wide[tried(wide)[0].topk(_STARTS).indices]
+    first = of_all[(columns == columns.max()) & (rows != rows.max())] / of_all[-1]
+    best = wide[tried(wide)[0].topk(cfg.load_starts).indices]
     best = torch.cat([best, first.nan_to_num().clamp(low, high)[None]])
-    reach = (high - low) / (_GRID - 1)
-    for _ in range(_FINER):
-        near = best[:, None] + reach * grid(_NEAR)
+    reach = (high - low) / (cfg.places - 1)
+    for _ in range(cfg.load_steps):
+        near = best[:, None] + reach * grid(cfg.near_places)
         best = near[torch.arange(len(best)), tried(near)[0].argmax(dim=1)]
-        reach = reach * _SHRINKS
+        reach = reach * cfg.shrinks
     falls, masses = tried(best)
     k = int(falls.argmax())
     return float(falls[k]), [float(masses[k]), *best[k].tolist()]

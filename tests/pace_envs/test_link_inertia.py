@@ -305,7 +305,7 @@ def test_a_load_is_found_among_the_ten_parameters_of_its_link():
     torques = torch.as_tensor(rng.normal(size=(40, 10))) / change.abs()
     slope = torch.as_tensor(rng.uniform(0.5, 2.0, size=10))
     jacobian, error = torques @ of_ten * slope, -torques @ change
-    explained, (mass, *place) = _best_load(link, jacobian.T @ jacobian, jacobian.T @ error, slope)
+    explained, (mass, *place) = _best_load(link, jacobian.T @ jacobian, jacobian.T @ error, slope, cfg=LinksCfg())
     assert explained == pytest.approx(float(error @ error), rel=1e-3)
     assert (mass, *place) == pytest.approx((0.3, 0.05, -0.02, -0.31), rel=0.02)
 

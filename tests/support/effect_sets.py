@@ -14,7 +14,7 @@ import torch
 from effect_envs import EFFECTS, Bench, long_chirp, null_values
 from problems import BENCH, env_cfg
 
-from pace_actuators.effects import get_effect
+from pace_actuators.effects import PROBED_STIFFNESS, get_effect
 from pace_optim.problem.parameter_space import ParameterSpace
 
 TASKS = (BENCH, "Pace-SO101-v0", "Pace-AnymalD-v0", "Pace-Go2-v0")
@@ -36,12 +36,16 @@ def draw(rng: random.Random, effects: list[str], corners: bool) -> dict[str, flo
 
 
 def rows_of(count: int, seed: int) -> list[dict[str, float]]:
-    """Sets of effects: the one that blew up first, all effects at once, elasticity with backlash, and random ones."""
+    """Sets of effects: the one that blew up first, all effects at once, elasticity with backlash, and random ones.
+
+    Without curves: their knots, drawn at random, are no physics. An inertia that a curve divides by 20 has another
+    elasticity than a transmission knows of.
+    """
     worst = {"quadratic_friction.coefficient": -1.0, "joint_elasticity.stiffness": 2e4, "joint_elasticity.damping": 0.0}
     rows: list[dict[str, float]] = [worst]
     for r in range(1, count):
         rng = random.Random(f"{seed}/{r}")
-        every = list(EFFECTS)
+        every = [name for name in EFFECTS if not get_effect(name).free_form]
         chosen = every if r % 4 == 0 else rng.sample(every, rng.randint(2, 6))
         if r % 4 == 1:
             chosen += sorted({"joint_elasticity", "backlash"} - set(chosen))
@@ -63,8 +67,11 @@ def blown_up(task: str, rows: list[dict[str, float]], seconds: float, seed: int,
         base[parameter.name] = low + part * (high - low)
     values = {}
     nulls = {key: value for name in EFFECTS for key, value in null_values(name).items()}
+    loop = min(float(drive.stiffness) for drive in cfg.scene.robot.actuators.values())
+    scaled = {f"{name}.{p.name}" for name in EFFECTS for p in get_effect(name).parameters if p.follows_loop}
     for key, null in nulls.items():
-        values[key] = torch.tensor([row.get(key, null) for row in rows], dtype=torch.float64)
+        size = loop / PROBED_STIFFNESS if key in scaled else 1.0
+        values[key] = torch.tensor([size * row.get(key, null) for row in rows], dtype=torch.float64)
     bench = Bench(list(EFFECTS), values, num_envs=len(rows), base=base, task=task)
     middle = torch.as_tensor(bench.robot.data.default_joint_pos[0]).numpy()
     targets = middle + 0.4 * long_chirp(seconds)

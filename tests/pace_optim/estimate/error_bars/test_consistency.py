@@ -88,7 +88,7 @@ def test_one_recording_has_nothing_to_disagree_with(recordings):
 
 
 def test_a_delay_longer_than_a_controller_of_another_rate_allows_is_refused(monkeypatch):
-    def cfg(task, control_dt):
+    def cfg(task, control_dt, couplings=None):
         other = env_cfg()
         other.decimation = 4
         return other
