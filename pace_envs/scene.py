@@ -20,6 +20,9 @@ from pace_envs.simulation import EnvIds, SimulationCfg, make_simulation
 class TerrainCfg(Config):
     """Flat ground."""
 
+    height: float = 0.0
+    """Of the ground [m]."""
+
     friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
     """Sliding, torsional [m] and rolling [m] friction coefficient, where the robot's geoms do not take precedence."""
 
@@ -150,6 +153,7 @@ def _add_terrain(spec: mujoco.MjSpec, cfg: TerrainCfg) -> None:
         name="terrain",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 0.05],
+        pos=[0.0, 0.0, cfg.height],
         friction=cfg.friction,
         rgba=[0.42, 0.45, 0.48, 1.0],
     )

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import torch
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.joint_units import JointType, joint_label, units_for
+from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import use_identified
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -26,8 +28,8 @@ from pace_optim.recording.dataset import make_dataset
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, rmse_by_joint
 
-_HEIGHT = 2.0
-"""How far the base is lifted, so that no leg reaches the ground [m]."""
+_DEPTH = 100.0
+"""How far the ground is below, so that no leg reaches it [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +54,9 @@ class TrainingReplay:
     replayed: Mapping[str, Mapping[str, float]]
     """The same in the training environment."""
 
+    touching: tuple[str, ...] = ()
+    """Links that touch each other where the recordings begin, as "A and B"."""
+
     @property
     def table(self) -> list[str]:
         """Its lines, one per joint."""
@@ -64,11 +69,15 @@ class TrainingReplay:
             cells = ""
             for part in parts:
                 fitted, here = self.fitted[part][name], self.replayed[part][name]
-                cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f}{100 * (here / fitted - 1):>+8.2f}%"
+                cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f} {100 * (here / fitted - 1):>+7.2f}%"
             lines.append(f"{label:<{width}}{cells}")
         lines.append(
             f"control steps: {1e3 * self.fitted_control_dt:g} ms in the fit, {1e3 * self.control_dt:g} ms here"
         )
+        if self.touching:
+            pairs = listed(self.touching, 4)
+            lines.append(f"Links of the training environment's robot touch each other and push its joints: {pairs}.")
+            lines.append("In the fit, nothing touches. Correct their shapes, or exclude the pairs in <contact>.")
         return lines
 
     def __str__(self) -> str:
@@ -114,7 +123,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
     dataset = make_dataset(trained, held_out)
     env.close()
     env = ManagerBasedRLEnv(_with_envs(env_cfg, dataset.num_recordings))
-    error = _errors(env, Rollout(env, dataset, _AsItIs()))  # type: ignore[arg-type]
+    error, touching = _errors(env, Rollout(env, dataset, _AsItIs()))  # type: ignore[arg-type]
     env.close()
     step = dataset.sampled.any(dim=1).nonzero()[:, 0]  # logs may be slower than the control step
     where = dataset.sampled[step]
@@ -129,6 +138,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
             part: rmse_by_joint(residuals, mask[step], tuple(result.joint_names))
             for part, mask in (("train", dataset.train), ("validation", dataset.validation))
         },
+        touching=touching,
     )
 
 
@@ -140,19 +150,19 @@ class _AsItIs:
 
 
 def _held_robot(fitted: PaceSim2realEnvCfg, training: ManagerBasedEnvCfg, folder: Path) -> PaceSim2realEnvCfg:
-    """The identification task with the training environment's robot, ground and physics."""
+    """The identification task with the training environment's robot and physics, and its ground far below."""
     cfg, training = copy.deepcopy(fitted), copy.deepcopy(training)
     drives = {name: _with_recorded_gains(drive, fitted) for name, drive in training.scene.robot.actuators.items()}
     training.scene.robot.actuators = drives
     use_identified(training, folder, gains=True, on_the_rig=True)
-    x, y, z = fitted.scene.robot.init_state.pos
     robot = replace(
         training.scene.robot,
         fix_base=True,
         joint_order=tuple(fitted.sim2real.joint_order),
-        init_state=replace(fitted.scene.robot.init_state, pos=(x, y, z + _HEIGHT)),
+        init_state=fitted.scene.robot.init_state,
     )
-    cfg.scene = replace(cfg.scene, robot=robot, terrain=training.scene.terrain)
+    terrain = training.scene.terrain and replace(training.scene.terrain, height=-_DEPTH)
+    cfg.scene = replace(cfg.scene, robot=robot, terrain=terrain)
     cfg.sim = training.sim
     decimations = {drive.control_decimation for drive in robot.actuators.values()}
     if len(decimations) > 1:
@@ -180,11 +190,22 @@ def _with_envs(cfg: PaceSim2realEnvCfg, num_envs: int) -> PaceSim2realEnvCfg:
     return cfg
 
 
-def _errors(env: ManagerBasedRLEnv, rollout: Rollout) -> torch.Tensor:
-    """q_sim - bias - q_measured at every step with a sample, (K, R, n) [rad]."""
+def _errors(env: ManagerBasedRLEnv, rollout: Rollout) -> tuple[torch.Tensor, tuple[str, ...]]:
+    """q_sim - bias - q_measured at every step with a sample, (K, R, n) [rad], and links that touch at the beginning."""
     robot, data = env.scene["robot"], rollout.dataset
     bias = torch.zeros(env.num_envs, robot.num_joints, dtype=torch.float64)
     for actuator in robot.actuators.values():
         bias[:, actuator.joint_indices] = actuator.encoder_bias
     rollout.start(torch.empty(1, 0), data.sampled)
-    return torch.stack([sim - bias - real for sim, real in rollout])
+    touching = _touching(env)
+    return torch.stack([sim - bias - real for sim, real in rollout]), touching
+
+
+def _touching(env: ManagerBasedRLEnv) -> tuple[str, ...]:
+    """Links of the first environment that touch each other, as "A and B"."""
+    model = env.sim.model_of(0)
+    data = mujoco.MjData(model)
+    env.sim.read_data(0, data)
+    mujoco.mj_forward(model, data)
+    bodies = [sorted(model.geom_bodyid[list(contact.geom)].tolist()) for contact in data.contact if contact.dist < 0]
+    return tuple(dict.fromkeys(" and ".join(model.body(body).name for body in pair) for pair in bodies))
