@@ -292,7 +292,8 @@ def _gravity(model: mujoco.MjModel) -> tuple[float, float, float]:
 
 
 def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, control_dt: float) -> list[str]:
-    notes = [f"home posture: {f'keyframe {key}' if key else 'all joints at 0, or in the middle of a range without it'}"]
+    middle = "0 for each joint, or the middle of its range where 0 lies outside"
+    notes = [f"home posture: {f'keyframe {key}' if key else middle}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
             f"gains, where a recording states none: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "

@@ -108,7 +108,7 @@ def pulled_notes(drives: IdentifiedDrives) -> list[str]:
     except ValueError:
         return []
     return [
-        f"the drive of {name} pulls {listed([joint for joint in row if joint != name])} too: not held; here the drive "
+        f"the drive of {name} pulls {listed([joint for joint in row if joint != name])} too: omitted; here the drive "
         "moves its joint, and the others follow."
         for name, row in couplings.items()
         if name in row and name in drives.joint_names

@@ -154,7 +154,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
     notes = []
     if not commands and drives.delay_s > 0:
         notes.append(
-            f"delay of {1e3 * drives.delay_s:.3g} ms of the controller's torque, feedback included: not held; such an "
+            f"delay of {1e3 * drives.delay_s:.3g} ms of the controller's torque, feedback included: omitted; such an "
             "actuator delays commands, which is another physics."
         )
     return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
@@ -172,9 +172,9 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
         if note := of_the_recording(kind):
             notes.append(note)
         elif kind.name in held:
-            notes.append(f"{kind.name} is held.")
+            notes.append(f"{kind.name}: in the file.")
         else:
-            notes.append(f"{kind.name} ({_what(kind)}): not held.")
+            notes.append(f"{kind.name} ({_what(kind)}): omitted. The robot moves differently without it.")
     return notes
 
 

@@ -141,18 +141,18 @@ def test_effects_that_a_joint_or_a_body_holds_move_the_model_as_in_the_identific
     bare = replay(fixed_in_the_air(export(without_effects(result), "mjcf").text), JOINTS, targets, targets[0])
     assert np.abs(found - expected).max() < error < 0.1 * np.abs(bare - expected).max()
     said = " ".join(exported.notes)
-    assert all(f"{name} is held" in said for name in names) and "not held" not in said
+    assert all(f"{name}: in the file" in said for name in names) and "omitted" not in said
     assert "measurement_delay is about the recording's time stamps" in said
     page: dict = {}
     exec(newton.text, page)
     joint, drive = page["JOINTS"][own[0]], page["DRIVES"][own[0]]
     if "parallel_spring" in names:
-        assert (joint["stiffness"], joint["rest_q"]) == (9.0, 0.4) and "parallel_spring is held" in " ".join(
+        assert (joint["stiffness"], joint["rest_q"]) == (9.0, 0.4) and "parallel_spring: in the file" in " ".join(
             newton.notes
         )
         assert drive["const_effort"] == pytest.approx(85.0 * 0.08 - 1.5)
     else:
-        assert "stiffness" not in joint and "quadratic_friction (τ - b2 v |v|): not held" in " ".join(newton.notes)
+        assert "stiffness" not in joint and "quadratic_friction (τ - b2 v |v|): omitted" in " ".join(newton.notes)
 
 
 def test_the_actuators_give_the_drives_torque(result):
