@@ -28,7 +28,9 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 
 NARROW = 1e-5
-"""Shortest normalised step, that of smooth simulations: as small as rounding allows."""
+"""Normalised step of smooth simulations: as small as rounding allows."""
+_LITTLE = 0.1
+"""Such a step moves no more than this part of the error: bounds that are far too wide make it shorter."""
 _LONGEST = 0.5
 """Longest normalised step, where the noise is the error's ..."""
 _FULL_REACH = 4.0
@@ -134,18 +136,22 @@ def stencil(
         score: The score at x [rad²].
         first: Normalised step along each entry where no principal directions are known.
     """
+    narrow = torch.full((len(x),), NARROW, dtype=torch.float64)
     if hessian is None:
         directions = torch.eye(len(x), dtype=torch.float64)
         reach = torch.full((len(x),), first, dtype=torch.float64)
     else:
+        little = _LITTLE * score**0.5
+        narrow = narrow.minimum(little / hessian.diagonal().clamp(min=1e-300).sqrt()) if score > 0 else narrow
         directions = _principal_directions(hessian, x, colouring)
         change = ((directions @ hessian) * directions).sum(dim=1).clamp(min=1e-300).sqrt()
         longest = _LONGEST * min(1.0, _FULL_REACH * noise / max(score**0.5, 1e-300))
-        reach = (min(TIMES_NOISE * noise, score**0.5) / change).clamp(NARROW, max(NARROW, longest))
+        least = (little / change).clamp(max=NARROW) if score > 0 else narrow
+        reach = (min(TIMES_NOISE * noise, score**0.5) / change).clamp(max=max(NARROW, longest)).maximum(least)
     free = torch.tensor([bool(joints) for joints in colouring.joints])
     steps = _inside(x, directions * torch.where(free, reach, 0.0)[:, None])
     vectors = [x + steps[list(entries)].sum(dim=0) for entries in colouring.colours]
-    aside = torch.where(free, torch.where(x > 0, -NARROW, NARROW), 0.0).to(x.dtype)
+    aside = torch.where(free, torch.where(x > 0, -narrow, narrow), 0.0).to(x.dtype)
     every = torch.stack([*vectors, x + aside, x + 2 * aside]).clamp(-1.0, 1.0)
     return Stencil(vectors=every, steps=steps, colouring=colouring)
 

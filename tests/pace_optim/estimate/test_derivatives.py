@@ -243,3 +243,19 @@ def test_the_noise_of_a_rattle_is_measured():
     x, colouring = torch.tensor([0.3, -0.2], dtype=torch.float64), Colouring(colours=((0,), (1,)), joints=((0,),) * 2)
     around = stencil(x, colouring)
     assert around.noise(residuals(torch.cat([x[None], around.vectors]))) == pytest.approx(0.02 / 2**0.5, rel=0.1)
+
+
+def test_bounds_that_are_far_too_wide_are_no_roughness():
+    """A URDF with limits of 1000 N m: a hundred-thousandth of the bounds was a hundred times the armature."""
+
+    def residuals(x):
+        error = torch.stack([torch.sin(1e4 * x[:, 0]), x[:, 1]], dim=1)[:, :, None, None]
+        return Residuals(error=error, where=torch.ones(2, 1, dtype=torch.bool), step=torch.arange(2))
+
+    x, colouring = torch.tensor([2e-9, 1e-4], dtype=torch.float64), Colouring(colours=((0,), (1,)), joints=((0,),) * 2)
+    hessian, score = torch.diag(torch.tensor([5e7, 0.5], dtype=torch.float64)), 5e-9
+    around = stencil(x, colouring, hessian, 0.0, score)
+    every = residuals(torch.cat([x[None], around.vectors]))
+    assert around.noise(every) < 0.01 * score**0.5
+    there = around.jacobian(every)
+    assert there.column(0)[0].item() == pytest.approx(1e4, rel=1e-3) and there.column(1)[1].item() == pytest.approx(1.0)
