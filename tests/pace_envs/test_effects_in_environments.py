@@ -93,7 +93,7 @@ def write_rows(bench, values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("integrator", "seconds"), [("implicitfast", 1.0), ("leapfrog", 1.5)]
+    ("integrator", "seconds"), [("implicitfast", 2.5), ("leapfrog", 5.0)]
 )  # the harder one for longer
 def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, seconds):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
@@ -119,7 +119,7 @@ def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, 
 @pytest.mark.parametrize("name", FAST)
 def test_the_extremes_stay_finite_on_a_robot_with_legs(name, calls, integrator):
     values, count = bounds_corners(name)
-    targets = legs_chirp(env_cfg(ANYMAL), 1.0)
+    targets = legs_chirp(env_cfg(ANYMAL), 2.0)
     base = {"armature": 0.1, "viscous_friction": 1.0, "friction": 1.0, "encoder_bias": 0.0, "delay": 1.0}
     steps = {"calls": calls, "integrator": integrator}
     reached = Bench([name], values, num_envs=count, task=ANYMAL, base=base, **steps).follow(targets)
@@ -152,7 +152,7 @@ def mechanical_energy(bench, load, base):
 
 @pytest.mark.parametrize(
     ("calls", "integrator", "seconds"),
-    [(1, "implicitfast", 2.5), (5, "implicitfast", 1.0), (2, "leapfrog", 2.5), (5, "leapfrog", 1.0)],
+    [(1, "implicitfast", 2.5), (5, "implicitfast", 2.5), (2, "leapfrog", 2.5), (5, "leapfrog", 2.5)],
 )
 def test_a_free_swing_never_gains_energy(calls, integrator, seconds):
     load = {"load_mass": 2.0, "load_length": 0.375, "arm_mass": 0.0}
@@ -177,7 +177,7 @@ def test_a_free_swing_never_gains_energy(calls, integrator, seconds):
             assert not gains, (step * DT, [values[i] for i in gains])
             lowest = torch.minimum(lowest, energy)
         bench.env.simulate(torch.zeros(len(values), 1, dtype=torch.float64))
-    held = (energy >= (1.0 - 0.04 * seconds) * start).nonzero()[:, 0].tolist()
+    held = (energy >= 0.9 * start).nonzero()[:, 0].tolist()
     assert not held, [values[i] for i in held]
     bench.env.close()
 

@@ -59,7 +59,7 @@ def told() -> StringIO:
 
 @pytest.fixture(scope="module")
 def run(log, told, tmp_path_factory):
-    """Nobody says what is fitted."""
+    """No option says what is fitted."""
     return fit_with_torques(settings(log, tmp_path_factory.mktemp("runs"), unknown=GAINS), ProgressLine(told))
 
 
