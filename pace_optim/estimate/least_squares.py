@@ -20,13 +20,15 @@ import torch
 
 from pace_actuators.files import checked
 from pace_optim.estimate.derivatives import NOISE_ROWS, Colouring, Jacobian, stencil
-from pace_optim.estimate.levenberg_marquardt import FIRST_DAMPING, LinearModel, next_damping
+from pace_optim.estimate.levenberg_marquardt import DAMPING_TRIALS, FIRST_DAMPING, LinearModel, next_damping
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
 ROUGH = 0.05
 """Part of the error from which on the simulation's own noise is notable."""
 _CREEPING = 3
 _REFUSED = 2
+_CHORDS, _SLIGHT = 10, 1e-6
+"""Steps with known derivatives at most, and the damping of the first: they are small."""
 _AS_EXPECTED = 0.5
 """Part of the expected gain that a step must bring for J to serve for another."""
 
@@ -251,10 +253,16 @@ def _iterate(
 class Step:
     """Trials of one step of a descent, at several dampings."""
 
-    def __init__(self, descent: Descent, hessian: torch.Tensor, gradient: torch.Tensor):
+    def __init__(
+        self,
+        descent: Descent,
+        hessian: torch.Tensor,
+        gradient: torch.Tensor,
+        dampings: Sequence[float] = DAMPING_TRIALS,
+    ):
         model = LinearModel(hessian, gradient)
         self.descent = descent
-        self.trials = model.trials(descent.x, descent.damping)
+        self.trials = model.trials(descent.x, descent.damping, dampings)
         self.expected = model.expected_gain(self.trials[0] - descent.x)
         """What the first of them gains where J is right [rad²]."""
 
@@ -270,6 +278,29 @@ class Step:
             descent.x, descent.scores[-1] = self.trials[best].clone(), float(scores[best])
         descent.damping = next_damping(descent.damping, best if gain > 0 else None)
         return gain, residuals.rows(best, best + 1)
+
+
+def by_chords(
+    evaluator: Evaluator, x: torch.Tensor, there: Jacobian, tolerance: float = LeastSquaresCfg.score_tolerance
+) -> tuple[torch.Tensor, Jacobian]:
+    """Steps with known derivatives, as long as they gain: where they lead, and the residuals there with these.
+
+    Args:
+        evaluator: Simulates.
+        x: Normalised, (size,).
+        there: Residuals at x, and derivatives near it.
+        tolerance: The part of the score that a step gains at least.
+    """
+    descent = Descent(x=x, damping=_SLIGHT, scores=[float(there.residuals.score[0])])
+    hessian, gradient = there.normal_equations()
+    for _ in range(_CHORDS):
+        gained, residuals = Step(descent, hessian, gradient, DAMPING_TRIALS[:2]).take(evaluator)
+        if gained > 0:
+            there = replace(there, residuals=residuals)
+            gradient = there.gradient_at(descent.x, residuals.error[0])
+        if gained <= tolerance * descent.score:
+            break
+    return descent.x, there
 
 
 def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:

@@ -220,7 +220,7 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
     """Add what depends on an assumed loop rate; take another rate where only others fit."""
     if end.problem.assumes_loop_rate:
         run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
-    rates = loop_rates(end.problem, end.x, end.jacobian, end.known)
+    rates = loop_rates(end.problem, end.x, end.jacobian, end.known, end.at.phases)
     if rates is None:
         return end
     end = replace(end, rates=rates)

@@ -11,14 +11,14 @@ import torch
 
 from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
-from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, Step
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
-_MOST_LOOKS, _MOST_STEPS = 3, 10
-"""After the first look, and with the derivatives of one."""
+_MOST_LOOKS = 3
+"""After the first."""
 _LATE = 1e-4
 """Standard deviation of the time from a row of a walk's log to the forces that act on its joints [s]."""
 _INITIAL_STEP = 1e-5
@@ -85,7 +85,7 @@ def assess(
     training = training or problem.training_evaluator()
     hessian, noise, score = (None, 0.0, 0.0) if ended is None else (ended.hessian, ended.noise, ended.score)
     own_step = ended is not None and ended.own_step
-    by_longer = ended if ended is not None and ended.stop_reason and training.looks_coarser else None
+    ended_early = ended is not None and bool(ended.stop_reason) and training.looks_coarser
     for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
         around = stencil(x, colouring, hessian, noise, score)
@@ -96,8 +96,8 @@ def assess(
         )
         there, noise, score = replace(around.jacobian(every), residuals=here), around.noise(every), float(here.score[0])
         blind, initial = hessian is None, probes.initial(every.error)
-        if by_longer is not None:
-            x, there = _gone_on(training, by_longer, x, there)
+        if ended_early:
+            x, there = by_chords(training, x, there)
         gained = score - float(there.residuals.score[0])
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break
@@ -135,20 +135,6 @@ def _assessment(
         initial=initial,
         phases=training.phases,
     )
-
-
-def _gone_on(evaluator: Evaluator, ended: Descent, x: torch.Tensor, there: Jacobian) -> tuple[torch.Tensor, Jacobian]:
-    """Steps with known derivatives, as long as they gain: where they lead, and the residuals there with these."""
-    descent = Descent(x=x, damping=ended.damping, scores=[float(there.residuals.score[0])])
-    hessian, gradient = there.normal_equations()
-    for _ in range(_MOST_STEPS):
-        gained, residuals = Step(descent, hessian, gradient).take(evaluator)
-        if gained > 0:
-            there = replace(there, residuals=residuals)
-            gradient = there.gradient_at(descent.x, residuals.error[0])
-        if gained <= LeastSquaresCfg().score_tolerance * descent.score:
-            break
-    return descent.x, there
 
 
 def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Tensor) -> np.ndarray:

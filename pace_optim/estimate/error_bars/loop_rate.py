@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import Colouring, Jacobian
+from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered
-from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.estimate.way_down import WayDownCfg
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords, least_squares
+from pace_optim.estimate.levenberg_marquardt import LinearModel
+from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -31,8 +32,11 @@ _FINEST = 5e-4
 """Physics step of all simulations at most [s], and half of the usual period: the step's error looks like a rate."""
 _COARSE = 2.0 + 1e-6
 """Times that: a longer physics step may be one that made the recordings."""
-_REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=1e-4, near_enough=1e-4)
-"""A fit with another period. Scores of rates differ by a thousandth: it goes near the end."""
+_LEFT = 3e-5
+"""Part of the score that the fit's derivatives may leave to gain with another period."""
+_SURELY = 0.1
+"""The same, as a part of what that period is worse than the best."""
+_REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=_LEFT, near_enough=_LEFT)
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
 UNEXPLAINED = 0.5
@@ -49,8 +53,8 @@ class LoopRates:
     """Candidates, the longest first [s]."""
     values: np.ndarray
     """What a fit finds with each, physical (periods, size)."""
-    weights: np.ndarray
-    """How likely each is, (periods,); their sum is 1."""
+    likelihood: np.ndarray
+    """Of each, (periods,); that of the best is 1."""
     assumed: float
     """The period that is taken where the recordings tell none [s]."""
     fitted: float
@@ -59,13 +63,24 @@ class LoopRates:
     @property
     def allowed(self) -> tuple[float, ...]:
         """Those that the recordings do not refute, the longest first: within two standard deviations of the best."""
-        least = math.exp(-0.5 * SURE**2) * self.weights.max()
-        return tuple(p for p, weight in zip(self.periods, self.weights, strict=True) if weight >= least)
+        least = math.exp(-0.5 * SURE**2)
+        return tuple(p for p, each in zip(self.periods, self.likelihood, strict=True) if each >= least)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """How probable each is, (periods,); their sum is 1.
+
+        Before the recordings, all periods are alike. A candidate stands for those that are nearest to it.
+        """
+        ends = np.array([self.periods[0], *self.periods, self.periods[-1]])
+        weights = self.likelihood * (ends[:-2] - ends[2:])
+        return weights / weights.sum() if weights.any() else np.ones(len(self.periods))
 
     @property
     def chosen(self) -> float:
-        """The fitted period where the recordings allow it, else the likeliest [s]."""
-        return self.fitted if self.fitted in self.allowed else self.periods[int(self.weights.argmax())]
+        """The fitted period where the recordings allow it, else the candidate that is nearest to the mean [s]."""
+        mean = float(self.weights @ self.periods)
+        return self.fitted if self.fitted in self.allowed else min(self.allowed, key=lambda each: abs(each - mean))
 
     @property
     def farthest(self) -> float:
@@ -130,14 +145,14 @@ def used_loop(assumed: float, used: float) -> dict[str, float]:
     return {"assumed_s": assumed, "used_s": used}
 
 
-def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray) -> LoopRates | None:
+def loop_rates(
+    problem: Problem, x: torch.Tensor, there: Jacobian, known: np.ndarray, phases: FreePhases | None = None
+) -> LoopRates | None:
     """Compare the rates that the loops may have, at a fit with one of them.
 
-    All are simulated with one physics step, and fitted again on pieces of the recordings: each from the end of the one
-    nearest to it, by derivatives of the fitted rate and the longest step. Residuals and values between the shortest
-    simulated periods follow by the polynomial through these. What was fitted alone does not tell a rate: the residuals
-    are those on all samples of the pieces, also on those kept for validation. With r those of a candidate and
-    d = r - r' their difference to the best one's,
+    All are simulated with one physics step and fitted again, each from the end of the one nearest to it, by the fit's
+    derivatives as long as they serve. Residuals and values between the shortest simulated periods follow by the
+    polynomial through these. With r the residuals of a candidate and d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
@@ -150,6 +165,7 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         x: The result, normalised (size,).
         there: Its residuals, and derivatives there, on the training samples.
         known: Which parameters have an error bar, (size,) bool; the others stay.
+        phases: What the residuals have taken out of free phases.
 
     Returns:
         What was found; ``None`` where the rate is stated, or none is better than the fit at its own, coarser physics
@@ -162,21 +178,20 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
     slower = [logged] if logged > (1 + _APART) * control else []
     fast = 0.0 if problem.delay_mode == "command" else _FAST  # a delayed torque needs a loop that holds it
     periods = sorted({control, fitted, *(p for p in (_USUAL, fast) if p < control), *slower}, reverse=True)
-    pieces, finest = problem.on_pieces(WayDownCfg().share), min(_FINEST, control / 2)
-    hessian, _ = there.normal_equations()
-    start, ends = Descent(x=x, hessian=hessian), dict[float, _Refit]()
+    finest = min(_FINEST, control / 2)
+    ends: dict[float, _Refit] = {}
     for period in sorted(periods, key=lambda each: abs(each - fitted)):
         nearest = min(ends, key=lambda other: abs(other - period), default=None)
-        begin = start if nearest is None else ends[nearest].descent
-        end = _refitted(pieces.with_loop(period, finest), pieces, begin, there.colouring)
+        begin = x if nearest is None else ends[nearest].x
+        best = min((other.score for other in ends.values()), default=float("inf"))
+        end = _refitted(problem.with_loop(period, finest), problem, begin, there, phases, best)
         if end is not None:
             ends[period] = end
         elif period == fitted:
             return None
-    if problem.physics_dt > _COARSE * finest:
-        coarse = _refitted(pieces, pieces, start, there.colouring)
-        if coarse is not None and coarse.descent.score <= min(end.descent.score for end in ends.values()):
-            return None
+    coarse = float(there.residuals.score[0])
+    if problem.physics_dt > _COARSE * finest and coarse <= min(end.score for end in ends.values()):
+        return None
     found = {period: ends[period] for period in periods if period in ends}
     nodes = tuple(found)[-3:]
     between = [1 / f for f in _RATES if 1 / f < max(nodes) and 1 / f not in found] if len(nodes) > 1 else []
@@ -188,13 +203,12 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
         else:
             row[-len(nodes) :] = _lagrange(nodes, period)
     values, errors = (np.stack([end.values for end in found.values()]), torch.stack([e.error for e in found.values()]))
-    where = found[fitted].where
+    where = there.residuals.where
     chi2 = _against(errors, weights, where, noise_score(problem) * int(where.sum()))
-    likelihood = np.exp(-0.5 * chi2)
     return LoopRates(
         periods=candidates,
         values=weights @ values,
-        weights=likelihood / likelihood.sum(),
+        likelihood=np.exp(-0.5 * chi2),
         assumed=problem.assumed_loop,
         fitted=fitted,
     )
@@ -204,25 +218,41 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
 class _Refit:
     """A fit with another period."""
 
-    descent: Descent
-    """On the training samples."""
+    x: torch.Tensor
+    """Normalised, (size,)."""
+    score: float
+    """On the training samples [rad²]."""
     values: np.ndarray
     """Physical, (size,)."""
     error: torch.Tensor
-    """On all samples, (K, R, n) [rad]."""
-    where: torch.Tensor
-    """Which samples these are, (K, R) bool."""
+    """On the training samples, (K, R, n) [rad]."""
 
 
-def _refitted(pieces: Problem, like: Problem, start: Descent, colouring: Colouring) -> _Refit | None:
-    """A fit from the end of one with another period, by derivatives like another's; ``None`` where it diverges."""
-    begin = Descent(x=start.x.clone(), hessian=start.hessian)
-    end = least_squares(pieces.evaluator_like(like), colouring, [begin], _REFIT)[0]
-    if not math.isfinite(end.score):
+def _refitted(
+    other: Problem, problem: Problem, x: torch.Tensor, there: Jacobian, phases: FreePhases | None, best: float
+) -> _Refit | None:
+    """A fit with another period from x, first by known derivatives; ``None`` where it diverges.
+
+    Args:
+        other: With that period.
+        problem: What was fitted.
+        x: Where it begins, normalised (size,).
+        there: Of the fit.
+        phases: What the residuals have taken out of free phases.
+        best: The least score that another period has [rad²].
+    """
+    evaluator, space = other.evaluator_like(problem), problem.space
+    evaluator.phases = phases
+    begin = evaluator.residuals(space.to_physical(x)[None])
+    if not bool(begin.score.isfinite()):
         return None
-    physical = pieces.space.to_physical(end.x)
-    every = pieces.evaluator().residuals(physical[None], pieces.dataset.sampled)
-    return _Refit(descent=end, values=physical.numpy(), error=every.error[0], where=every.where)
+    x, near = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
+    model, score = LinearModel(*near.normal_equations()), float(near.residuals.score)
+    if model.expected_gain(model.step(x, 0.0) - x) > max(_LEFT * score, _SURELY * (score - best)):
+        x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=model.hessian)], _REFIT)[0].x
+        near = replace(near, residuals=evaluator.residuals(space.to_physical(x)[None]))
+    residuals = near.residuals
+    return _Refit(x=x, score=float(residuals.score), values=space.to_physical(x).numpy(), error=residuals.error[0])
 
 
 def _lagrange(nodes: Sequence[float], at: float) -> np.ndarray:

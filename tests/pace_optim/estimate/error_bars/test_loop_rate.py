@@ -96,12 +96,11 @@ def test_only_drive_dt_states_a_rate():
     assert all(drive.implicit for drive in continuous.plain_cfg.scene.robot.actuators.values())
 
 
-def of(weights, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
-    weights = np.array(weights)
+def of(likelihood, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
     return LoopRates(
         periods=(0.0025, 0.001, 0.0005),
         values=np.array(values),
-        weights=weights / weights.sum(),
+        likelihood=np.array(likelihood),
         assumed=0.0025,
         fitted=0.0025,
     )
@@ -110,8 +109,8 @@ def of(weights, values=((1.0, 5.0), (0.7, 5.0), (0.6, 5.0))):
 def test_a_rate_that_the_recordings_refute_is_not_used_and_the_spread_of_the_others_is_an_error():
     undecided, decided, assumed = of([1.0, 1.0, 1.0]), of([1e-4, 1.0, 1.0]), of([1.0, 1e-9, 1e-9])
     assert (undecided.chosen, decided.chosen, assumed.chosen) == (0.0025, 0.001, 0.0025)
-    assert (decided.shares**2).sum(axis=0) == pytest.approx([0.5 * 0.1**2, 0.0], rel=1e-2)
-    assert (undecided.shares**2).sum(axis=0)[0] == pytest.approx((0.3**2 + 0.4**2) / 3)
+    assert (decided.shares**2).sum(axis=0) == pytest.approx([0.2 * 0.1**2, 0.0], rel=1e-2)
+    assert (undecided.shares**2).sum(axis=0)[0] == pytest.approx(0.5 * 0.3**2 + 0.125 * 0.4**2)
     assert (assumed.shares**2).sum() < 1e-9
     assert assumed.allowed == (0.0025,)
 
