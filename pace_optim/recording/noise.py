@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import signal
@@ -21,6 +22,7 @@ _ABOVE = 1.5
 """A spectrum this many times the noise's is motion."""
 _MOST_STEPS = 50
 _NUMERICAL = 1e-9
+_VARIANCES: WeakKeyDictionary[Recording, float] = WeakKeyDictionary()
 LEAST_NOISE = 1e-7
 """Noise of positions that is assumed where recordings have less [rad]."""
 
@@ -54,12 +56,15 @@ def noise_floor(position: np.ndarray, dt: float) -> NoiseFloor:
 
 def noise_variance(recordings: Sequence[Recording]) -> float:
     """Mean variance of the noise of recordings' positions, over recordings and joints [rad²]."""
-    squares = [
-        noise_floor(recording.dof_pos[:, j], float(np.median(np.diff(recording.time)))).sigma ** 2
-        for recording in recordings
-        for j in range(recording.dof_pos.shape[1])
-    ]
-    return float(np.mean(squares))
+    return float(np.mean([_variance(recording) for recording in recordings]))
+
+
+def _variance(recording: Recording) -> float:
+    """Of one, which is looked at once."""
+    if recording not in _VARIANCES:
+        dt = float(np.median(np.diff(recording.time)))
+        _VARIANCES[recording] = float(np.mean([noise_floor(each, dt).sigma ** 2 for each in recording.dof_pos.T]))
+    return _VARIANCES[recording]
 
 
 def with_repetitions(floors: Sequence[NoiseFloor], positions: Sequence[np.ndarray]) -> list[NoiseFloor]:

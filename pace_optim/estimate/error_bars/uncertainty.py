@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -212,23 +213,26 @@ def _from_first_sample(
     residuals, colouring = jacobian.residuals, jacobian.colouring
     size, row = len(colouring.joints), _row_of(colouring)
     total = np.zeros((size, size))
-    for moved, joints in zip(initial, initial_joints, strict=True):
-        for joint in joints:
-            # what a joint moves is its tree: the joints of the entries that move it and not all joints
-            tree = min((set(j) for j in colouring.joints if joint in j), key=len, default=set())
-            own = [entry for entry in row if tree & set(colouring.joints[entry])]
-            for r in range(residuals.num_recordings):
-                at = residuals.where[:, r]
-                if int(at.sum()) < 2:
-                    continue
-                noise = 0.5 * float(residuals.error[0, at, r, joint].diff().square().mean())
-                columns = jacobian.columns[[row[entry] for entry in own]]
-                effect = np.zeros(len(own))
-                for column in residuals.columns_of(r):
-                    both = columns[:, :, column, sorted(tree)] * moved[None, :, column, sorted(tree)]
-                    effect += both.sum(dim=(1, 2)).numpy()
-                total[np.ix_(own, own)] += noise * np.outer(effect, effect)
+    for tree in dict.fromkeys(_tree_of(joint, colouring) for joints in initial_joints for joint in joints):
+        own = [entry for entry in row if set(tree) & set(colouring.joints[entry])]
+        sets = [(i, joint) for i, joints in enumerate(initial_joints) for joint in joints if joint in tree]
+        for r in range(residuals.num_recordings):
+            at = residuals.where[:, r]
+            if int(at.sum()) < 2:
+                continue
+            effect = np.zeros((len(own), len(sets)))
+            for column, joint in itertools.product(residuals.columns_of(r), tree):
+                columns = jacobian.columns[[row[entry] for entry in own], :, column, joint]
+                effect += (columns @ initial[[i for i, _ in sets], :, column, joint].T).numpy()
+            error = residuals.error[0, at, r][:, [joint for _, joint in sets]]
+            effect *= (0.5 * error.diff(dim=0).square().mean(dim=0)).sqrt().numpy()
+            total[np.ix_(own, own)] += effect @ effect.T
     return total
+
+
+def _tree_of(joint: int, colouring: Colouring) -> tuple[int, ...]:
+    """What a joint moves: the joints of the entries that move it and not all joints."""
+    return min((moved for moved in colouring.joints if joint in moved), key=len, default=())
 
 
 def _row_of(colouring: Colouring) -> dict[int, int]:

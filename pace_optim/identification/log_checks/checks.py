@@ -204,10 +204,15 @@ def swapped(evidence: Evidence) -> Iterator[Change]:
                 ("target", view.target), ("target_vel", view.target_vel), ("feed_forward", view.feed_forward),
             )
         }  # fmt: skip
+        apart = view.position - view.target
+        crossed = np.square(view.position[:, pair] - view.target[:, other]).sum()
+        follows = crossed < np.square(apart[:, pair]).sum()  # positions the targets of the other
         for changes, what in (
             ({**measured, **commanded}, "all columns"), (measured, "the positions (dof_pos)"),
             (commanded, "the targets (des_dof_pos)"),
         ):  # fmt: skip
+            if not (follows or changes.keys() >= measured.keys() | commanded.keys()):
+                continue
             yield Change(
                 joints=(i, j),
                 view=replace(view, **changes),
