@@ -27,8 +27,10 @@ ROUGH = 0.05
 """Part of the error from which on the simulation's own noise is notable."""
 _CREEPING = 3
 _REFUSED = 2
+_FEW = DAMPING_TRIALS[:2]
+"""Dampings of steps with derivatives of another vector: they are small."""
 _CHORDS, _SLIGHT = 10, 1e-6
-"""Steps with known derivatives at most, and the damping of the first: they are small."""
+"""Such steps at most, and the damping of the first, where there are no others."""
 _AS_EXPECTED = 0.5
 """Part of the expected gain that a step must bring for J to serve for another."""
 
@@ -226,7 +228,7 @@ def _iterate(
         gain, residuals = step.take(evaluator, where)
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
-        step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]))
+        step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]), _FEW)
         if step.expected <= allowed:
             break
     gained = descent.scores[-2] - descent.scores[-1]
@@ -294,7 +296,7 @@ def by_chords(
     descent = Descent(x=x, damping=_SLIGHT, scores=[float(there.residuals.score[0])])
     hessian, gradient = there.normal_equations()
     for _ in range(_CHORDS):
-        gained, residuals = Step(descent, hessian, gradient, DAMPING_TRIALS[:2]).take(evaluator)
+        gained, residuals = Step(descent, hessian, gradient, _FEW).take(evaluator)
         if gained > 0:
             there = replace(there, residuals=residuals)
             gradient = there.gradient_at(descent.x, residuals.error[0])
