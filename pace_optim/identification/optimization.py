@@ -21,6 +21,7 @@ from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
+from pace_optim.identification.balanced_start import balanced_start
 from pace_optim.identification.setup import make_optimizer, make_searcher
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem, as_vector
@@ -396,11 +397,18 @@ class Optimization:
             end = way.near(x, NEAR)
         else:
             searches = self.settings.optimizer != "least_squares"
-            starts = self._without_effects_too(self.problem.space.start)
+            starts = self._without_effects_too(self._first())
             end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
         return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
+    def _first(self) -> torch.Tensor:
+        """What is nearer on pieces: the prior's start, or the one that the balance of torques gives."""
+        starts = torch.stack([self.problem.space.start, balanced_start(self.problem)])
+        with self._found_again(self.way.pieces):
+            scores = self.way.pieces.residuals(self.problem.space.to_physical(starts)).score
+        return starts[int(scores.nan_to_num(torch.inf).argmin())]
 
     def _without_effects_too(self, x: torch.Tensor) -> list[torch.Tensor]:
         """A start, and the same without the effects: a richer model also begins at the one that it contains."""

@@ -16,6 +16,8 @@ from pace_optim.recording import Recording
 
 _SHARE = 0.1
 """Of the torque, that each of armature, viscous and Coulomb friction takes at the start."""
+_PLACEHOLDER = 10.0
+"""Times what a drive was asked for that its effort limit may be at most."""
 _SMOOTH = 0.02
 """Positions are averaged over this time before they are differentiated [s]."""
 
@@ -61,7 +63,8 @@ def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence
 
     A model file's bounds are parts of its effort limits. Where it has none, they come from its inertia and gravity: of
     a light link with a strong drive they exclude what is there. A drive's scale then is the limit that a recording
-    states; without one, what its gains ask for at an error of half a radian, and what they did ask for.
+    states; without one, what its gains ask for at an error of half a radian, and what they did ask for. An effort limit
+    of ten times that is a placeholder: in a box of a million times a wrist's armature no derivative is right.
 
     Args:
         sim2real: The bounds and starts; changed.
@@ -69,30 +72,36 @@ def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence
         recordings: On the robot's joints, in its order.
     """
     upper = {name: sim2real.bounds[name][:, 1].clone() for name in CARRIED}
-    effort = np.max([_scale(env, sim2real, recording) for recording in recordings], axis=0)
+    least, most = np.max([_scales(env, sim2real, recording) for recording in recordings], axis=0)
     speed = np.nan_to_num(of_joints(env, "velocity_limit"), nan=np.inf)
     for j, joint in enumerate(sim2real.joint_order):
-        most = largest_parameters(float(effort[j]), float(speed[j]), is_slide=joint in sim2real.slide_joints)
+        low, high = (
+            largest_parameters(float(effort[j]), float(speed[j]), is_slide=joint in sim2real.slide_joints)
+            for effort in (least, most)
+        )
         for name in CARRIED:
-            if most[name] > upper[name][j]:
-                upper[name][j] = most[name]
-                starts = sim2real.start_params[name] | {joint: OF_BOUNDS * most[name]}  # type: ignore[operator]
+            reach = min(max(float(upper[name][j]), low[name]), high[name])
+            if reach != float(upper[name][j]):
+                upper[name][j] = reach
+                starts = sim2real.start_params[name] | {joint: OF_BOUNDS * reach}  # type: ignore[operator]
                 sim2real.start_params = {**sim2real.start_params, name: starts}
     for name, high in upper.items():
         sim2real.set_bounds(name, upper=high)
 
 
-def _scale(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> np.ndarray:
-    """Largest torque of each drive as a recording has it, (n,) [N m]; 0 where nothing states its gains."""
+def _scales(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most that a recording says of each drive's largest torque, (n,) each [N m]; 0 and infinity: nothing."""
     drive, configured = recording.drive, of_joints(env, "effort_limit")
-    limit = configured if drive.effort_limit is None else drive.effort_limit
-    stated = drive.stiffness is not None or drive.damping is not None
     length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), defaults.SLIDE_LENGTH, 1.0)
-    asked = np.zeros(len(length))
-    if stated:
+    if drive.stiffness is None and drive.damping is None:
+        asked, most = np.zeros(len(length)), np.full(len(length), np.inf)
+    else:
         kp = of_joints(env, "stiffness") if drive.stiffness is None else drive.stiffness
         asked = np.maximum(0.5 * kp * length, np.abs(asked_torque(env, recording)).max(axis=0))
-    return np.where(np.isfinite(limit), 0.0 if drive.effort_limit is None else limit, asked)
+        most = _PLACEHOLDER * asked
+    limit = configured if drive.effort_limit is None else drive.effort_limit
+    known = np.isfinite(limit) & (drive.effort_limit is not None)
+    return np.where(np.isfinite(limit), np.where(known, limit, 0.0), asked), np.where(known, np.inf, most)
 
 
 def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:

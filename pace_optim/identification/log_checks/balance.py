@@ -37,7 +37,7 @@ _FEW_ROWS = 200
 """The same of a coarse look."""
 _SELDOM = 4
 """Times as many instants where joints are free at times only."""
-_FEWEST = 60
+FEWEST = 60
 """Instants without which a joint is not judged."""
 _MOVING = 0.1
 """Of its RMS speed: slower joints may stick, and their friction is anything up to its largest."""
@@ -269,15 +269,20 @@ def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarra
         joints: By index.
         further: Torques that may have any part in each joint's, (N, n, m) [N m].
     """
-    result = {}
-    still = view.smooth((~view.used).astype(float))[links.rows] > _TOUCHED
-    held = None if view.free is None else view.smooth((~view.free).astype(float))[links.rows] > _TOUCHED
+    result, counts = {}, moving(view, links)
     for j in joints:
-        speed = np.abs(links.speed[:, j])
-        moving = ~still & (speed > _MOVING * np.sqrt(np.square(speed).mean()))
-        moving &= True if held is None else ~held[:, j]
-        if moving.sum() >= _FEWEST and (found := _balance(view, links, j, moving, further)) is not None:
+        if counts[:, j].sum() >= FEWEST and (found := _balance(view, links, j, counts[:, j], further)) is not None:
             result[j] = found
+    return result
+
+
+def moving(view: View, links: Links) -> np.ndarray:
+    """At which instants each joint counts: it moves, is free, and no sample nearby is left out; (N, n) bool."""
+    speed = np.abs(links.speed)
+    result = speed > _MOVING * np.sqrt(np.square(speed).mean(axis=0))
+    result &= (view.smooth((~view.used).astype(float))[links.rows] <= _TOUCHED)[:, None]
+    if view.free is not None:
+        result &= view.smooth((~view.free).astype(float))[links.rows] <= _TOUCHED
     return result
 
 
