@@ -29,8 +29,8 @@ _CREEPING = 3
 _REFUSED = 2
 _FEW = DAMPING_TRIALS[:2]
 """Dampings of steps with derivatives of another vector: they are small."""
-_CHORDS, _SLIGHT = 10, 1e-6
-"""Such steps at most, and the damping of the first, where there are no others."""
+_CHORDS, _SLIGHT = 5, 1e-6
+"""Such steps at most where there are no others, and the damping of the first."""
 _AS_EXPECTED = 0.5
 """Part of the expected gain that a step must bring for J to serve for another."""
 
@@ -284,25 +284,31 @@ class Step:
 
 def by_chords(
     evaluator: Evaluator, x: torch.Tensor, there: Jacobian, tolerance: float = LeastSquaresCfg.score_tolerance
-) -> tuple[torch.Tensor, Jacobian]:
-    """Steps with known derivatives, as long as they gain: where they lead, and the residuals there with these.
+) -> tuple[torch.Tensor, Jacobian, bool]:
+    """Steps with known derivatives, as long as they gain what these promise.
 
     Args:
         evaluator: Simulates.
         x: Normalised, (size,).
         there: Residuals at x, and derivatives near it.
         tolerance: The part of the score that a step gains at least.
+
+    Returns:
+        Where they lead, the residuals there with these derivatives, and whether the last step still gained.
     """
     descent = Descent(x=x, damping=_SLIGHT, scores=[float(there.residuals.score[0])])
     hessian, gradient = there.normal_equations()
     for _ in range(_CHORDS):
-        gained, residuals = Step(descent, hessian, gradient, _FEW).take(evaluator)
+        step = Step(descent, hessian, gradient, _FEW)
+        gained, residuals = step.take(evaluator)
         if gained > 0:
             there = replace(there, residuals=residuals)
             gradient = there.gradient_at(descent.x, residuals.error[0])
         if gained <= tolerance * descent.score:
+            return descent.x, there, False
+        if gained < _AS_EXPECTED * step.expected:
             break
-    return descent.x, there
+    return descent.x, there, True
 
 
 def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:

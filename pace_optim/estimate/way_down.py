@@ -38,7 +38,9 @@ class WayDownCfg:
     """Share of each recording that the pieces make."""
 
     on_pieces: LeastSquaresCfg = field(
-        default_factory=lambda: LeastSquaresCfg(max_iteration=15, score_tolerance=1e-3, target_score=1e-10)
+        default_factory=lambda: LeastSquaresCfg(
+            max_iteration=15, score_tolerance=1e-3, near_enough=3e-2, target_score=1e-10
+        )
     )
     """Descents on pieces."""
 

@@ -97,7 +97,7 @@ def assess(
         there, noise, score = replace(around.jacobian(every), residuals=here), around.noise(every), float(here.score[0])
         blind, initial = hessian is None, probes.initial(every.error)
         if ended_early:
-            x, there = by_chords(training, x, there)
+            x, there, _ = by_chords(training, x, there)
         gained = score - float(there.residuals.score[0])
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break

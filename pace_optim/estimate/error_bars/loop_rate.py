@@ -18,7 +18,6 @@ from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords, least_squares
-from pace_optim.estimate.levenberg_marquardt import LinearModel
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -34,8 +33,6 @@ _COARSE = 2.0 + 1e-6
 """Times that: a longer physics step may be one that made the recordings."""
 _LEFT = 3e-5
 """Part of the score that the fit's derivatives may leave to gain with another period."""
-_SURELY = 0.1
-"""The same, as a part of what that period is worse than the best."""
 _REFIT = LeastSquaresCfg(max_iteration=4, score_tolerance=_LEFT, near_enough=_LEFT)
 _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
@@ -183,8 +180,7 @@ def loop_rates(
     for period in sorted(periods, key=lambda each: abs(each - fitted)):
         nearest = min(ends, key=lambda other: abs(other - period), default=None)
         begin = x if nearest is None else ends[nearest].x
-        best = min((other.score for other in ends.values()), default=float("inf"))
-        end = _refitted(problem.with_loop(period, finest), problem, begin, there, phases, best)
+        end = _refitted(problem.with_loop(period, finest), problem, begin, there, phases)
         if end is not None:
             ends[period] = end
         elif period == fitted:
@@ -229,7 +225,7 @@ class _Refit:
 
 
 def _refitted(
-    other: Problem, problem: Problem, x: torch.Tensor, there: Jacobian, phases: FreePhases | None, best: float
+    other: Problem, problem: Problem, x: torch.Tensor, there: Jacobian, phases: FreePhases | None
 ) -> _Refit | None:
     """A fit with another period from x, first by known derivatives; ``None`` where it diverges.
 
@@ -239,17 +235,16 @@ def _refitted(
         x: Where it begins, normalised (size,).
         there: Of the fit.
         phases: What the residuals have taken out of free phases.
-        best: The least score that another period has [rad²].
     """
     evaluator, space = other.evaluator_like(problem), problem.space
     evaluator.phases = phases
     begin = evaluator.residuals(space.to_physical(x)[None])
     if not bool(begin.score.isfinite()):
         return None
-    x, near = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
-    model, score = LinearModel(*near.normal_equations()), float(near.residuals.score)
-    if model.expected_gain(model.step(x, 0.0) - x) > max(_LEFT * score, _SURELY * (score - best)):
-        x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=model.hessian)], _REFIT)[0].x
+    x, near, gains = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
+    if gains:
+        hessian, _ = near.normal_equations()
+        x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
         near = replace(near, residuals=evaluator.residuals(space.to_physical(x)[None]))
     residuals = near.residuals
     return _Refit(x=x, score=float(residuals.score), values=space.to_physical(x).numpy(), error=residuals.error[0])

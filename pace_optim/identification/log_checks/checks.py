@@ -194,7 +194,7 @@ def reversed_sign(evidence: Evidence) -> Iterator[Change]:
 def swapped(evidence: Evidence) -> Iterator[Change]:
     """The columns of two joints are exchanged, in all series, the positions or the targets."""
     view, doubted = evidence.view, evidence.doubted
-    every = itertools.combinations(sorted(evidence.balance), 2)
+    every, target = itertools.combinations(sorted(evidence.balance), 2), view.target[view.steps]
     for i, j in (pair for pair in every if not set(pair).isdisjoint(doubted)):  # friction may hide the fault of one
         pair, other = [i, j], [j, i]
         measured: dict[str, Any] = {"position": _column(view.position, pair, view.position[:, other])}
@@ -204,14 +204,12 @@ def swapped(evidence: Evidence) -> Iterator[Change]:
                 ("target", view.target), ("target_vel", view.target_vel), ("feed_forward", view.feed_forward),
             )
         }  # fmt: skip
-        apart = view.position - view.target
-        crossed = np.square(view.position[:, pair] - view.target[:, other]).sum()
-        follows = crossed < np.square(apart[:, pair]).sum()  # positions the targets of the other
+        crossed, own = (np.square(view.position[:, pair] - target[:, each]).sum() for each in (other, pair))
         for changes, what in (
             ({**measured, **commanded}, "all columns"), (measured, "the positions (dof_pos)"),
             (commanded, "the targets (des_dof_pos)"),
         ):  # fmt: skip
-            if not (follows or changes.keys() >= measured.keys() | commanded.keys()):
+            if crossed >= own and not changes.keys() >= measured.keys() | commanded.keys():  # none follows the other's
                 continue
             yield Change(
                 joints=(i, j),
