@@ -102,8 +102,8 @@ class Hidden:
     """Of a gear [rad]."""
 
 
-_GEAR = 3000.0, 0.5
-"""Stiffness [N m/rad] and damping [N m s/rad] of a gear with a gap."""
+_GEAR = 3000.0, 2.0
+"""Stiffness [N m/rad] and damping [N m s/rad] of teeth that touch."""
 
 
 @dataclass(kw_only=True)
@@ -171,14 +171,6 @@ class Plant:
             joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
             if gaps[i]:
                 joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
-                half = 0.5 * gaps[i]
-                gear = spec.add_tendon(
-                    name=f"{name}_gear",
-                    stiffness=[_GEAR[0], 0, 0],
-                    damping=[_GEAR[1], 0, 0],
-                    springlength=[-half, half],
-                )
-                gear.wrap_joint(f"{name}_gap", 1.0)
         for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
             spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
         return spec.compile()
@@ -189,6 +181,9 @@ class Plant:
         data = mujoco.MjData(model)
         q = np.array([model.joint(name).qposadr[0] for name in self.joints])
         v = np.array([model.joint(name).dofadr[0] for name in self.joints])
+        loose = np.flatnonzero(np.broadcast_to(self.hidden.gap, len(self.joints)))
+        gap = np.array([model.joint(f"{self.joints[i]}_gap").id for i in loose], dtype=int)
+        half = 0.5 * np.broadcast_to(self.hidden.gap, len(self.joints))[loose]
         data.qpos[q] = self.targets(0.0)
         if self.swing:
             at = model.joint("rope").qposadr[0]
@@ -228,6 +223,8 @@ class Plant:
             for _ in range(parts):
                 given += follows * (held - given)
                 data.qfrc_applied[v] = self._torque(given, data.qpos[q])
+                at, dof = model.jnt_qposadr[gap], model.jnt_dofadr[gap]
+                data.qfrc_applied[dof] = _teeth(data.qpos[at], data.qvel[dof], half)
                 mujoco.mj_step(model, data)
         if self.imu is not None:
             log["imu"] = json.dumps({"body": self.imu[0], "pos": self.imu[1]})
@@ -245,6 +242,13 @@ class Plant:
         """What the drives give, with what is hidden, (n,) [N m]."""
         own = self.hidden
         return own.gain * given + own.ripple * np.sin(own.periods * position) - own.spring * (position - own.rest)
+
+
+def _teeth(turn: np.ndarray, speed: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Torque on links that are turned against their motors, (n,) [N m]: teeth push, and nothing acts in a gap."""
+    pressed = turn - np.clip(turn, -half, half)
+    torque = -_GEAR[0] * pressed - _GEAR[1] * speed
+    return np.where(torque * pressed < 0, torque, 0.0)
 
 
 def drawn(n: int, seed: int, scale: float = 1.0) -> dict[str, np.ndarray]:
