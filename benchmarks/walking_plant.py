@@ -115,7 +115,9 @@ class Plant:
     truth: Mapping[str, np.ndarray]
     """``armature`` [kg m²], ``viscous_friction`` [N m s/rad] and ``friction`` [N m] of each joint."""
     targets: Callable[[float], np.ndarray]
-    """Positions that joints are told at a time, (n,) [rad]."""
+    """Positions that joints are told at a time, (n,) [rad]; of a policy, at the beginning alone."""
+    policy: Callable[[float, mujoco.MjData], np.ndarray] | None = None
+    """The same of a policy, which sees the simulation; ``None``: there is none."""
     feet: Mapping[str, str] = field(default_factory=dict)
     """Geom of each foot, by the foot's name; none: nothing touches the ground."""
     swing: float | None = None
@@ -216,7 +218,8 @@ class Plant:
             if feet:
                 pairs = data.contact.geom[: data.ncon] if data.ncon else np.zeros((0, 2), dtype=int)
                 log["contact"][k] = np.isin(feet, pairs)
-            log["des_dof_pos"][k] = self.targets(k * CONTROL)
+            now = k * CONTROL
+            log["des_dof_pos"][k] = self.targets(now) if self.policy is None else self.policy(now, data)
             targets.append(log["des_dof_pos"][k])
             torque = self.kp * (targets[k] - data.qpos[q]) - self.kd * data.qvel[v]
             held = np.clip(torque, -self.effort_limit, self.effort_limit)
