@@ -172,7 +172,8 @@ class Plant:
             joint.solref_friction = [2 * STEP, 1.0]
             joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
             if gaps[i]:
-                joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
+                loose = joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
+                loose.armature, loose.frictionloss, loose.damping[0] = 0.0, 0.0, 0.0  # the file's default is another's
         for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
             spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
         return spec.compile()
