@@ -102,8 +102,8 @@ class Hidden:
     """Of a gear [rad]."""
 
 
-_GEAR = 3000.0, 0.5
-"""Stiffness [N m/rad] and damping [N m s/rad] of a gear with a gap."""
+_GEAR = 3000.0, 2.0
+"""Stiffness [N m/rad] and damping [N m s/rad] of teeth that touch."""
 
 
 @dataclass(kw_only=True)
@@ -115,7 +115,9 @@ class Plant:
     truth: Mapping[str, np.ndarray]
     """``armature`` [kg m²], ``viscous_friction`` [N m s/rad] and ``friction`` [N m] of each joint."""
     targets: Callable[[float], np.ndarray]
-    """Positions that joints are told at a time, (n,) [rad]."""
+    """Positions that joints are told at a time, (n,) [rad]; of a policy, at the beginning alone."""
+    policy: Callable[[float, mujoco.MjData], np.ndarray] | None = None
+    """The same of a policy, which sees the simulation; ``None``: there is none."""
     feet: Mapping[str, str] = field(default_factory=dict)
     """Geom of each foot, by the foot's name; none: nothing touches the ground."""
     swing: float | None = None
@@ -170,15 +172,8 @@ class Plant:
             joint.solref_friction = [2 * STEP, 1.0]
             joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
             if gaps[i]:
-                joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
-                half = 0.5 * gaps[i]
-                gear = spec.add_tendon(
-                    name=f"{name}_gear",
-                    stiffness=[_GEAR[0], 0, 0],
-                    damping=[_GEAR[1], 0, 0],
-                    springlength=[-half, half],
-                )
-                gear.wrap_joint(f"{name}_gap", 1.0)
+                loose = joint.parent.add_joint(name=f"{name}_gap", axis=joint.axis, pos=joint.pos)
+                loose.armature, loose.frictionloss, loose.damping[0] = 0.0, 0.0, 0.0  # the file's default is another's
         for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
             spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
         return spec.compile()
@@ -189,6 +184,9 @@ class Plant:
         data = mujoco.MjData(model)
         q = np.array([model.joint(name).qposadr[0] for name in self.joints])
         v = np.array([model.joint(name).dofadr[0] for name in self.joints])
+        loose = np.flatnonzero(np.broadcast_to(self.hidden.gap, len(self.joints)))
+        gap = np.array([model.joint(f"{self.joints[i]}_gap").id for i in loose], dtype=int)
+        half = 0.5 * np.broadcast_to(self.hidden.gap, len(self.joints))[loose]
         data.qpos[q] = self.targets(0.0)
         if self.swing:
             at = model.joint("rope").qposadr[0]
@@ -221,13 +219,16 @@ class Plant:
             if feet:
                 pairs = data.contact.geom[: data.ncon] if data.ncon else np.zeros((0, 2), dtype=int)
                 log["contact"][k] = np.isin(feet, pairs)
-            log["des_dof_pos"][k] = self.targets(k * CONTROL)
+            now = k * CONTROL
+            log["des_dof_pos"][k] = self.targets(now) if self.policy is None else self.policy(now, data)
             targets.append(log["des_dof_pos"][k])
             torque = self.kp * (targets[k] - data.qpos[q]) - self.kd * data.qvel[v]
             held = np.clip(torque, -self.effort_limit, self.effort_limit)
             for _ in range(parts):
                 given += follows * (held - given)
                 data.qfrc_applied[v] = self._torque(given, data.qpos[q])
+                at, dof = model.jnt_qposadr[gap], model.jnt_dofadr[gap]
+                data.qfrc_applied[dof] = _teeth(data.qpos[at], data.qvel[dof], half)
                 mujoco.mj_step(model, data)
         if self.imu is not None:
             log["imu"] = json.dumps({"body": self.imu[0], "pos": self.imu[1]})
@@ -245,6 +246,13 @@ class Plant:
         """What the drives give, with what is hidden, (n,) [N m]."""
         own = self.hidden
         return own.gain * given + own.ripple * np.sin(own.periods * position) - own.spring * (position - own.rest)
+
+
+def _teeth(turn: np.ndarray, speed: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Torque on links that are turned against their motors, (n,) [N m]: teeth push, and nothing acts in a gap."""
+    pressed = turn - np.clip(turn, -half, half)
+    torque = -_GEAR[0] * pressed - _GEAR[1] * speed
+    return np.where(torque * pressed < 0, torque, 0.0)
 
 
 def drawn(n: int, seed: int, scale: float = 1.0) -> dict[str, np.ndarray]:

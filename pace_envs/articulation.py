@@ -179,6 +179,25 @@ class Articulation(RobotState):
             result[:, ids] = actuator.observe(pick(self.data.joint_pos, ids), pick(self.data.joint_vel, ids))
         return result
 
+    def held(
+        self, position: torch.Tensor, speed: torch.Tensor, free: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """State of the joints where encoders show a position [rad] and a speed [rad/s] before their bias.
+
+        What lies between encoders and joints is put there, too: write the state before the next step.
+
+        Args:
+            position: (num_envs, num_joints).
+            speed: (num_envs, num_joints).
+            free: Joints that stay as they are, (num_envs, num_joints) bool.
+        """
+        now, position, speed = self.data, position.clone(), speed.clone()
+        for actuator in self.actuators.values():
+            self._tell_link(actuator)
+            state, ids = (now.joint_pos, now.joint_vel, position, speed, free), actuator.joint_indices
+            position[:, ids], speed[:, ids] = actuator.held(*(pick(each, ids) for each in state))
+        return torch.where(free, now.joint_pos, position), torch.where(free, now.joint_vel, speed)
+
     def joint_pos_that_shows(self, encoder_pos: torch.Tensor) -> torch.Tensor:
         """Joint positions at which the encoders, just reset, show values before their bias: inverse of sensing.
 

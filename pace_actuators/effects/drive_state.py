@@ -40,6 +40,10 @@ class DriveState:
         base_friction, base_viscous_friction, base_armature: The identified base parameters.
         time: Since the session began [s].
         enabled: 1 where the drive gives torque, 0 where it is switched off.
+
+    While joints are held (``Effect.hold``):
+        held: 1 where a joint is, 0 where it is free.
+        held_pos, held_vel: What its encoder shows [rad], [rad/s]; effects change it to what the joint has.
     """
 
     joint_pos_target: torch.Tensor
@@ -68,6 +72,9 @@ class DriveState:
     base_armature: torch.Tensor
     time: torch.Tensor
     enabled: torch.Tensor
+    held: torch.Tensor
+    held_pos: torch.Tensor
+    held_vel: torch.Tensor
 
     __slots__ = tuple(f"_{name}" for name in __annotations__)
 

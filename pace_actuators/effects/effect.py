@@ -257,6 +257,9 @@ class Effect:
     def advance(self, s: DriveState) -> None:
         """Once per physics step, before all else: bring the own state to the present joint state."""
 
+    def hold(self, s: DriveState) -> None:
+        """Where encoders are held, after ``advance``: change ``s.held_pos`` and ``s.held_vel`` to the joint's."""
+
     def command(self, s: DriveState) -> None:
         """Once per run of the controller, before the command's delay: change ``s.joint_pos_target``."""
 

@@ -19,6 +19,7 @@ _IN_DRIVE = ("current_limit", "current_loop", "drive", "torque_speed")
 
 _STAGES = (
     "advance",
+    "hold",
     "command",
     "measurement",
     "sensed_velocity",
@@ -203,6 +204,25 @@ class EffectStack:
         s.motor_pos, s.motor_vel = joint_pos, joint_vel
         self.run("advance")
         self._step_begun = True
+
+    def held(
+        self,
+        joint_pos: torch.Tensor,
+        joint_vel: torch.Tensor,
+        position: torch.Tensor,
+        speed: torch.Tensor,
+        free: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Hold encoders: position [rad] and speed [rad/s] of the joints, as :meth:`PaceDCMotor.held`."""
+        self.begin_step(joint_pos, joint_vel)
+        s = self.state
+        s.held, s.held_pos, s.held_vel = torch.where(free, 0.0, 1.0), position, speed
+        s.motor_pos = torch.where(free, s.motor_pos, position)
+        s.motor_vel = torch.where(free, s.motor_vel, speed)
+        self.run("hold")
+        s.joint_pos = torch.where(free, joint_pos, s.held_pos)
+        s.joint_vel = torch.where(free, joint_vel, s.held_vel)
+        return s.joint_pos.clone(), s.joint_vel.clone()
 
     def end_step(self) -> None:
         """Let the time go on to the next instant."""

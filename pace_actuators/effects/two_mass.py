@@ -139,6 +139,18 @@ class _TwoMass(Effect):
         s.motor_pos = torch.where(self._on, self._angle, s.motor_pos)
         s.motor_vel = torch.where(self._on, self._speed, s.motor_vel)
 
+    def hold(self, s: DriveState) -> None:
+        """An encoder on the motor shows the motor: the link is beyond the transmission, and both move together."""
+        if not self._any:
+            return
+        s.held_pos -= self._side * (self._angle - s.joint_pos)
+        s.held_vel -= self._side * (self._speed - s.joint_vel)
+        moves = self._side * s.held
+        self._angle = self._angle + moves * (s.held_pos - s.joint_pos)
+        self._speed = self._speed + moves * (s.held_vel - s.joint_vel)
+        s.motor_pos = torch.where(self._on, self._angle, s.motor_pos)
+        s.motor_vel = torch.where(self._on, self._speed, s.motor_vel)
+
     def measurement(self, s: DriveState) -> None:
         """An encoder on the motor sees the motor; before the first step it is where it will stand at rest."""
         if not self._any:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from pace_envs.articulation import Articulation
 
 _DTYPES = {kind: dtype for dtype, kind in TYPES.items()}
+HELD = ("held_free", "held_position", "held_speed")
+"""Series that say where joints are free, and what encoders show where they are held."""
 _TARGETS = (("joint_vel_target", "command_vel"), ("joint_effort_target", "command_effort"))
 _LIKE_THE_FIRST = {"clone", "copy", "fill", "full_like", "masked_fill", "new_zeros", "ones_like", "zero", "zeros_like"}
 _OF_FLOATS = {"div", "atan2", *UNARY} - {"neg", "abs", "square", "sign", "sgn", "clone", "_to_copy", "relu"}
@@ -344,18 +346,23 @@ class OneJoint:
         self.robot = robot
         return robot
 
-    def control_step(self, decimation: int, commands: Commands, with_torques: bool = False) -> dict[str, Node]:
+    def control_step(
+        self, decimation: int, commands: Commands, with_torques: bool = False, hold: Callable[[], None] | None = None
+    ) -> dict[str, Node]:
         """Let the robot do a control step; returns what is shown of it (``Program.shown``).
 
         Args:
             decimation: Physics steps of a control step.
             commands: What the robot follows.
             with_torques: Whether the motor's torque is shown, too.
+            hold: Puts the joint where it is held, with :meth:`held`; ``None``: it is free.
 
         Raises:
             NotTraceableError: If something counts steps in Python.
         """
         before = self.drive.flags()
+        if hold is not None:
+            hold()
         shown = {"out": self.tracer.node(self.robot.sensed_joint_pos())}
         if commands.torque_enable is not None:
             self.drive.set_torque_enable(self.series("torque_enable"))
@@ -368,6 +375,18 @@ class OneJoint:
         if self.drive.flags() != before:
             raise NotTraceableError("a drive or an effect that counts steps in Python")
         return shown
+
+    def held(
+        self, shift: torch.Tensor | float, shift_vel: torch.Tensor | float = 0.0
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """State in which the encoder shows what it is held at, and the present one where the joint is free.
+
+        Args:
+            shift: Added to what encoders show [rad] ...
+            shift_vel: ... and to their speeds [rad/s].
+        """
+        free, position, speed = (self.series(name) for name in HELD)
+        return self.robot.held(position + shift, speed + shift_vel, free > 0.5)
 
     def series(self, name: str) -> torch.Tensor:
         """The present value of a series."""

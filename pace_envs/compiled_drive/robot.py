@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,11 +18,17 @@ if TYPE_CHECKING:
 
 STATE = ("qpos", "qvel", "qfrc_bias")
 """Fields of MuJoCo's data that drives and effects read."""
-WRITTEN = ("qvel", "qfrc_applied", "dof_armature", "dof_frictionloss", "dof_damping")
+WRITTEN = ("qpos", "qvel", "qfrc_applied", "dof_armature", "dof_frictionloss", "dof_damping")
 """Fields of MuJoCo's data and model that they write before a physics step."""
 
 
-def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor, with_torques: bool) -> Program:
+def record_drive(
+    env: ManagerBasedEnv,
+    dataset: Commands,
+    actuator: PaceDCMotor,
+    with_torques: bool,
+    shift: torch.Tensor | None = None,
+) -> Program:
     """What a control step does to the joints of a drive, in all environments.
 
     Args:
@@ -29,6 +36,7 @@ def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor,
         dataset: The recordings whose commands it follows.
         actuator: One of its robot's drives.
         with_torques: Whether the motors' torques are shown, too.
+        shift: Added to what encoders are held at, (num_envs, n, 2) [rad, rad/s]; ``None``: none is held.
 
     Raises:
         NotTraceableError: If a kernel cannot do it.
@@ -44,10 +52,17 @@ def record_drive(env: ManagerBasedEnv, dataset: Commands, actuator: PaceDCMotor,
     with joint.noting():
         sim = _Physics(joint.tracer, env.sim)
         joint.in_robot(sim, dataset)
-        shown = joint.control_step(env.cfg.decimation, dataset, with_torques)
+        hold = None if shift is None else partial(_hold, joint, sim, shift)
+        shown = joint.control_step(env.cfg.decimation, dataset, with_torques, hold)
         sim.end()
         program = joint.program(shown, sim.written)
     return program
+
+
+def _hold(joint: OneJoint, sim: _Physics, shift: torch.Tensor) -> None:
+    own = [joint.leaf(lambda i=i: shift[None, :, joint.columns, i]) for i in range(2)]  # type: ignore[misc]
+    for field, held in zip((sim.qpos, sim.qvel), joint.held(*own), strict=True):
+        field.copy_(held)
 
 
 class _Physics:

@@ -15,7 +15,7 @@ import torch
 
 from pace_envs.articulation import Articulation
 from pace_envs.compiled_drive.drive_code import Program
-from pace_envs.compiled_drive.one_joint import Commands, commands
+from pace_envs.compiled_drive.one_joint import HELD, Commands, commands
 from pace_envs.compiled_drive.robot import record_drive
 from pace_envs.compiled_drive.robot_source import ARGUMENTS, RobotSource, robot_source
 from pace_envs.compiler.host import CannotCompileError, HostKernels, mujoco_kernels
@@ -118,7 +118,8 @@ class RobotKernel:
             return
         self._flags = flags
         drives = robot.actuators.values()
-        self._programs = [record_drive(self._env, self._dataset, each, with_torques) for each in drives]
+        shift = None if self._course is None else self._course.shift
+        self._programs = [record_drive(self._env, self._dataset, each, with_torques, shift) for each in drives]
         self._source = robot_source(
             self._programs,
             robot._layout.qpos_columns,
@@ -127,8 +128,15 @@ class RobotKernel:
             mujoco.mj_versionString(),
             self._env.sim.coordinates,
         )
-        series = [commands(self._env, self._dataset, name).double() for name in self._source.series]
+        series = [self._one(name).double() for name in self._source.series]
         self._series = torch.stack(series).contiguous() if series else torch.zeros(1, dtype=torch.float64)
+
+    def _one(self, name: str) -> torch.Tensor:
+        """A series by name, (T, R, n)."""
+        if name not in HELD or self._course is None:
+            return commands(self._env, self._dataset, name)
+        position, speed = self._course.held.unbind(dim=-1)
+        return {HELD[0]: position.isnan(), HELD[1]: position.nan_to_num(), HELD[2]: speed.nan_to_num()}[name]
 
     def positions(
         self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
@@ -161,7 +169,7 @@ class RobotKernel:
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         if (course := self._course) is not None:
-            tensors |= {name: getattr(course, name) for name in ("motion", "point", "held", "shift", "push")}
+            tensors |= {name: getattr(course, name) for name in ("motion", "point", "push")}
             tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
         tensors["before"][:, 5] = env.sim.gained
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]

@@ -46,9 +46,6 @@ ARGUMENTS = {
     "point": "const double* point",  # where the specific force was measured (recordings, 3)
     "push": "const double* push",  # what is added to it and to the angular acceleration (environments, 6)
     "room": "double* room",  # (environments, 12 nbody)
-    # joints that are held, or 0
-    "held": "const double* held",  # positions and speeds (commands, recordings, joints, 2); NaN: free
-    "shift": "const double* shift",  # what is added to them (environments, joints, 2)
 }
 """What ``simulate`` gets, eight bytes each. Then the leaves of each drive, with the memory of its delays behind it."""
 
@@ -96,9 +93,8 @@ def robot_source(
     parts, names = len(programs[0].written), [drive.name for drive in drives]
     loop = []
     for part in range(parts):
-        loop += ["hold(d, robot, k, a);", "keep(m, d, robot, k, a);"] if part == 0 else []
         loop += [f"{name}_{part}(x, robot, m, d, k, a);" for name in names]
-        loop += ["if (k == a->end) break;"] if part == 0 else []
+        loop += ["keep(m, d, robot, k, a);", "if (k == a->end) break;"] if part == 0 else []
         loop += [f"advance(m, d, robot, k, {part}, a);"] if part + 1 < parts else []
     functions = "\n".join(drive.functions(at, qpos, dof) for drive, at in zip(drives, begins, strict=True))
     begin = "\n    ".join(f"{name}_begin(x, robot, m, d, 0, a);" for name in names)
@@ -117,20 +113,8 @@ static void keep(const mjModel* m, const mjData* d, long long robot, long long k
   memcpy(kept, d->qpos, m->nq * sizeof(double));
   memcpy(kept + m->nq, d->qvel, m->nv * sizeof(double));
 }}
-static const int Q[{num_joints}] = {{{", ".join(map(str, qpos.tolist()))}}};
-static const int V[{num_joints}] = {{{", ".join(map(str, dof.tolist()))}}};
 static long long row(long long robot, long long k, long long parts, long long part, const Arguments* a) {{
   return ((k < a->commands ? k : a->commands - 1) * parts + part) * a->recordings + robot % a->recordings;
-}}
-static void hold(mjData* d, long long robot, long long k, const Arguments* a) {{
-  if (!a->held) return;
-  const double* held = a->held + row(robot, k, 1, 0, a) * {2 * num_joints};
-  const double* shift = a->shift + robot * {2 * num_joints};
-  for (int j = 0; j < {num_joints}; ++j, held += 2, shift += 2) {{
-    if (held[0] != held[0]) continue;
-    d->qpos[Q[j]] = held[0] + shift[0];
-    d->qvel[V[j]] = held[1] + shift[1];
-  }}
 }}
 {SOURCE}
 {turns}
@@ -261,9 +245,12 @@ class _Drive:
         if node.operation == "physics":
             written = self._program.written[node.index].items()
             return " ".join(
-                f"{_WHERE[name]}->{name}[{self.name}_V[j]] = {self._code.of(value)};" for name, value in written
+                f"{_WHERE[name]}->{name}[{self._place(name)}] = {self._code.of(value)};" for name, value in written
             )
         name = (*STATE, *WRITTEN)[node.index]
         if name not in STATE:
             raise NotTraceableError(f"MuJoCo's {name}, which is read")
-        return f"d->{name}[{self.name}_{'Q' if name == 'qpos' else 'V'}[j]]"
+        return f"d->{name}[{self._place(name)}]"
+
+    def _place(self, field: str) -> str:
+        return f"{self.name}_{'Q' if field == 'qpos' else 'V'}[j]"

@@ -417,17 +417,14 @@ class Rollout:
         self.env.simulate(self._rows(data.command[k]))
 
     def hold(self, step: int) -> None:
-        """Put joints that are not free to where they were measured at a control step."""
+        """Put joints that are not free to where encoders show what was measured at a control step."""
         if self._course is None:
             return
         held = self._course.held[min(step, len(self._course.held) - 1)].repeat(self.num_candidates, 1, 1)
-        wanted, now = held + self._course.shift, self.robot.data
         free = held[..., 0].isnan()
         if not bool(free.all()):
-            position, speed = wanted.unbind(dim=-1)
-            self.robot.write_joint_state_to_sim(
-                torch.where(free, now.joint_pos, position), torch.where(free, now.joint_vel, speed)
-            )
+            position, speed = (held + self._course.shift).nan_to_num().unbind(dim=-1)
+            self.robot.write_joint_state_to_sim(*self.robot.held(position, speed, free))
 
     def _course_of(self, dataset: Dataset) -> Course | None:
         """How the base moves and joints are held, as the simulation wants it."""

@@ -15,9 +15,6 @@ from pace_optim.joints.simulation.simulation import TwinSimulation
 if TYPE_CHECKING:
     from pace_optim.problem.rollout import Rollout
 
-HELD = ("held_free", "held_position", "held_speed")
-"""Series that say where joints are held, and where they are free."""
-
 
 def record(rollout: Rollout, actuator: PaceDCMotor, rows: range) -> Program:
     """What a control step does to joints of a drive in some rows, in all of which the same effects act.
@@ -36,13 +33,14 @@ def record(rollout: Rollout, actuator: PaceDCMotor, rows: range) -> Program:
         sim = _simulation(joint, cast(TwinSimulation, rollout.env.sim))
     with joint.noting():
         robot = joint.in_robot(sim, rollout.dataset)
-        if rollout.dataset.carried is not None:
-            free, position, speed = (joint.series(name) for name in HELD)
-            position = position + joint.drive.encoder_bias
-            for field, held in ((sim.qpos, position), (sim.qvel, speed)):
-                sim._set(field, torch.where(free > 0.5, sim._joints(field), held))
+
+        def hold() -> None:
+            for field, held in zip((sim.qpos, sim.qvel), joint.held(joint.drive.encoder_bias), strict=True):
+                sim._set(field, held)
             robot._refresh()
-        shown = joint.control_step(rollout.env.cfg.decimation, rollout.dataset)
+
+        is_held = rollout.dataset.carried is not None
+        shown = joint.control_step(rollout.env.cfg.decimation, rollout.dataset, hold=hold if is_held else None)
         return joint.program(shown)
 
 

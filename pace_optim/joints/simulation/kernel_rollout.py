@@ -12,8 +12,8 @@ import torch
 
 from pace_envs.compiled_drive.drive_code import Program
 from pace_envs.compiled_drive.joint_source import joint_source
-from pace_envs.compiled_drive.one_joint import commands
-from pace_optim.joints.simulation.kernel_recorder import HELD, record
+from pace_envs.compiled_drive.one_joint import HELD, commands
+from pace_optim.joints.simulation.kernel_recorder import record
 from pace_optim.problem.rollout import between_steps
 
 if TYPE_CHECKING:
