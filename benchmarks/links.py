@@ -97,7 +97,7 @@ CASES = (
     Case("panda", (Wrong("mass", "link4"),)),
     Case("bolt", (Wrong("mass", "FL_LOWER_LEG"),)),
     Case("ur5e", (Wrong("com", "upper_arm_link", (0.02, 0.0, 0.0)),)),
-    Case("panda", (Wrong("com", "link2", (0.0, 0.0, 0.02)),)),
+    Case("panda", (Wrong("com", "link2", (0.02, 0.0, 0.0)),)),
     Case("bolt", (Wrong("com", "FL_UPPER_LEG", (0.02, 0.0, 0.0)),)),
     Case("ur5e", (Wrong("tool", "wrist_3_link", UR5E_TOOL),)),
     Case("panda", (Wrong("tool", "link7", PANDA_TOOL),)),

@@ -132,6 +132,15 @@ def find_wrong_links(
         if best is None or best.rmse**2 > (1 - own.explains) * now.rmse**2 + own.explains * noise**2:
             break
         now, found = _fit(best.problem, _values_of(best), own, whole=True), best.problem.env_cfg.sim2real.links
+    for each in found[:-1]:  # it was chosen beside errors that later ones explain
+        say(f"choosing again beside the others: {each.link}")
+        others = tuple(other for other in found if other != each)
+        without = _fit(base.problem.seeking(others), _values_of(now), own)
+        best = _best_addition(without, others, _screened(without, others, cfg), noise, say, cfg)
+        if best is not None and best.problem.env_cfg.sim2real.links[-1].link != each.link:
+            again = _fit(best.problem, _values_of(best), own, whole=True)
+            if again.rmse <= own.same * now.rmse:
+                now, found = again, best.problem.env_cfg.sim2real.links
     if not found:
         return LinkFindings()
     part = (base.rmse**2 - now.rmse**2) / max(base.rmse**2 - noise**2, 1e-300)
