@@ -70,9 +70,10 @@ class JudgingCfg:
 class VerdictCfg:
     """Whether a name is earned (``judging.naming``), and what a curve must show."""
 
-    most: float = 0.5
-    """An effect must explain this part of what lies above the floor without it, and wrong links together. A curve says
-    more where it leaves less than this part of what effects leave, and an effect dominates above this share."""
+    most: float = 0.75
+    """An effect must explain this part of the squared error above the floor without it, so that it halves the error;
+    wrong links together, and a curve too. A curve takes the place of effects where it does so to what they leave. An
+    effect dominates above this share."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15

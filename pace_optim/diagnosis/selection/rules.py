@@ -124,7 +124,7 @@ def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     ((name, after),), facts = decision.after.items(), decision.facts
     pays = judge(decision.before, after, 0, facts["candidates"], facts["first"], cfg=cfg.judging).significant
     left, base = (max(0.0, mse - facts["floor"] ** 2) for mse in (float(after.mse), facts["base"]))
-    says_more = facts["first"] or left < cfg.verdict.most * facts["left"]
+    says_more = facts["first"] or left < (1 - cfg.verdict.most) * facts["left"]
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 
