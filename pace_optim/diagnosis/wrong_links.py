@@ -371,8 +371,9 @@ def _best_load(
     reach = ((high - low) / (cfg.places - 1)).expand_as(best)
     while float(reach.max()) > cfg.load_place:
         near = (best[:, None] + reach[:, None] * near_by).clamp(low, high)
-        fall, at = tried(near)[0].max(dim=1)
-        moves = (fall > tried(best)[0])[:, None]
+        falls = tried(near)[0]
+        fall, at = falls.max(dim=1)
+        moves = (fall > (1 + 1e-9) * falls[:, len(near_by) // 2])[:, None]  # rounding alone would go on for ever
         best = torch.where(moves, near[torch.arange(len(best)), at], best)
         reach = torch.where(moves, reach, reach / 2)
     falls, masses = tried(best)
