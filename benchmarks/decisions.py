@@ -2,13 +2,14 @@
 
 python benchmarks/hidden_effects.py --cases effects,clean --seeds 5
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl
-python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --number alike=1.05 --number next_effect=1.15
+python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --numbers judging.alike=1.05 verdict.bars=0
 python benchmarks/decisions.py logs/hidden_effects/*/*.jsonl --save reference.jsonl.gz
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import gzip
 import json
 from collections import Counter, defaultdict
@@ -27,15 +28,23 @@ def main() -> None:
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="decisions of diagnoses, or a saved file")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write them all to one compressed file")
     parser.add_argument(
-        "--number", action="append", default=[], metavar="NAME=VALUE", help="another value of a field of JudgingCfg"
+        "--numbers", nargs="+", default=[], metavar="PART.NAME=VALUE", help="other values of fields of DiagnosisCfg"
     )
     args = parser.parse_args()
-    numbers = dict(each.split("=") for each in args.number)
-    cfg = replace(DEFAULT, judging=replace(DEFAULT.judging, **{name: float(value) for name, value in numbers.items()}))
+    cfg = with_numbers(DEFAULT, args.numbers)
     cases = read_cases(args.files)
     if args.save is not None:
         save_cases(cases, args.save)
     print(table(cases, cfg))
+
+
+def with_numbers(cfg: DiagnosisCfg, numbers: Sequence[str]) -> DiagnosisCfg:
+    """A configuration with other numbers, each as ``judging.alike=1.05``, or a Python tuple of them."""
+    for each in numbers:
+        place, value = each.split("=")
+        part, name = place.split(".")
+        cfg = replace(cfg, **{part: replace(getattr(cfg, part), **{name: ast.literal_eval(value)})})
+    return cfg
 
 
 def read_cases(files: Sequence[Path]) -> dict[str, list[Decision]]:

@@ -16,9 +16,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from decisions import with_numbers
 from hidden_effects_cases import GROUPS, ROBOTS, Job, make_jobs, run_job
 from hidden_effects_table import make_table
 from workers import pinned_pool
+
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
@@ -50,6 +53,7 @@ def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", default="effects,clean,outside,pairs,harmonic", help=f"of {', '.join(GROUPS)}")
+    parser.add_argument("--only", nargs="+", metavar="EFFECT", help="cases that hide one of these (default: all)")
     parser.add_argument("--seeds", type=int, default=5, help="cases of each kind")
     parser.add_argument("--first_seed", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--recordings", choices=("battery", "chirp"), default="battery")
@@ -57,6 +61,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--max_effects", type=int, default=3, help="how many the diagnosis may add")
     parser.add_argument("--off", nargs="+", default=[], metavar="RULE", help="rules to switch off")
+    parser.add_argument(
+        "--numbers", nargs="+", default=[], metavar="PART.NAME=VALUE", help="other numbers, as judging.alike=1.05"
+    )
     parser.add_argument("--physics_dt", type=float, default=0.00125, help="of the model [s]")
     parser.add_argument(
         "--ratio",
@@ -81,12 +88,14 @@ def main() -> None:
                 args.folder / f"{args.robot}_{args.recordings}",
                 physics_dt=args.physics_dt,
                 max_effects=args.max_effects,
-                off=tuple(args.off),
+                cfg=with_numbers(DiagnosisCfg(off=tuple(args.off)), args.numbers),
                 ratio=tuple(args.ratio) if args.ratio else None,
                 device=args.device,
             )
         except ValueError as error:
             sys.exit(f"error: {error}")
+        if args.only:
+            jobs = [job for job in jobs if set(args.only) & set(job.case.effects)]
         run_all(jobs, results, args.workers, args.limit)
     print(make_table(read_results(results)))
 

@@ -55,8 +55,8 @@ class Job:
     """Of the model [s]."""
     max_effects: int = 3
     """How many effects the diagnosis may add."""
-    off: tuple[str, ...] = ()
-    """Rules of the diagnosis that are switched off."""
+    cfg: DiagnosisCfg = DEFAULT
+    """Its numbers and rules."""
     device: str = "cpu"
     """Where single joints are simulated."""
     ratio: tuple[float, float] | None = None
@@ -65,7 +65,7 @@ class Job:
     @property
     def fits(self) -> Fits:
         """What fits models there."""
-        return fits_on(self.device, DEFAULT.fitting)
+        return fits_on(self.device, self.cfg.fitting)
 
 
 def make_jobs(
@@ -127,9 +127,8 @@ def run_case(job: Job) -> dict[str, Any]:
     middle = problem.space.to_physical(problem.space.start)
     decisions: list[Decision] = []
     fits = job.fits
-    cfg = DiagnosisCfg(off=job.off)
     found = search_effects(
-        problem, middle, candidate_effects(), job.max_effects, log=decisions.append, cfg=cfg, fits=fits
+        problem, middle, candidate_effects(), job.max_effects, log=decisions.append, cfg=job.cfg, fits=fits
     )
     diagnosed = time.perf_counter()
     job.folder.parent.mkdir(parents=True, exist_ok=True)

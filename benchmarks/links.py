@@ -4,6 +4,7 @@
     python benchmarks/links.py --only ur5e         # of some robots
     python benchmarks/links.py --table             # of what is done
     python benchmarks/links.py --labels torque     # with measured torques and without stated gains
+    python benchmarks/links.py --workers 16        # so many cases at once
 
 Plants are plain MuJoCo robots of public wheels (`wheel_plant.py`, which shares no code with the project): PD loops at
 1 kHz, encoder noise of 0.1 mrad. The plant has the file's links; the fit gets a copy of the file with one or two
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -29,6 +31,7 @@ import mujoco
 import numpy as np
 from wheel_plant import Drives, Plant, commands, draw, load, log
 from wheel_robots import CACHE, GROUPS, ROOT, Robot, _write_log, model_file
+from workers import pinned_pool
 
 from pace_optim.diagnosis.wrong_links import find_wrong_links
 from pace_optim.run.open import open_problem
@@ -52,7 +55,9 @@ class Wrong:
     """``mass``, ``com`` or ``tool``."""
     link: str
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How far the file's centre of mass is from the true one; where a tool's 0.5 kg sit, in the link's frame [m]."""
+    """How far the file's centre of mass is from the true one; where a tool sits, in the link's frame [m]."""
+    kg: float = 0.5
+    """Mass of a tool."""
 
     @property
     def label(self) -> str:
@@ -85,18 +90,18 @@ class Case:
         return tuple(each for each in self.wrong if each.kind == "tool")
 
 
-TOO_HEAVY, TOOL = 1.15, 0.5
+TOO_HEAVY = 1.15
 UR5E_TOOL, PANDA_TOOL = (0.0, 0.178, 0.0), (0.0, 0.0, 0.187)
 CASES = (
     Case("ur5e", (Wrong("mass", "forearm_link"),)),
     Case("panda", (Wrong("mass", "link4"),)),
     Case("bolt", (Wrong("mass", "FL_LOWER_LEG"),)),
     Case("ur5e", (Wrong("com", "upper_arm_link", (0.02, 0.0, 0.0)),)),
-    Case("panda", (Wrong("com", "link2", (0.0, 0.0, 0.02)),)),
+    Case("panda", (Wrong("com", "link2", (0.02, 0.0, 0.0)),)),
     Case("bolt", (Wrong("com", "FL_UPPER_LEG", (0.02, 0.0, 0.0)),)),
     Case("ur5e", (Wrong("tool", "wrist_3_link", UR5E_TOOL),)),
     Case("panda", (Wrong("tool", "link7", PANDA_TOOL),)),
-    Case("bolt", (Wrong("tool", "FL_LOWER_LEG", (0.0, 0.02, -0.12)),)),
+    Case("bolt", (Wrong("tool", "FL_LOWER_LEG", (0.0, 0.008, -0.2), 0.03),)),  # at the foot of a robot of 1.3 kg
     Case("ur5e", (Wrong("com", "upper_arm_link", (0.02, 0.0, 0.0)), Wrong("mass", "forearm_link"))),
     Case("panda", (Wrong("mass", "link4"), Wrong("tool", "link7", PANDA_TOOL))),
     Case("bolt", (Wrong("mass", "FL_LOWER_LEG"), Wrong("com", "FR_UPPER_LEG", (0.02, 0.0, 0.0)))),
@@ -114,8 +119,9 @@ def wrong_file(case: Case, cache: Path) -> Path:
     for each in errors:
         _make_wrong(tree, each, path.suffix == ".urdf")
     wrong = path.with_name(f"{path.stem}_{case.name}{path.suffix}")
-    tree.write(wrong)
-    return wrong
+    partial = wrong.with_name(f"{wrong.name}.{os.getpid()}")  # another process may make it too
+    tree.write(partial)
+    return partial.rename(wrong)
 
 
 def _make_wrong(tree: ElementTree.ElementTree, error: Wrong, urdf: bool) -> None:
@@ -147,15 +153,15 @@ def true_plant(case: Case, path: Path) -> Plant:
         mujoco.mju_quat2Mat(turn, model.body_iquat[b])
         turn = turn.reshape(3, 3)
         inertia = turn @ np.diag(model.body_inertia[b]) @ turn.T
-        centre = (before * com + TOOL * np.array(tool.at)) / (before + TOOL)
-        for mass, place in ((before, com), (TOOL, np.array(tool.at))):
+        centre = (before * com + tool.kg * np.array(tool.at)) / (before + tool.kg)
+        for mass, place in ((before, com), (tool.kg, np.array(tool.at))):
             arm = place - centre
             inertia = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         moments, axes = np.linalg.eigh(inertia)
         axes[:, 0] *= np.sign(np.linalg.det(axes))
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, axes.ravel())
-        model.body_mass[b], model.body_ipos[b] = before + TOOL, centre
+        model.body_mass[b], model.body_ipos[b] = before + tool.kg, centre
         model.body_inertia[b], model.body_iquat[b] = moments, quat
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return plant
@@ -328,24 +334,40 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="print what is done, run nothing")
     parser.add_argument("--fits", action="store_true", help="fit only, name no links yet")
     parser.add_argument("--cache", type=Path, default=CACHE)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
     args = parser.parse_args()
     done = args.cache / "results_links.jsonl"
-    for case in () if args.table else CASES:
-        if case.robot not in args.only or case.kind not in args.kinds:
-            continue
-        for label in args.labels:
-            if label == "links" and not case.wrong:
-                continue
-            # a search by CMA-ES cannot mend a wrong file
-            options = ["--optimizer", "least_squares"]
-            if label != "file" and case.wrong:
-                options += ["--links", *(each.label for each in case.wrong)]
-            row = run_case(case, options, label, label == "file" and not args.fits, args.cache)
-            rows = [json.loads(line) for line in done.read_text().splitlines()] if done.is_file() else []
-            rows = [r for r in rows if (r["robot"], r["case"], r["label"]) != (case.robot, case.name, label)] + [row]
-            done.write_text("".join(json.dumps(r) + "\n" for r in rows))
+    jobs = [
+        (case, label, label == "file" and not args.fits, args.cache)
+        for case in (() if args.table else CASES)
+        if case.robot in args.only and case.kind in args.kinds
+        for label in args.labels
+        if label != "links" or case.wrong
+    ]
+    logs = {(case.robot, case.tools, case.seed, label == "torque"): (case, label) for case, label, *_ in jobs}
+    jobs.sort(key=lambda job: job[0].kind == "clean")  # the shortest last
+    for robot in {case.robot for case, *_ in jobs}:
+        model_file(ROBOTS[robot], args.cache)
+    with pinned_pool(args.workers) as pool, done.open("a", encoding="utf-8") as file:
+        pool.starmap(make_logs, [(case, args.cache, label == "torque") for case, label in logs.values()], 1)
+        for row in pool.imap_unordered(_run, jobs):
+            file.write(json.dumps(row) + "\n")
+            file.flush()
             print(json.dumps(row), flush=True)
-    print(table([json.loads(line) for line in done.read_text().splitlines()] if done.is_file() else []))
+    lines = (json.loads(line) for line in done.read_text(encoding="utf-8").splitlines())
+    print(table(list({(row["robot"], row["case"], row["label"]): row for row in lines}.values())))
+
+
+def _run(job: tuple[Case, str, bool, Path]) -> dict:
+    """One case with one label."""
+    case, label, name, cache = job
+    options = ["--optimizer", "least_squares"]  # a search by CMA-ES cannot mend a wrong file
+    if label != "file" and case.wrong:
+        options += ["--links", *(each.label for each in case.wrong)]
+    try:
+        return run_case(case, options, label, name, cache)
+    except Exception as error:  # one case must not end the others
+        return {"robot": case.robot, "case": case.name, "label": label, "exit": f"{type(error).__name__}: {error}"}
 
 
 if __name__ == "__main__":

@@ -39,6 +39,23 @@ class LinkInertia:
     """xx, yy, zz, xy, xz, yz about the centre of mass, (6,) [kg m²]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CommandTiming:
+    """When commands came that a log stamps by a separate clock, against an even timer."""
+
+    interval_s: float
+    """From one tick of the timer to the next [s]."""
+
+    early_s: float
+    """One command in twenty came this much or more before its tick [s]."""
+
+    late_s: float
+    """One command in twenty came this much or more after its tick [s]."""
+
+    lost: float
+    """Part of the ticks without a command."""
+
+
 @dataclass(kw_only=True)
 class DriveResult:
     """What an identification says of the drives; field names are the file's keys."""
@@ -68,6 +85,9 @@ class DriveResult:
     """Labels of what ended at a bound."""
     times_noise: float | None = None
     """The training error as a multiple of the measurement noise; ``None``: it is not known."""
+
+    command_timing: CommandTiming | None = None
+    """When the recordings' commands came; ``None``: no log stamps them separately, or they follow no timer."""
 
     environment: dict[str, Any] = field(default_factory=dict)
     """Where the environment of the identification comes from: its code and files, by digest."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pace_actuators.base_parameters import PER_JOINT
-from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia, result_path
+from pace_actuators.drive_result import ALL, CURE, CommandTiming, DriveResult, LinkInertia, result_path
 from pace_actuators.effects import EffectCfg, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
@@ -95,6 +95,9 @@ class IdentifiedDrives:
     times_noise: float | None = None
     """The fit's error as a multiple of the measurement noise; ``None``: it is not known."""
 
+    command_timing: CommandTiming | None = None
+    """When the recordings' commands came; ``None``: it is not known."""
+
     environment: Mapping[str, Any] = field(default_factory=dict)
     """Where the environment of the identification comes from: its code and files, by digest."""
 
@@ -133,6 +136,7 @@ class IdentifiedDrives:
             undetermined=frozenset(content.undetermined),
             at_bound=tuple(content.at_bound),
             times_noise=content.times_noise,
+            command_timing=content.command_timing,
             environment=content.environment,
         )
         result._check()

@@ -92,8 +92,9 @@ Others are similar in part, especially in narrow recordings:
 Give a joint only one of the last three: each replaces the simulator's Coulomb friction. `soft_friction` is not the
 physics of a drive but of MuJoCo's solver. Use it for recordings from MuJoCo.
 
-No smooth model finds a delay that jitters, dropped commands or coarse quantisation. They are qualities of the
-recording and raise the noise.
+No effect finds commands that jitter or are lost, or coarse quantisation. Where a log stamps its commands by a separate
+clock (`des_time`), the fit holds each command from its own stamp, and reports jitter and losses. Elsewhere they raise
+the noise.
 """
 
 

@@ -61,7 +61,7 @@ def diagnose(
     values = {name: result.parameters[name] for name in whole.space.slices}
     wrong = LinkFindings()
     if settings.links and not whole.joints_stand_alone:  # there an effect on the joint says the same
-        wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, settings.cfg.links)
+        wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, cfg=settings.cfg)
     problem = _as_found(whole, result).with_effects(()).with_links(wrong.links).on_positions()
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)

@@ -50,16 +50,14 @@ class JudgingCfg:
     """Chance of a false alarm over all that was tried."""
     alike: float = 1.10
     """Models up to this ratio apart are alike: the first effect must bring more, and effects within it are
-    reported together. An error within it of the floor is at the floor."""
+    reported together. Of these, the simplest is taken: with the fewest parameters, or with one value for all joints.
+    An error within it of the floor is at the floor."""
     next_effect: float = 1.25
     """What each further effect must bring: nearer to the floor than this none could."""
     clear: float = 1.5
     """A fall that is this large only needs t > ``clear_t``."""
     clear_t: float = 2.0
     """See ``clear``."""
-    as_good: float = 1.025
-    """A simpler model is as good up to this ratio: the effect with the fewest parameters is chosen, joints share one
-    value, and a way with fewer parameters is taken."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
     to this ratio apart. A joint is held at the robot's delay where a separate delay leaves an error this many times
@@ -72,9 +70,10 @@ class JudgingCfg:
 class VerdictCfg:
     """Whether a name is earned (``judging.naming``), and what a curve must show."""
 
-    most: float = 0.5
-    """An effect must explain this part of what lies above the floor without it. A curve says more where it leaves less
-    than this part of what effects leave, and an effect dominates above this share."""
+    most: float = 0.75
+    """An effect must explain this part of the squared error above the floor without it, so that it halves the error;
+    wrong links together, and a curve too. A curve takes the place of effects where it does so to what they leave. An
+    effect dominates above this share."""
     bars: float = 5.0
     """So many of its error bars an effect's size is away from none, ..."""
     uneven: float = 0.15
@@ -102,19 +101,11 @@ RULES = (
 
 @dataclass(frozen=True, kw_only=True)
 class LinksCfg:
-    """Numbers of the search for wrong links; ratios are of RMSE."""
+    """Numbers of the search for wrong links, beside those of :class:`JudgingCfg` and :class:`VerdictCfg`."""
 
-    left: float = 1.15
-    """At this many times the noise nothing is left to look for."""
-    near: float = 3.0
-    """Links are named if at most this many times the noise is left: it is what an effect must lead to, too."""
     explains: float = 0.3
     """A link is fitted if it would explain this part of the squared error above the noise, to first order, and is kept
     if it does: each of three wrong links may."""
-    together: float = 0.5
-    """Links are named if they explain this part of it together."""
-    alike: float = 1.10
-    """Errors up to this ratio apart are alike: the candidate with the fewest parameters is taken."""
     same: float = 1.01
     """Errors up to this ratio apart are the same: of as many parameters, those of the outermost link are taken."""
     share: float = 0.25
@@ -122,13 +113,9 @@ class LinksCfg:
     places: int = 13
     """Places to a side at which a load on a link is tried first."""
     load_starts: int = 8
-    """The best of them that are refined ..."""
-    load_steps: int = 24
-    """... so often, ..."""
-    near_places: int = 3
-    """... each time among so many places to a side about it, ..."""
-    shrinks: float = 0.7
-    """... which are so much nearer each time."""
+    """The best of them that are refined, ..."""
+    load_place: float = 1e-4
+    """... until their neighbours are this near [m]."""
     step: float = 1e-2
     """Normalised step of the derivatives."""
     tried: int = 4

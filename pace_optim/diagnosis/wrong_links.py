@@ -28,7 +28,7 @@ from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import effect_cfgs, get_effect
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
-from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, LinksCfg
 from pace_optim.estimate.derivatives import Colouring, colour, stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
@@ -107,7 +107,8 @@ def find_wrong_links(
     problem: Problem,
     physical: torch.Tensor,
     say: Callable[[str], None] = lambda _: None,
-    cfg: LinksCfg | None = None,
+    *,
+    cfg: DiagnosisCfg = DEFAULT,
 ) -> LinkFindings:
     """Look for links whose inertial parameters the model file states wrongly.
 
@@ -115,33 +116,42 @@ def find_wrong_links(
         problem: The whole robot, no link sought.
         physical: Its parameters as they were fitted, (size,).
         say: Shows how far it is.
-        cfg: Its numbers.
+        cfg: By what numbers it is decided.
     """
-    cfg = cfg or LinksCfg()
+    own, alike = cfg.links, cfg.judging.alike
     noise = (noise_score(problem) / len(problem.joint_names)) ** 0.5
     base = _Fitted(problem, problem.space.to_normalised(physical), _held_out(problem, physical))
-    if not noise > 0 or base.rmse < cfg.left * noise:
+    if not noise > 0 or base.rmse < alike * noise:
         return LinkFindings()
     now, found, joint_of = base, tuple[Reference, ...](), None
-    while len(found) < cfg.most and now.rmse > cfg.left * noise:
+    while len(found) < own.most and now.rmse > alike * noise:
         say(f"screening the links of the model file ({len(found)} found to be wrong)")
         screened = _screened(now, found, cfg)
         joint_of = screened.joint_of if joint_of is None else joint_of
         best = _best_addition(now, found, screened, noise, say, cfg)
-        if best is None or best.rmse**2 > (1 - cfg.explains) * now.rmse**2 + cfg.explains * noise**2:
+        if best is None or best.rmse**2 > (1 - own.explains) * now.rmse**2 + own.explains * noise**2:
             break
-        now, found = _fit(best.problem, _values_of(best), cfg, whole=True), best.problem.env_cfg.sim2real.links
+        now, found = _fit(best.problem, _values_of(best), own, whole=True), best.problem.env_cfg.sim2real.links
+    for each in found[:-1]:  # it was chosen beside errors that later ones explain
+        say(f"choosing again beside the others: {each.link}")
+        others = tuple(other for other in found if other != each)
+        without = _fit(base.problem.seeking(others), _values_of(now), own)
+        best = _best_addition(without, others, _screened(without, others, cfg), noise, say, cfg)
+        if best is not None and best.problem.env_cfg.sim2real.links[-1].link != each.link:
+            again = _fit(best.problem, _values_of(best), own, whole=True)
+            if again.rmse <= own.same * now.rmse:
+                now, found = again, best.problem.env_cfg.sim2real.links
     if not found:
         return LinkFindings()
     part = (base.rmse**2 - now.rmse**2) / max(base.rmse**2 - noise**2, 1e-300)
-    if now.rmse > cfg.near * noise or part < cfg.together:
+    if now.rmse > cfg.judging.far * noise or part < cfg.verdict.most:
         return LinkFindings()
     say("fitting the links that may be wrong")
-    likes = _look_alikes(base, joint_of or {}, cfg)
+    likes = _look_alikes(base, joint_of or {}, own)
     left = max(now.rmse, noise)
-    if any(rmse * cfg.alike < left for rmse in likes.values()):
+    if any(rmse * alike < left for rmse in likes.values()):
         return LinkFindings()
-    if likes := {name: rmse for name, rmse in likes.items() if rmse <= cfg.alike * left}:
+    if likes := {name: rmse for name, rmse in likes.items() if rmse <= alike * left}:
         names = ", ".join(reference.link for reference in found)
         return LinkFindings(
             sentences=[
@@ -185,28 +195,28 @@ def _best_addition(
     screened: _Screened,
     noise: float,
     say: Callable[[str], None],
-    cfg: LinksCfg,
+    cfg: DiagnosisCfg,
 ) -> _Fitted | None:
     """The model with one more wrong link that leaves least; of those alike, the one with the fewest parameters.
 
     A load on the axis of a joint is the same on both sides of it: of those that leave the same, the outermost.
     """
-    problem, fitted = now.problem, list[tuple[int, _Fitted]]()
-    for addition in sorted(screened.links[: cfg.tried], key=lambda each: len(each.names)):
-        if any(size < len(addition.names) and each.rmse <= cfg.left * noise for size, each in fitted):
+    problem, fitted, alike = now.problem, list[tuple[int, _Fitted]](), cfg.judging.alike
+    for addition in sorted(screened.links[: cfg.links.tried], key=lambda each: len(each.names)):
+        if any(size < len(addition.names) and each.rmse <= alike * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
         say(f"fitting the links {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
         values = _values_of(now) | screened.loads.get(addition.link, {})
-        fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg)))
+        fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg.links)))
     if not fitted:
         return None
     least = max(min(each.rmse for _, each in fitted), noise)
-    alike = [(size, each.rmse, each) for size, each in fitted if each.rmse <= cfg.alike * least]
-    if not alike:
+    near = [(size, each.rmse, each) for size, each in fitted if each.rmse <= alike * least]
+    if not near:
         return None
-    size, rmse, _ = min(alike, key=lambda each: each[:2])
-    same = [each for own, other, each in alike if own == size and other <= cfg.same * rmse]
+    size, rmse, _ = min(near, key=lambda each: each[:2])
+    same = [each for own, other, each in near if own == size and other <= cfg.links.same * rmse]
     return max(same, key=lambda each: screened.order.index(each.problem.env_cfg.sim2real.links[-1].link))
 
 
@@ -225,7 +235,7 @@ class _Screened:
     little."""
 
 
-def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Screened:
+def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: DiagnosisCfg) -> _Screened:
     """Links that would explain most of the error, and more than any effect on a single joint does."""
     problem = now.problem
     env = problem.make_env(1)
@@ -241,7 +251,7 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
     whole = whole.with_effects([*problem.effects, *likes])
     none = {f"{effect}.{p.name}": dict.fromkeys(problem.joint_names, p.null or 0.0) for effect, p in sizes.items()}
     x = _values_in(whole, {**_values_of(now), **none})
-    hessian, gradient, left = _look(whole, x, cfg)
+    hessian, gradient, left = _look(whole, x, cfg.links)
     place = {label: i for i, label in enumerate(whole.space.labels)}
     tried = {*NAMES, *(f"{effect}.{p.name}" for effect, own in likes.items() for p in own)}
     own = [i for label, i in place.items() if label.split("/")[0] not in tried]
@@ -256,16 +266,16 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
     for effect, p in sizes.items():
         labels = {joint: f"{effect}.{p.name}/{joint}" for joint in problem.joint_names}
         on_joints[effect] = {joint: gain([label]) for joint, label in labels.items() if label in place}
-    least = cfg.explains * (left - score - noise_score(whole))
+    least = cfg.links.explains * (left - score - noise_score(whole))
     single = max((each for gains in on_joints.values() for each in gains.values()), default=0.0)
     promising: list[tuple[float, Reference]] = []
     loads: dict[str, dict[str, dict[str, float]]] = {}
 
-    is_fitted = left < cfg.left**2 * noise_score(whole)  # what is left where it was not fitted is no link's
+    is_fitted = left < cfg.judging.alike**2 * noise_score(whole)  # what is left where it was not fitted is no link's
 
     def consider(explained: float, each: Reference) -> None:
         if explained > max(least, single) and not is_fitted:
-            promising.append((explained / len(each.names) ** cfg.cost, each))
+            promising.append((explained / len(each.names) ** cfg.links.cost, each))
 
     for each in every:
         if any(each.link == known.link for known in found):
@@ -276,13 +286,13 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: LinksCfg) -> _Scr
         if not any(body[each.link] == body[link] for link in loads):  # bodies that are welded carry it together
             at = [place[f"{name}/{each.link}"] for name in TEN]
             explained, values = _best_load(
-                each, *_beside(hessian, gradient, own, at), whole.space.slope(x)[at], cfg=cfg
+                each, *_beside(hessian, gradient, own, at), whole.space.slope(x)[at], cfg=cfg.links
             )
             loads[each.link] = {name: {each.link: value} for name, value in zip(PARTS["load"], values, strict=True)}
             consider(explained, replace(each, names=PARTS["load"]))
     links: list[Reference] = []
     for _, each in sorted(promising, key=lambda each: -each[0]):
-        if sum(each.link == other.link for other in links) < cfg.of_link:
+        if sum(each.link == other.link for other in links) < cfg.links.of_link:
             links.append(each)
     together = (
         gain([label for effect, p in sizes.items() if (label := f"{effect}.{p.name}/{joint}") in place])
@@ -349,20 +359,23 @@ def _best_load(
         slopes, curvatures = d @ gradient, ((d @ hessian) * d).sum(dim=-1).clamp(min=1e-300)
         return torch.where(slopes < 0, slopes.square() / curvatures, 0.0), -slopes / curvatures
 
-    def grid(count: int) -> torch.Tensor:
-        steps = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
+    def grid(steps: torch.Tensor) -> torch.Tensor:
         return torch.cartesian_prod(steps, steps, steps)
 
-    wide = (low + high) / 2 + (high - low) / 2 * grid(cfg.places)
+    fine = torch.linspace(-1.0, 1.0, cfg.places, dtype=torch.float64)
+    wide, near_by = (low + high) / 2 + (high - low) / 2 * grid(fine), grid(torch.tensor([-1.0, 0.0, 1.0]).double())
     of_all = torch.linalg.lstsq(hessian @ turn, -gradient[:, None], driver="gelsd").solution[:, 0]
     first = of_all[(columns == columns.max()) & (rows != rows.max())] / of_all[-1]
     best = wide[tried(wide)[0].topk(cfg.load_starts).indices]
     best = torch.cat([best, first.nan_to_num().clamp(low, high)[None]])
-    reach = (high - low) / (cfg.places - 1)
-    for _ in range(cfg.load_steps):
-        near = best[:, None] + reach * grid(cfg.near_places)
-        best = near[torch.arange(len(best)), tried(near)[0].argmax(dim=1)]
-        reach = reach * cfg.shrinks
+    reach = ((high - low) / (cfg.places - 1)).expand_as(best)
+    while float(reach.max()) > cfg.load_place:
+        near = (best[:, None] + reach[:, None] * near_by).clamp(low, high)
+        falls = tried(near)[0]
+        fall, at = falls.max(dim=1)
+        moves = (fall > (1 + 1e-9) * falls[:, len(near_by) // 2])[:, None]  # rounding alone would go on for ever
+        best = torch.where(moves, near[torch.arange(len(best)), at], best)
+        reach = torch.where(moves, reach, reach / 2)
     falls, masses = tried(best)
     k = int(falls.argmax())
     return float(falls[k]), [float(masses[k]), *best[k].tolist()]

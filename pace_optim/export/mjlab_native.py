@@ -100,9 +100,22 @@ def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> dict[str
     for parameter, name in names.items():
         if not is_undetermined(drives, parameter, joint):
             values[name] = drives.values(parameter, [joint])[joint]
-    steps = round(drive.delay_s / drives.at.physics_dt)
-    lags = {"delay_min_lag": steps, "delay_max_lag": steps} if steps else {}
-    return {"target_names_expr": (_expression(joint),), **{name: digits(v) for name, v in values.items()}, **lags}
+    return {
+        "target_names_expr": (_expression(joint),),
+        **{name: digits(v) for name, v in values.items()},
+        **_lags(drives, drive),
+    }
+
+
+def _lags(drives: IdentifiedDrives, drive: PlainDrive) -> dict[str, int | bool]:
+    """Delay and jitter of commands in physics steps; one that jitters is drawn again with each command."""
+    dt, timing = drives.at.physics_dt, drives.command_timing
+    early, late = (0.0, 0.0) if timing is None else (timing.early_s, timing.late_s)
+    least, most = max(0, round((drive.delay_s - early) / dt)), round((drive.delay_s + late) / dt)
+    lags: dict[str, int | bool] = {"delay_min_lag": least, "delay_max_lag": most} if most else {}
+    if timing is not None and most > least:
+        lags |= {"delay_update_period": max(1, round(timing.interval_s / dt)), "delay_per_env_phase": False}
+    return lags
 
 
 def _expression(joint: str) -> str:
@@ -115,6 +128,8 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
     most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
     notes.append(f"encoder bias (up to {most:.3g} rad): add EVENTS to the environment's events.")
     notes.append("Coulomb friction is soft by default: call write_joints(spec) in your spec_fn, for springs too.")
+    if drives.command_timing is not None and drives.command_timing.lost > 0:
+        notes.append(f"{100 * drives.command_timing.lost:.2g} % of the commands were lost: mjlab loses none.")
     rates = {drive.run_dt for drive in plain.values()}
     if 0.0 in rates and any(drive.has_line for drive in plain.values()):
         notes.append(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+
+from pace_actuators.drive_result import CommandTiming
 
 from .data import Recording
 from .keys import COMMAND_SERIES
@@ -15,6 +18,8 @@ GRID_COMMANDS = {"des_dof_pos": "command", "des_dof_vel": "command_vel", "des_do
 """The field of a conformed recording that holds each command on the control grid."""
 _EVEN = 2e-3
 """An interval this near to a tenth of a millisecond or to a whole number of Hz is that."""
+_FOLLOWS = 0.1
+"""Part of a command's deviation by which the ticks that are counted follow the timer, whose rate is not known yet."""
 
 
 def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
@@ -80,3 +85,52 @@ def command_interval(recording: Recording) -> float:
     interval = float(np.median(np.diff(instants[new] if len(new) > 1 else instants)))
     even = min((1 / max(1, round(1 / interval)), round(interval, 4)), key=lambda each: abs(each - interval))
     return even if abs(even / interval - 1) < _EVEN else interval
+
+
+def command_timing(recordings: Iterable[Recording]) -> CommandTiming | None:
+    """When commands came against an even timer, over recordings whose commands have a separate clock.
+
+    The k-th tick of a timer is at t₀ + k T. Ticks are counted along the stamps, and a straight line through them gives
+    t₀ and T. What a stamp is off by is jitter; a tick without a stamp is a lost command.
+
+    Args:
+        recordings: As `load_recording` gives them.
+
+    Returns:
+        ``None`` where none has such stamps, or where they follow no timer: nine in ten lie further apart than half
+        an interval.
+    """
+    off, steps, ticks, came = list[np.ndarray](), list[float](), 0, 0
+    for own in (each.des_time for each in recordings):
+        if own is None or len(own) < 3:
+            continue
+        interval = float(np.median(np.diff(own)))
+        count, at = np.zeros(len(own)), own[0]
+        for k in range(1, len(own)):
+            passed = round((own[k] - at) / interval)
+            at += passed * interval
+            at += _FOLLOWS * (own[k] - at)
+            count[k] = count[k - 1] + passed
+        step, start = np.polyfit(count, own - own[0], 1)
+        off.append(own - own[0] - start - step * count)
+        steps.append(float(step))
+        ticks, came = ticks + int(count[-1]) + 1, came + len(np.unique(count))
+    if not off:
+        return None
+    interval = float(np.median(steps))
+    early, late = (float(each) for each in np.quantile(np.concatenate(off), (0.05, 0.95)))
+    if late - early > interval / 2:
+        return None
+    return CommandTiming(interval_s=interval, early_s=-early, late_s=late, lost=1 - came / ticks)
+
+
+def timing_note(recording: Recording) -> str:
+    """When the commands of a recording came, in a sentence; "" where it does not stamp them."""
+    timing = command_timing([recording])
+    if timing is None:
+        return ""
+    every, early, late = 1e3 * timing.interval_s, 1e3 * timing.early_s, 1e3 * timing.late_s
+    return (
+        f"Commands came every {every:.4g} ms, nine in ten from {early:.2g} ms before to {late:.2g} ms after their "
+        f"tick, and {100 * timing.lost:.2g} % are lost: each is held from its own stamp."
+    )

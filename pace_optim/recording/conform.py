@@ -12,7 +12,7 @@ from pace_actuators.joint_units import JointType
 from pace_actuators.text import listed
 
 from .checks import MIN_SAMPLES, refuse_uncommanded
-from .commands import GRID_COMMANDS, command_interval, commands_on_grid
+from .commands import GRID_COMMANDS, command_interval, commands_on_grid, timing_note
 from .data import Drive, Recording
 from .keys import CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES
 from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
@@ -96,7 +96,7 @@ def conform_recording(
         sample_stride=base.sample_stride,
         command_dt=command_interval(recording),
         logged=None if base.exact and recording.des_time is None else recording,
-        notes=(*recording.notes, *base.notes, *notes),
+        notes=(*recording.notes, *base.notes, *filter(None, [timing_note(recording)]), *notes),
     )
 
 

@@ -24,6 +24,7 @@ from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
+from pace_optim.recording.commands import command_timing
 from pace_optim.recording.dataset import Torques
 from pace_optim.recording.notes import notes_by_kind
 
@@ -301,6 +302,7 @@ def make_result(
         links=_found_links(problem, values),
         file_values=_file_values(problem),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
+        command_timing=command_timing(each.logged for each in data.recordings if each.logged is not None),
         **facts,
     )
     gains = identified_gains(problem.env_cfg, data.recordings, problem.unknown, values, open_, result.unit_of)

@@ -17,7 +17,7 @@ from pace_envs import ArticulationCfg, ManagerBasedRLEnv, SimulationCfg, load_en
 from pace_envs.identified import use_identified
 from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, TEN, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
-from pace_optim.diagnosis.diagnosis_cfg import LinksCfg
+from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg, LinksCfg
 from pace_optim.diagnosis.wrong_links import LinkFindings, WrongLink, _best_load, find_wrong_links
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
@@ -324,7 +324,7 @@ def test_a_diagnosis_names_a_tool_that_the_file_lacks(tmp_path, monkeypatch):
     recording = dataclasses.replace(recorded(tmp_path, {}, tool, noise=1e-4), load=Load())
     problem = make_problem(recording, cfg=arm_cfg(tmp_path), train_fraction=0.6)
     x, _ = fit(problem)
-    found = find_wrong_links(problem, problem.space.to_physical(x), cfg=LinksCfg(tried=2))
+    found = find_wrong_links(problem, problem.space.to_physical(x), cfg=DiagnosisCfg(links=LinksCfg(tried=2)))
     assert [each.label for each in found.wrong] == ["fore@load"]  # the tool is fixed to it
     assert found.values["link_load_mass"]["fore"] == pytest.approx(0.3, rel=0.03)
     assert found.after < 3e-4 < found.before  # a second of one motion

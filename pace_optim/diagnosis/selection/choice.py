@@ -32,17 +32,14 @@ def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judgi
     for j, close in enumerate(near):
         if close:
             most = max(wanted[trial.effect] for trial in close)
-            best = _simplest([trial for trial in close if wanted[trial.effect] == most], cfg.as_good)
+            best = min((t for t in close if wanted[t.effect] == most), key=_parameters_and_error)
             alike = [trial.effect for trial in close if within(trial.mse_after, best.mse_after, cfg.alike)]
             chosen[j], rivals[j] = best.effect, [effect for effect in alike if effect is not best.effect]
     return Round(trials=ordered, chosen=chosen, rivals=rivals)
 
 
-def _simplest(trials: Sequence[Trial], ratio: float) -> Trial:
-    """The best trial of a joint, or one with fewer parameters that is as good."""
-    least = min(t.mse_after for t in trials)
-    alike = [t for t in trials if within(t.mse_after, least, ratio)]
-    return min(alike, key=lambda t: (len(t.effect.parameters), t.mse_after))
+def _parameters_and_error(trial: Trial) -> tuple[int, float]:
+    return len(trial.effect.parameters), trial.mse_after
 
 
 def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]:

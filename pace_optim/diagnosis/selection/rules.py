@@ -75,7 +75,7 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
 def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """One value for all joints, where that is as good over all of them."""
     ((name, after),) = decision.after.items()
-    taken = within(float(after.mse.sum()), float(decision.before.mse.sum()), cfg.judging.as_good)
+    taken = within(float(after.mse.sum()), float(decision.before.mse.sum()), cfg.judging.alike)
     return [name if taken else None for _ in decision.joints]
 
 
@@ -83,7 +83,7 @@ def _echo(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """An effect that a joint can do without, as another joint of its tree has it."""
     ((name, after),) = decision.after.items()
     errors = zip(after.mse.tolist(), decision.before.mse.tolist(), strict=True)
-    return [name if within(without, having, cfg.judging.as_good) else None for without, having in errors]
+    return [name if within(without, having, cfg.judging.alike) else None for without, having in errors]
 
 
 def _trim(decision: Decision, cfg: DiagnosisCfg) -> Taken:
@@ -110,7 +110,7 @@ def beats(way: Mapping[str, Any], other: Mapping[str, Any], *, cfg: JudgingCfg =
     own, others = (sum(len(get_effect(name).parameters) for name in each["effects"]) for each in (way, other))
     if set(way["effects"]) == set(other["effects"]) or own > others:
         return not within(other["mse"], way["mse"], cfg.alike)
-    return within(way["mse"], other["mse"], cfg.as_good) if own < others else way["mse"] < other["mse"]
+    return within(way["mse"], other["mse"], cfg.alike) if own < others else way["mse"] < other["mse"]
 
 
 def _name(decision: Decision, cfg: DiagnosisCfg) -> Taken:
@@ -124,7 +124,7 @@ def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     ((name, after),), facts = decision.after.items(), decision.facts
     pays = judge(decision.before, after, 0, facts["candidates"], facts["first"], cfg=cfg.judging).significant
     left, base = (max(0.0, mse - facts["floor"] ** 2) for mse in (float(after.mse), facts["base"]))
-    says_more = facts["first"] or left < cfg.verdict.most * facts["left"]
+    says_more = facts["first"] or left < (1 - cfg.verdict.most) * facts["left"]
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 

@@ -60,7 +60,7 @@ def fit_curves(
     """Fit every curve on the joints that are far from the floor in the end; ``None`` without such joints.
 
     A wrong effect can explain much of an error, and the right one leaves something where more is missing. A curve over
-    one variable that leaves less than half of what named effects leave says that those are not it. Where no effect is
+    one variable that halves the error that named effects leave says that those are not it. Where no effect is
     named a curve is held against the base model. Joints with an effect that the whole robot shares are left out.
 
     Args:

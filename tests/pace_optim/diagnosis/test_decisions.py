@@ -53,7 +53,7 @@ def test_saved_cases_are_read_as_they_were(tmp_path):
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():
     log: list[Decision] = []
     decide("pool", [0], errors_of(1e-3), {"torque_gain": errors_of(1.01e-3)}, cfg=DEFAULT, log=log.append)
-    strict = replace(DEFAULT, judging=replace(DEFAULT.judging, as_good=1.0))
+    strict = replace(DEFAULT, judging=replace(DEFAULT.judging, alike=1.0))
     rows = table({"one": log, "two": log}, strict).splitlines()
     assert rows[2] == "| pool | 2 | 2 | 2 of 2 | 2 |"
 

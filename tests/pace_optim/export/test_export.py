@@ -1,6 +1,7 @@
 """What is exported holds what was identified."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -11,6 +12,7 @@ from command_lines import run_script
 from torque_sequence import DT, ENVS, JOINTS, sequence, write_result
 
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators.drive_result import CommandTiming
 from pace_envs import load_env_cfg
 from pace_optim.export import FORMATS, export
 from pace_optim.export.mjlab_native import mjlab_actuator
@@ -142,6 +144,10 @@ def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out)
     expected = {name: value for name, value in (given | joint).items() if name not in left_out}
     names, delay = {"target_names_expr": ("LF_HFE",)}, {"delay_min_lag": 3, "delay_max_lag": 3}
     assert call.values == expected | names | delay
+    timing = CommandTiming(interval_s=8 * DT, early_s=0.6 * DT, late_s=2.2 * DT, lost=0.01)
+    call = mjlab_actuator(replace(IdentifiedDrives.load(result), command_timing=timing), "LF_HFE", plain)
+    jitter = {"delay_min_lag": 3, "delay_max_lag": 6, "delay_update_period": 8, "delay_per_env_phase": False}
+    assert call.values == expected | names | jitter
 
 
 @pytest.mark.parametrize("fmt", FORMATS)

@@ -1,5 +1,7 @@
 """The control step of a model file is that of the log's commands, where they come faster than 400 Hz."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from models import HEAD, KD, KP, MOTORS
 
 from pace_optim.identification.fit import fit
 from pace_optim.recording import Drive, Recording, save_recording
-from pace_optim.recording.commands import command_interval
+from pace_optim.recording.commands import command_interval, command_timing
 from pace_optim.run.open import open_problem, problem_of
 from pace_optim.run.settings import FitSettings
 
@@ -42,6 +44,24 @@ def test_a_command_that_is_repeated_is_none(repeat, own_clock, interval):
         clock = {"des_time": time, "time": time[::4], "dof_pos": held[::4]}
     recording = Recording(name="r", joint_names=("j",), des_dof_pos=held, **clock)
     assert command_interval(recording) == pytest.approx(interval, rel=1e-9)
+
+
+def test_jitter_and_lost_commands_are_those_of_the_stamps():
+    rng, ticks = np.random.default_rng(0), np.flatnonzero(np.random.default_rng(1).random(4000) > 0.03)
+    late = rng.triangular(0.0, 0.0, 0.006, len(ticks))
+    stamps = 5.0 + 0.02003 * ticks + late
+    time = np.arange(0.0, 85.0, 0.05)
+    recording = Recording(
+        name="r", joint_names=("j",), time=time, dof_pos=np.zeros((len(time), 1)), des_time=stamps,
+        des_dof_pos=np.sin(stamps)[:, None],
+    )  # fmt: skip
+    timing = command_timing([recording])
+    low, high = np.quantile(late - late.mean(), (0.05, 0.95))
+    assert timing.interval_s == pytest.approx(0.02003, rel=1e-5)
+    assert (-timing.early_s, timing.late_s) == pytest.approx((low, high), abs=2e-5)
+    assert timing.lost == pytest.approx(1 - len(ticks) / (ticks[-1] - ticks[0] + 1))
+    assert command_timing([replace(recording, des_time=None)]) is None
+    assert command_timing([replace(recording, des_time=np.sort(rng.uniform(5.0, 85.0, len(ticks))))]) is None
 
 
 def test_commands_for_each_control_step_need_no_clock():

@@ -35,7 +35,7 @@ CREEP, SKEW = get_effect("creeping_friction"), get_effect("clock_skew")
 FLOOR, YES = torch.tensor([1e-4]).double(), torch.tensor([True])
 SURE = Evidence(
     without=100.0,
-    left=40.0,
+    left=20.0,
     floor=1.0,
     harm=0.0,
     larger=0.0,
@@ -53,7 +53,7 @@ SURE = Evidence(
     [
         ({}, []),
         ({"left": 60.0}, ["it explains 40 % of what lies above the floor"]),
-        ({"harm": 20.0}, ["it explains 40 % of what lies above the floor"]),
+        ({"harm": 40.0}, ["it explains 40 % of what lies above the floor"]),
         ({"bars": 4.0}, ["its size is not significant"]),
         ({"uneven": 0.2}, ["its size differs between recordings"]),
         ({"at_bound": True}, ["it is at a bound"]),
