@@ -156,7 +156,7 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
 
     Residuals are whitened by C, which a fit follows. What lasts in them is in Σ = L⁻¹ C' L⁻ᵀ, with C' all that is not
     known of a swing. If the errors of a swing are above C', its Σ is as many times as large: each swing is a cluster
-    with a variance of its own (Liang and Zeger, Biometrika 73, 1986).
+    with its own variance (Liang and Zeger, Biometrika 73, 1986).
 
     Args:
         jacobian: On the training samples.
@@ -253,7 +253,7 @@ def make_probes(
 
     Args:
         x: Normalised vector, (size,).
-        around: Vectors around x that tell the derivatives.
+        around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
         joint_names: All joints, in order.
         shake: How far first positions are moved [rad].

@@ -31,7 +31,7 @@ _GAIN_RANGE = 0.6
 _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
 _GAIN_REFITS = 2
-"""Recordings refitted with gains of their own."""
+"""Recordings refitted with separate gains."""
 _REFINE = LeastSquaresCfg(max_iteration=12, score_tolerance=1e-4)
 """From the joint result: what is left after that is some tenths of a standard deviation."""
 
@@ -161,7 +161,7 @@ def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[
 
     Args:
         values: One per recording, (R,).
-        std: Their standard deviations, (R,); NaN where there is none.
+        std: Their standard deviations, (R,); NaN if unknown.
         smallest: Differences below this do not count.
 
     Returns:

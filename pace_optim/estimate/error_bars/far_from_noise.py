@@ -14,7 +14,7 @@ FAR_ABOVE_NOISE = 10.0
 
 
 def times_noise(problem: Problem, rmse: float | None) -> float | None:
-    """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` where there is none.
+    """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` without noise.
 
     Args:
         problem: What was fitted.

@@ -52,7 +52,7 @@ class LoopRates:
     weights: np.ndarray
     """How likely each is, (periods,); their sum is 1."""
     assumed: float
-    """The period that is taken where the recordings tell none [s]."""
+    """The period that is used if the recordings do not show one [s]."""
     fitted: float
     """The period that was fitted with [s]."""
 
@@ -135,8 +135,8 @@ def loop_rates(problem: Problem, x: torch.Tensor, there: Jacobian, known: np.nda
 
     All are simulated with one physics step, and fitted again on pieces of the recordings: each from the end of the one
     nearest to it, by derivatives of the fitted rate and the longest step. Residuals and values between the shortest
-    simulated periods follow by the polynomial through these. What was fitted alone does not tell a rate: the residuals
-    are those on all samples of the pieces, also on those kept for validation. With r those of a candidate and
+    simulated periods follow by the polynomial through these. Training samples alone do not show the rate: the
+    residuals are those on all samples of the pieces, also on those kept for validation. With r those of a candidate and
     d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
