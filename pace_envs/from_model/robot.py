@@ -132,6 +132,7 @@ def cfg_from_model(
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
+        assumed_gains={joint.name: gains(joint) for joint in joints if not has_gains(joint)},
         couplings={joint.name: dict(joint.drive.row) for joint in joints if joint.drive and joint.drive.row}
         | {name: dict(row) for name, row in (motors or {}).items() if name in names and name not in row},
     )
@@ -176,7 +177,8 @@ def robot_cfg_from_model(
 ) -> ArticulationCfg:
     """The robot of a model file for a training task, with the joints and drives of :func:`cfg_from_model`.
 
-    It stands on the ground with its lowest colliding geom.
+    It stands on the ground with its lowest colliding geom. Gains that the file does not state are assumed;
+    :func:`~pace_envs.use_identified` replaces them by those of the recordings.
 
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).

@@ -90,11 +90,11 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
     if meshes and touches:
         notes.append(
-            f"Nothing touches its collision meshes {listed(meshes, 3)}, which are not there or none of "
-            f"{', '.join(_READABLE)}: convert them, or put them where the file looks for them."
+            f"Collision meshes without effect: {listed(meshes, 3)}. Expected {', '.join(_READABLE)} files beside the "
+            "URDF; the folder of a package:// path may also lie above it. Convert or move them."
         )
     elif meshes:
-        notes.append(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.")
+        notes.append("Its meshes are not loaded: a fit needs no shapes.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
     command, (motors, told) = _command_interfaces(root), _motors(root, path)
