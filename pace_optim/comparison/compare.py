@@ -133,16 +133,13 @@ def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tr
 
 
 def _summary(compared: Sequence[JointComparison]) -> str:
-    """How many joints are explained, in a sentence."""
+    """How many joints are explained, in a sentence or two."""
     count = len(compared)
     done = sum(_explained(joint.content) for joint in compared)
     spread = sum(not _explained(joint.content) and not joint.places for joint in compared)
     if done == count:
-        return (
-            "The joint is at the noise floor: no model could explain more of this data."
-            if count == 1
-            else f"All {count} joints are at the noise floor: no model could explain more of this data."
-        )
+        which, near = "The joint is" if count == 1 else f"All {count} joints are", 100 * (AT_THE_FLOOR - 1)
+        return f"{which} within {near:.0f} % of the noise: a better model could explain little more of this data."
     rest = count - done
     if count == 1:
         text = "There is error above the noise floor that a better model could explain."

@@ -54,12 +54,16 @@ def error_line(result: FitResult) -> str:
 
 
 def next_line(result: FitResult, folder: Path) -> list[str]:
-    """The command that comes after a fit, where its error is above the noise."""
-    times = result.times_noise or 0.0
-    if times < _ABOVE_NOISE:
+    """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown."""
+    if result.times_noise is None:
         return []
-    verb = "diagnose" if result.std_means_nothing else "compare"
-    return [f"next: {command(verb)} {shlex.quote(str(folder))}"]
+    run = shlex.quote(str(folder))
+    if result.std_means_nothing and not result.effects:
+        return [f"next: {command('diagnose')} {run}"]
+    if result.times_noise >= _ABOVE_NOISE:
+        return [f"next: {command('compare')} {run}"]
+    robot = shlex.quote(f"{result.robot_name}_identified.xml")
+    return [f"next: {command('export')} {run} --format mjcf --output {robot}"]
 
 
 def _torque_errors(result: FitResult) -> list[str]:
@@ -78,13 +82,12 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
         return []
     names = [name for name in names if set(joints) & set(result.parameters[name])]
     unit = {name: next(result.unit_of(name, j) for j in joints if j in result.parameters[name]) for name in names}
-    columns = [f"{name} [{unit[name]}]".rjust(26) for name in names]
+    columns = [[f"{name} [{unit[name]}]", *(_value(result, name, joint) for joint in joints)] for name in names]
     head = units_for("train / validation [mrad]", [joint_type])
-    lines = ["  ".join(["joint".ljust(width), *columns, head.rjust(26)])]
-    for joint in joints:
-        cells = [_value(result, name, joint).rjust(26) for name in names]
-        lines.append("  ".join([joint.ljust(width), *cells, errors_of(result, joint).rjust(26)]))
-    return [*lines, ""]
+    columns.append([head, *(errors_of(result, joint) for joint in joints)])
+    aligned = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+    rows = zip([name.ljust(width) for name in ("joint", *joints)], *aligned, strict=True)
+    return [*("  ".join(row) for row in rows), ""]
 
 
 def _links(result: FitResult) -> list[str]:

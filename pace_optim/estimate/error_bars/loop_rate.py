@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,16 @@ class LoopRates:
         The sum of their squares is the variance of the values that comes from the rate.
         """
         return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
+
+    def at(self, space: ParameterSpace, physical: np.ndarray) -> LoopRates:
+        """The same about a result: the chosen period's values are the result's, and the others' as far away as here.
+
+        Args:
+            space: The parameters.
+            physical: The result, (size,).
+        """
+        moved = self.values + (physical - self.value_at(self.chosen))
+        return replace(self, values=np.clip(moved, space.lower.numpy(), space.upper.numpy()))
 
     def to_dict(self, space: ParameterSpace) -> dict[str, Any]:
         """For ``result.json``: the periods, and the values with the chosen one and the farthest from it."""
