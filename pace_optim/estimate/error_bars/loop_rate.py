@@ -7,6 +7,7 @@ friction and kd h / 2 of armature. A fit with a wrong rate finds these in its va
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -121,9 +122,10 @@ class LoopRates:
         change = self.value_at(other) - self.value_at(used)
         size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(used)), 1e-12), 0.0)
         shown = [
-            f"{space.labels[i].split('/')[0].replace('_', ' ')} of {space.labels[i].split('/')[1]} is "
-            f"{self.value_at(used)[i]:.4g} with {_rate(used)} and {self.value_at(other)[i]:.4g} with {_rate(other)}"
+            f"{re.sub('[_.]', ' ', name)} of {key} is {self.value_at(used)[i]:.4g} with {_rate(used)} and "
+            f"{self.value_at(other)[i]:.4g} with {_rate(other)}"
             for i in np.argsort(-size)[:_NAMED].tolist()
+            for name, _, key in [space.labels[i].partition("/")]
         ]
         return [
             f"{begin}These recordings cannot separate {_rate(used)} and {_rate(other)}: {', '.join(shown)}. The error "
