@@ -298,9 +298,8 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     notes = [f"home posture: {f'keyframe {key}' if key else middle}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
-            f"gains, where a recording states none: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
-            f"{defaults.NATURAL_FREQUENCY:g} Hz with the joint's inertia; kd for a damping ratio of "
-            f"{defaults.DAMPING_RATIO:g} (stiffness, damping)"
+            f"gains: the recording's; if it states none, kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
+            f"{defaults.NATURAL_FREQUENCY:g} Hz, and kd for a damping ratio of {defaults.DAMPING_RATIO:g}"
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:

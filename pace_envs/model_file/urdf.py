@@ -169,9 +169,8 @@ def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
     if impossible := [name for name, change in told.items() if math.isfinite(change)]:
         most = max(told[name] for name in impossible)
         notes.append(
-            f"No body can have the inertia that is stated for {listed(impossible, 3)} (a principal moment is not "
-            f"positive, or above the sum of the other two): the nearest possible one is taken, changed by "
-            f"{100 * most:.1f} % at most."
+            f"No body can have the stated inertia of {listed(impossible, 3)}: a principal moment is not positive, or "
+            f"above the sum of the other two. The nearest possible one is used, changed by {100 * most:.1f} % at most."
         )
     return notes
 
