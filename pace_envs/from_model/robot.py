@@ -348,8 +348,8 @@ def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
 
 def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> str:
     if runs_continuously(joints, model, control_dt):
-        return "the drives' loops run continuously, as MuJoCo holds the file's gains"
-    return "the drives' loops run at the control rate and hold their torque (--drive_dt: a faster loop)"
+        return "drive loops: continuous, as MuJoCo holds the file's gains, unless --drive_dt states a period"
+    return "drive loops: at the control rate with a held torque, unless --drive_dt states a period"
 
 
 def _folder_name(file: ModelFile) -> str:

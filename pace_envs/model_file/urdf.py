@@ -94,7 +94,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
             "URDF; the folder of a package:// path may also lie above it. Convert or move them."
         )
     elif meshes:
-        notes.append("Its meshes are not loaded: a fit needs no shapes.")
+        notes.append("The meshes are not loaded: a fit needs no shapes.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
     command, (motors, told) = _command_interfaces(root), _motors(root, path)

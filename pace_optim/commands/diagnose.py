@@ -65,5 +65,5 @@ def run_and_tell(settings: DiagnosisSettings) -> None:
         with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
         before, refit = FitResult.load(first), FitResult.load(last)
         lines = ["", f"whole robot with {' and '.join(with_what)}:", *summary(refit)]
-        lines += [f"{error_line(before)} before", *next_line(refit, last)]
+        lines += [error_line(before, "error before, all joints"), *next_line(refit, last)]
     print(*lines, f"report: {last / 'report.html'}", f"run: {last}", sep="\n")

@@ -30,10 +30,9 @@ def summary(result: FitResult) -> list[str]:
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
     if result.step_error:
-        of = f"the physics step of {1e3 * result.physics_dt:g} ms"
-        if result.assumes_loop_rate:
-            of += " and of the assumed loop rate"
-        lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
+        rate = " and the assumed loop rate" if result.assumes_loop_rate else ""
+        step = f"the physics step of {1e3 * result.physics_dt:g} ms"
+        lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
@@ -48,9 +47,9 @@ def summary(result: FitResult) -> list[str]:
     return lines + [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
 
 
-def error_line(result: FitResult) -> str:
-    """RMSE of all joints in training and validation."""
-    return units_for(f"error, all joints: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
+def error_line(result: FitResult, of: str = "error, all joints") -> str:
+    """RMSE of all joints in training and validation, under a name."""
+    return units_for(f"{of}: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
 
 
 def next_line(result: FitResult, folder: Path) -> list[str]:
