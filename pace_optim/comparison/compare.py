@@ -103,7 +103,7 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
                 "duration": float(track.time[-1] - track.time[0]),
                 "trained_share": float(track.train.mean()),
                 "repetitions": [o.name for o in run.tracks if o.group == track.group and o is not track],
-                "held_out": held_out_spans(track.time - track.time[0], track.train),
+                "held_out": held_out_spans(track.time - track.time[0], ~track.held_out),
             }
             for track in run.tracks
         ],

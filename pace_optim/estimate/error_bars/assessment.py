@@ -281,13 +281,15 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
     """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
     data, residuals, result = problem.dataset, residuals.positions, []
     for r, recording in enumerate(data.recordings):
-        at = residuals.where[:, r]
+        at, also = residuals.where[:, r], {}
         measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
         enabled = recording.torque_enable
         error = residuals.error[0, at, r]
         if residuals.weight is not None:
             error = error / residuals.weight[at, r].clamp(min=1.0)
         on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
+        if data.settling is not None:
+            also["settling"] = data.settling[residuals.step][at, r]
         path, base = problem.base_paths[r], {}
         if path is not None:
             base = {
@@ -306,5 +308,6 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
                 "train": data.train[residuals.step][at, r],
                 "torque_enable": on[: len(measured)],
             }
+            | also
         )
     return {"joint_names": list(problem.joint_names), "recordings": result}

@@ -94,7 +94,7 @@ def _share_of_motion(run: RunData, held_out: bool) -> float | None:
     """The error as a part of the joints' standard deviation, on what was held out or on what was trained on."""
     error, moved = 0.0, 0.0
     for recording in run.recordings:
-        where = recording.train != held_out
+        where = recording.held_out if held_out else recording.train
         if where.any():
             measured = recording.measured[where]
             error += float(np.square(recording.error[where]).sum())
