@@ -11,7 +11,7 @@ from pace_actuators.text import shortened
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
-_ABOVE_NOISE = 1.5
+ABOVE_NOISE = 1.5
 """Times the noise above which an error has causes beside it."""
 
 
@@ -52,17 +52,22 @@ def error_line(result: FitResult, of: str = "error, all joints") -> str:
     return units_for(f"{of}: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
 
 
-def next_line(result: FitResult, folder: Path) -> list[str]:
-    """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown."""
+def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> list[str]:
+    """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown.
+
+    Args:
+        result: Of the fit.
+        folder: Of the run.
+        compared: Whether the run has been compared with its recordings.
+    """
     if result.times_noise is None:
         return []
     run = shlex.quote(str(folder))
-    if result.std_means_nothing and not result.effects:
-        return [f"next: {command('diagnose')} {run}"]
-    if result.times_noise >= _ABOVE_NOISE:
-        return [f"next: {command('compare')} {run}"]
-    robot = shlex.quote(f"{result.robot_name}_identified.xml")
-    return [f"next: {command('export')} {run} --format mjcf --output {robot}"]
+    if result.times_noise < ABOVE_NOISE:
+        robot = shlex.quote(f"{result.robot_name}_identified.xml")
+        return [f"next: {command('export')} {run} --format mjcf --output {robot}"]
+    verb = "diagnose" if compared or (result.std_means_nothing and not result.effects) else "compare"
+    return [f"next: {command(verb)} {run}"]
 
 
 def _torque_errors(result: FitResult) -> list[str]:
