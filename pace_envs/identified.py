@@ -242,7 +242,7 @@ def _with_recorded_gains(robot: ArticulationCfg, drives: IdentifiedDrives) -> Ar
     """The robot with these."""
     gains, groups = _recorded_gains(robot, drives), {}
     for group, drive, joints in _groups(robot):
-        changed = {}
+        changed: dict[str, Any] = {}
         for name, values in gains.items():
             own = resolve_joint_values(getattr(drive, name), joints, field=name).tolist()
             changed[name] = {re.escape(j): values.get(j, value) for j, value in zip(joints, own, strict=True)}
