@@ -132,8 +132,8 @@ class DelayBuffer:
             self._lag[rows] = lag
         except RuntimeError:
             raise ValueError(
-                f"The delay has shape {tuple(lag.shape)}, expected a number, or a row for each of "
-                f"{len(self._lag[rows])} environments with a column for all joints or one per joint."
+                f"The delay has shape {tuple(lag.shape)}. Expected a number, or {len(self._lag[rows])} rows of "
+                "environments, with one column for all joints or one per joint."
             ) from None
         self._index_lags()
 

@@ -31,8 +31,8 @@ def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
         physics_dt: Time between two of its calls [s].
 
     Returns:
-        The calls; ``None`` where runs do not fall on the same calls of every control step: the drive then keeps a clock
-        of its own.
+        The calls; ``None`` where runs do not fall on the same calls of every control step: the drive then keeps its
+        own clock.
 
     Raises:
         ValueError: If its own rate is higher than that of the physics, or that of the physics is not known.
@@ -305,7 +305,7 @@ class Drive:
     def _held_between_runs(
         self, position: torch.Tensor, speed: torch.Tensor, period: float
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What a controller with a clock of its own saw when it last ran; it runs as soon as its period [s] is over."""
+        """What a controller with its own clock saw when it last ran; it runs as soon as its period [s] is over."""
         runs = self._since_run >= (1 - _ROUNDING) * period
         self._since_run = torch.where(runs, self._since_run - period, self._since_run) + (self._physics_dt or 0.0)
         self._held_pos = torch.where(runs, position, self._held_pos)
@@ -404,7 +404,7 @@ class Drive:
         return [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
 
     def delays(self) -> list[DelayBuffer]:
-        """The buffers of its own delay and of its effects'."""
+        """The buffers of the drive's delay and of its effects'."""
         held = [value for each in self.parts() for value in vars(each).values() if isinstance(value, DelayBuffer)]
         return [*self._delays.buffers, *held]
 

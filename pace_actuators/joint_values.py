@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
+from pace_actuators.text import listed
+
 JointValue = float | Mapping[str, float] | Sequence[float] | torch.Tensor
 """A number for every joint, a dict of regular expression to value, or one value per joint."""
 
@@ -32,7 +34,7 @@ def match_names(patterns: str | Sequence[str], names: Sequence[str], *, what: st
         found = [i for i, name in enumerate(names) if expression.fullmatch(name)]
         if not found:
             raise ValueError(
-                f"The pattern {pattern!r} matches no {what}. Available: {', '.join(names)}. "
+                f"The pattern {pattern!r} matches no {what}. Available: {listed(names)}. "
                 "Correct the pattern or remove it."
             )
         matches.append(found)

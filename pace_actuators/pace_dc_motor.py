@@ -20,7 +20,7 @@ _INVERSION_STEPS = 6
 
 
 class DriveWithEffects(Drive):
-    """What the simulator is to apply, what encoders show, and what effects are told."""
+    """What the simulator is to apply, what encoders show, and what effects read."""
 
     @property
     def _feeds_back(self) -> bool:
@@ -166,12 +166,12 @@ class DriveWithEffects(Drive):
             self.effects.state.time = time.expand_as(self.effects.state.time)
 
     def remember(self, heat: Heat) -> None:
-        """Tell effects how hard the drive has worked in the session before; once the parameters are known."""
+        """Give effects the drive's work in the session before, once the parameters are known."""
         for effect in () if self.effects is None else self.effects.effects:
             effect.remember(heat)
 
     def notice(self, conditions: Conditions) -> None:
-        """Tell effects what was logged of the drive's conditions."""
+        """Give effects the logged conditions of the drive."""
         for effect in () if self.effects is None else self.effects.effects:
             effect.notice(conditions)
 
@@ -197,7 +197,7 @@ class PaceDCMotor(DriveWithEffects):
 
     Source: Bjelonic et al., PACE (arXiv 2509.06342); torque-speed limit as Isaac Lab's ``DCMotor``.
     The constructor, the attributes and :meth:`compute` are those of an Isaac Lab actuator. Override
-    :meth:`compute_effort_command` or :meth:`drive_effort` to model a motor of your own.
+    :meth:`compute_effort_command` or :meth:`drive_effort` to model another motor.
 
     Attributes:
         computed_effort: The controller's torque before the drive's limits [N m], (num_envs, num_joints).
@@ -347,7 +347,7 @@ class PaceDCMotor(DriveWithEffects):
     def _effort_command_at(self, part: int) -> torch.Tensor:
         """The controller's torque [N m] at a call between two of its runs, when a command or a torque has arrived."""
         delays, run = self._delays, self._run
-        if run is None:  # a subclass has a law of its own
+        if run is None:  # a subclass has another law
             return self.computed_effort
         self._jump = self._jump_of_torque(part, run.stiffness, run.damping)
         if self.cfg.delay_mode == "effort":

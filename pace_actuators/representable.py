@@ -67,8 +67,8 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             continue
         if kind.overrides("write_model") and not world.bodies:
             notes.append(
-                f"{kind.name} changes the rigid body that a joint moves, which {world.name} does not let a drive do: "
-                "use the model that pace export --format mjcf --joints_only writes, which has it."
+                f"{kind.name} changes the rigid body that a joint moves. In {world.name} a drive cannot do this. Use "
+                "the model that pace export --format mjcf --joints_only writes: it has the change."
             )
         if kind.reads_link and not world.inertia_per_step:
             raise ValueError(

@@ -60,6 +60,10 @@ class ArticulationCfg(Config):
     joint_order: tuple[str, ...] | None = None
     """Order of the joints in every tensor, and which of them are used; ``None`` means the model's order."""
 
+    assumed_gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Stiffness and damping by joint that a model file does not state and that were assumed. If the drives still have
+    them, identified drives replace them by the recordings'."""
+
     couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Motors that move several joints, ``{motor: {joint: ratio}}``: a motor's position is Σ ratio q_joint, and its
     torque acts on each of these joints by its ratio. ``joint_order`` and the drives name motors in place of their

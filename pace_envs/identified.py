@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolv
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
-from pace_actuators.text import listed
+from pace_actuators.text import listed, plural
 from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -22,6 +24,8 @@ from pace_envs.registration import set_physics_dt
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
 
+GAINS = ("stiffness", "damping")
+"""Fields of a drive that a model file may leave open."""
 _FAR_ABOVE_NOISE = 10.0
 """An error of this many times the noise is no residual of noise."""
 _SAME = 0.01
@@ -43,9 +47,9 @@ def use_identified(
     """Give the robot of an environment the drives that a fit identified.
 
     Armature, frictions, encoder bias, delay, delay mode, effects and the inertial parameters of links become the
-    identified ones. Gains and limits stay
-    the environment's: they are the policy's controller. Where the identification took steps of second order, so does
-    the environment on the processor, and at its control step as fine ones; on a GPU drives take half a step back
+    identified ones. Gains and limits stay the environment's: they are the policy's controller. Gains that a model file
+    did not state and that were assumed become the recordings'. Where the identification took steps of second order, so
+    does the environment on the processor, and at its control step as fine ones; on a GPU drives take half a step back
     (``PaceDCMotorCfg.second_order``).
 
     Args:
@@ -65,6 +69,8 @@ def use_identified(
     """
     drives = IdentifiedDrives.of(identified)
     notes = check_representable(drives, HERE)
+    if taken := {joint for own in _recorded_gains(cfg.scene.robot, drives).values() for joint in own}:
+        notes.append(f"gains of {plural(len(taken), 'joint')}: the recordings', as the model file states none")
     cfg.scene.robot.actuators = groups = _identified_groups(cfg.scene.robot, drives, gains, on_the_rig)
     cfg.scene.robot.links = {**cfg.scene.robot.links, **drives.links}
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
@@ -166,12 +172,10 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | 
 
 def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]:
     """Gains and limits of the environment that are not those of the recordings."""
-    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
-    found = []
+    found, robot = [], _with_recorded_gains(robot, drives)
     for name in DRIVE_FIELDS:
         differs: dict[tuple[float, float], list[str]] = {}
-        for drive in robot.actuators.values():
-            own = [names[i] for group in match_names(drive.joint_names_expr, names) for i in group]
+        for _, drive, own in _groups(robot):
             if (configured := getattr(drive, name)) is None:
                 continue
             values = resolve_joint_values(configured, own, field=name).tolist()
@@ -190,10 +194,8 @@ def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]
 def _identified_groups(
     robot: ArticulationCfg, drives: IdentifiedDrives, gains: bool, on_the_rig: bool
 ) -> dict[str, PaceDCMotorCfg]:
-    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
     result, used = {}, set()
-    for group, drive in robot.actuators.items():
-        own = [names[i] for found in match_names(drive.joint_names_expr, names) for i in found]
+    for group, drive, own in _groups(_with_recorded_gains(robot, drives)):
         identified = [joint for joint in drives.joint_names if joint in own]
         if not identified:
             result[group] = drive
@@ -207,10 +209,52 @@ def _identified_groups(
         result[group] = _merged(drive, drives, identified, gains, on_the_rig)
     if left := [joint for joint in drives.joint_names if joint not in used]:
         raise ValueError(
-            f"{drives.path} is of another robot: it has {', '.join(left)}, and the robot has {', '.join(names)}. "
+            f"{drives.path} is of another robot: it has {', '.join(left)}, and the robot has "
+            f"{', '.join(joint for _, _, own in _groups(robot) for joint in own)}. "
             "Use the result of a fit of this robot."
         )
     return result
+
+
+def assumed_gains(robot: ArticulationCfg) -> dict[str, list[str]]:
+    """Joints whose stiffness or damping no file states and no task has changed, by field."""
+    found: dict[str, list[str]] = {name: [] for name in GAINS}
+    for _, drive, joints in _groups(robot):
+        for i, name in enumerate(GAINS):
+            values = resolve_joint_values(getattr(drive, name), joints, field=name).tolist()
+            found[name] += [
+                joint
+                for joint, value in zip(joints, values, strict=True)
+                if joint in robot.assumed_gains and math.isclose(value, robot.assumed_gains[joint][i])
+            ]
+    return found
+
+
+def _recorded_gains(robot: ArticulationCfg, drives: IdentifiedDrives) -> dict[str, dict[str, float]]:
+    """The recordings' gains of joints whose gains are assumed, by field and joint."""
+    return {
+        name: {joint: float(drives.drive[name][joint]) for joint in joints if joint in drives.drive.get(name, {})}
+        for name, joints in assumed_gains(robot).items()
+    }
+
+
+def _with_recorded_gains(robot: ArticulationCfg, drives: IdentifiedDrives) -> ArticulationCfg:
+    """The robot with these."""
+    gains, groups = _recorded_gains(robot, drives), {}
+    for group, drive, joints in _groups(robot):
+        changed: dict[str, Any] = {}
+        for name, values in gains.items():
+            own = resolve_joint_values(getattr(drive, name), joints, field=name).tolist()
+            changed[name] = {re.escape(j): values.get(j, value) for j, value in zip(joints, own, strict=True)}
+        groups[group] = replace(drive, **changed) if any(gains.values()) else drive
+    return replace(robot, actuators=groups)
+
+
+def _groups(robot: ArticulationCfg) -> Iterator[tuple[str, PaceDCMotorCfg, list[str]]]:
+    """Each group of drives with its name and its joints, in its order."""
+    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
+    for group, drive in robot.actuators.items():
+        yield group, drive, [names[i] for found in match_names(drive.joint_names_expr, names) for i in found]
 
 
 def _merged(

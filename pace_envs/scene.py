@@ -9,6 +9,7 @@ import mujoco
 import torch
 
 from pace_actuators.config import Config
+from pace_actuators.text import listed
 from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
@@ -85,7 +86,7 @@ class InteractiveScene:
     def __getitem__(self, name: str) -> Articulation:
         """The entity of that name."""
         if name not in self.articulations:
-            raise KeyError(f"The scene has no {name!r}. Available: {', '.join(self.articulations)}.")
+            raise KeyError(f"The scene has no {name!r}. Available: {listed(self.articulations)}.")
         return self.articulations[name]
 
     def reset(self, env_ids: EnvIds = None) -> None:

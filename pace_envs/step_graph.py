@@ -239,7 +239,7 @@ def _waits(wanted: bool) -> Iterator[list[str]]:
 
 
 class Copies:
-    """Copies tensors that stay where they are, again and again, into memory of their own each time."""
+    """Copies tensors that keep their addresses, again and again, each time into new memory."""
 
     def __init__(self, tensors: Sequence[torch.Tensor]):
         """Write the kernel.

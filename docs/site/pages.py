@@ -109,7 +109,7 @@ def _help(module: str, name: str) -> str:
     main, out = import_module(f"pace_optim.commands.{module}").main, io.StringIO()
     words, width = (
         mock.patch.object(sys, "argv", [f"pace {name}", "--help"]),
-        mock.patch.dict(os.environ, COLUMNS="100"),
+        mock.patch.dict(os.environ, COLUMNS="96"),
     )
     with words, width, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main()

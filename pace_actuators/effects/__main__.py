@@ -125,7 +125,7 @@ def _parameter(effect: type[Effect], p: EffectParameter) -> str:
 
 
 def _is_told(effect: type[Effect], p: EffectParameter) -> bool:
-    """Whether the row of a curve's first value tells of it too."""
+    """Whether the row of a curve's first value describes it too."""
     return effect.free_form and p.null is not None and p is not effect.parameters[0]
 
 

@@ -105,7 +105,7 @@ class DriveState:
         raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
     def __deepcopy__(self, memo: dict) -> DriveState:
-        """A copy with tensors of its own; what shares memory with it still does in its copy."""
+        """A copy with separate tensors; tensors that share memory still share it in the copy."""
         fields = {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
         return DriveState(copy.deepcopy(fields, memo))
 

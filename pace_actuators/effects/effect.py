@@ -160,7 +160,7 @@ class Effect:
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
-    """Parameter of which every probed value starts a fit of its own: no descent leads from one to the other."""
+    """Parameter whose every probed value starts a separate fit: no descent leads from one value to another."""
     comb: ClassVar[tuple[str, str, str] | None] = None
     """A frequency over the position [1/rev], and the amplitudes of its sine and cosine: the frequency is scanned over
     the range of motion, where the error has a valley for each of its periods."""
@@ -169,7 +169,7 @@ class Effect:
     shared: ClassVar[bool] = False
     """Whether it is one for the whole robot by its nature."""
     is_stiff: ClassVar[bool] = False
-    """Whether it has fast dynamics of its own, so that the simulation must be implicit."""
+    """Whether it has fast internal dynamics, so that the simulation must be implicit."""
     parts_motor_and_link: ClassVar[bool] = False
     """Whether motor and link move apart: friction then acts on the motor, other torques on the link."""
     reads_load: ClassVar[bool] = False
@@ -190,14 +190,14 @@ class Effect:
     acts_while_off: ClassVar[bool] = False
     """Whether it acts only while the drive is switched off: it is tried only where a recording has that."""
     condition: ClassVar[str] = ""
-    """What of the drive's conditions it follows, ``temperature`` or ``voltage``: it is tried only where that was logged
-    and changes."""
+    """The drive's condition that it follows, ``temperature`` or ``voltage``. It is tried only if that was logged and
+    changes."""
     absorbed_by: ClassVar[str] = ""
     """Base parameter that may take it up wholly, so that recordings of positions do not show it."""
     scales: ClassVar[str] = ""
-    """What was stated that it multiplies, as "torque": its size is then told as a factor of that."""
+    """The stated fact that it multiplies, such as "torque": its size is then printed as a factor of that."""
     separates: ClassVar[str] = ""
-    """Which further recording tells it from its likes."""
+    """Which further recording separates it from similar effects."""
 
     def __init__(
         self,
@@ -243,7 +243,7 @@ class Effect:
         """Compute what follows from the parameters; called after each change of them."""
 
     def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Forget the history of some of its rows, (rows,) bool or a slice: :meth:`take_new_rows` then tells of them."""
+        """Forget the history of some of its rows, (rows,) bool or a slice: :meth:`take_new_rows` then returns them."""
         if self.new_rows is None:
             self.new_rows = self._no_rows()
         self.new_rows[rows] = True
@@ -364,7 +364,7 @@ class Effect:
 
     @classmethod
     def overrides(cls, method: str) -> bool:
-        """Whether the class has a method of its own for a stage."""
+        """Whether the class overrides the method of a stage."""
         return getattr(cls, method) is not getattr(Effect, method)
 
     @classmethod

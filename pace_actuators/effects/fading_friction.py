@@ -32,7 +32,7 @@ class _FadingFriction(Effect):
         return middle
 
     def drag(self, s: DriveState, damping: torch.Tensor) -> None:
-        """Add a drag [N m s/rad]; what of it is too fast for the step acts on the speed at its end."""
+        """Add a drag [N m s/rad]; the part that is too fast for the step acts on the speed at its end."""
         resolved = torch.minimum(damping, s.armature / self.dt)
         s.viscous_friction += resolved
         s.implicit_damping += damping - resolved
@@ -42,9 +42,9 @@ class _FadingFriction(Effect):
 class CreepingFriction(_FadingFriction):
     """Coulomb friction that fades towards standstill, so that a loaded joint creeps instead of sticking.
 
-    F tanh(|v|/v_s) is its tangent at the speed in the middle of the step, L + D |v|: the level L is left to the
-    simulator, which lets it turn within a step, and D is viscous friction; what of it is too fast for the step acts on
-    the speed at its end. Both are ≥ 0: no v_s is too small for the step, and none creates energy.
+    F tanh(|v|/v_s) is its tangent at the speed in the middle of the step, L + D |v|. The simulator applies the level L,
+    which turns within a step. D is viscous friction; the part that is too fast for the step acts on the speed at its
+    end. Both are ≥ 0: no v_s is too small for the step, and none creates energy.
     """
 
     name = "creeping_friction"

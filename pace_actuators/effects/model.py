@@ -1,6 +1,6 @@
 """Effects on the rigid body that a joint moves.
 
-They change no torque: they tell the environment what to write to its model. Elsewhere, scale the mass and inertia of
+They change no torque: they change the environment's model. Elsewhere, scale the mass and inertia of
 the link, or turn its centre of mass about the joint's axis, in the robot's own model.
 """
 

@@ -1,6 +1,6 @@
 """What the robot is mounted on gives way.
 
-The base turns by φ about a joint's axis, on a spring k and a damper c with an inertia J of its own:
+The base turns by φ about a joint's axis, on a spring k and a damper c with the inertia J:
 
     (J + I) φ̈ + I q̈ + g(q) + K φ + k φ + c φ̇ = 0        link: - I φ̈ - K φ beside what it felt
 
@@ -27,7 +27,7 @@ from pace_actuators.effects.registry import register_effect
 
 @register_effect
 class MountCompliance(Effect):
-    """The base stands on a spring and a damper: k, c and an inertia of its own, about each joint's axis."""
+    """The base stands on a spring and a damper: k, c and the mount's inertia, about each joint's axis."""
 
     name = "mount_compliance"
     stage = "transmission"

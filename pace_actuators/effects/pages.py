@@ -27,7 +27,7 @@ def effect_page(effect: type[Effect], picture: str | None = None) -> str:
         parts += [f"Acts like {' and '.join(f'`{like}`' for like in likes)}.\n" if likes else ""]
         parts += [f"Separated by recording: {effect.separates}.\n" if effect.separates else ""]
     parts.append(
-        f"\n## Add it\n\n```text\npython scripts/fit.py --task TASK --data FILE --effects {effect.name}\n```\n"
+        f"\n## Add it\n\n```text\npace fit --task TASK --data FILE --effects {effect.name}\n```\n"
         "\nAll effects: [effects.md](../effects.md).\n"
     )
     return "".join(parts)

@@ -43,7 +43,7 @@ def get_effect(name: str) -> type[Effect]:
     """The effect of that name, or the class that ``module:Class`` names (which registers it).
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If no effect has this name.
     """
     if ":" in name:
         return _imported(name)
@@ -80,7 +80,7 @@ def import_effect(text: str) -> str:
 
 
 def use_recorded_effects(effects: Sequence[str], code: CodeRecord, where: str) -> None:
-    """Make the effects known that a file names: those of one's own by its record of their code, and not otherwise.
+    """Register the effects that a file names. Custom effects need the file's record of their code.
 
     Args:
         effects: What :meth:`EffectCfg.parse` reads.
@@ -96,7 +96,7 @@ def use_recorded_effects(effects: Sequence[str], code: CodeRecord, where: str) -
 
 
 def effect_modules(effects: Sequence[str]) -> list[str]:
-    """The modules that effects of one's own name."""
+    """The modules of custom effects."""
     return [module for text in effects if (module := split_reference(text.partition("@")[0])[0])]
 
 

@@ -19,7 +19,7 @@ from pace_envs.compiler.tracer import Tracer, tensors_in
 _ROW_WIDTH = 32
 """Threads of a block that has one for each row: few rows spread over the GPU."""
 _SMALLEST = 2
-"""Rows below which an axis of rows is not told from one that is spread."""
+"""Fewer rows than these: an axis of rows cannot be separated from a broadcast one."""
 
 
 class Compiler(Protocol):
@@ -52,7 +52,7 @@ class Fusion(Tracer):
         self._space, self._compiler = RowSpace(rows, device), compiler
         self._operations: list[Operation] = []
         self.launched = 0
-        """Kernels of its own that have been launched."""
+        """Compiled kernels that have been launched."""
         self.left = list[str]()
         """Operations that were left to torch since it was entered last."""
         self._draws = 0
@@ -145,7 +145,7 @@ class Fusion(Tracer):
         return block[:wanted].view(shape)
 
     def _add(self, operation: Operation) -> bool:
-        """Put an operation off; false where its rows are other rows of its own."""
+        """Defer an operation; false if it reads other rows than those that it writes."""
         if self._overlap(operation):
             self.launch()
             for array, _ in operation.touched:
@@ -181,7 +181,7 @@ def fusion_for(rows: int, device: torch.device) -> Fusion | None:
 
 
 def launch_pending() -> None:
-    """Do now what is put off: somebody else than torch is about to read or write tensors."""
+    """Run the deferred operations now: code outside torch is about to read or write tensors."""
     for mode in _get_current_dispatch_mode_stack():
         if isinstance(mode, Fusion):
             mode.launch()

@@ -73,7 +73,7 @@ class HostKernels:
         with ThreadPoolExecutor(min(len(new), os.cpu_count() or 1)) as pool:
             try:
                 names = list(pool.map(self._compiled, new))
-            except BaseException:  # one has failed, or the user has interrupted: nobody needs the others
+            except BaseException:  # one has failed, or the user has interrupted: the others are not needed
                 pool.shutdown(wait=False, cancel_futures=True)
                 for process in list(self._running):
                     _end(process)
@@ -90,7 +90,7 @@ class HostKernels:
 
         Args:
             source: Its source.
-            threads: Not used: ``arguments`` tell how many joints there are.
+            threads: Not used: ``arguments`` hold the number of joints.
             width: Not used.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
@@ -224,7 +224,7 @@ def _compiler() -> str | None:
 
 
 def _own_folder() -> OwnFolder:
-    """A folder that is the user's alone: kept, or for this process where there is none to keep."""
+    """A private folder of the user: a kept one if possible, else one for this process."""
     if (kept := OwnFolder.below("XDG_CACHE_HOME", ".cache", "pace", "kernels")) is not None:
         return kept
     _TEMPORARY.append(tempfile.TemporaryDirectory(prefix="pace_kernels_"))

@@ -108,7 +108,7 @@ def _compiler() -> ctypes.CDLL:
     """NVRTC: the one in torch's own packages, or the system's.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If NVRTC is not found.
     """
     version = (torch.version.cuda or "").split(".")[0]
     packages = Path(torch.__file__).parents[1] / "nvidia"

@@ -188,7 +188,7 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
 
 
 def is_compared(name: str) -> bool:
-    """Whether an operation compares operands in a type of their own, and makes true or false of them."""
+    """Whether an operation compares operands in their common type and returns true or false."""
     return name in COMPARED
 
 

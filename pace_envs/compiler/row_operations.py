@@ -32,7 +32,7 @@ def plan(space: RowSpace, func: Any, name: str, args: tuple, kwargs: dict[str, A
         name: Its name, without the underscore of those in place.
         args: Arguments.
         kwargs: Options, without ``out``.
-        target: What it writes; ``None`` for a result of its own.
+        target: What it writes; ``None`` for a new tensor.
     """
     own = _ENTRIES.get(name)
     if own is not None:
@@ -59,7 +59,7 @@ def on_elements(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[st
     kinds = ["bool" if i == 0 and name in ("where", "masked_fill") else TYPES[dtype] for i in range(len(values))]
     tensors = [each for each in operands if isinstance(each, torch.Tensor)]
     numbers = [None if isinstance(each, torch.Tensor) else each for each in operands]  # what waits holds no tensor:
-    made = "bool" if compared else TYPES[dtype]  # a result that somebody holds is written to memory
+    made = "bool" if compared else TYPES[dtype]  # a result that is still referenced is written to memory
 
     def element(tape: Tape, load: Load, index: Index) -> Node:
         source = count()
@@ -226,7 +226,7 @@ def _reduced(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, 
 
 
 def _joined(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[str, Any], result: torch.Tensor) -> Plan:
-    """Tensors side by side, along an axis of their own or a new one."""
+    """Tensors side by side, along an existing axis or a new one."""
     sources = list(args[0])
     dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % result.ndim
     axis = space.axis(result)

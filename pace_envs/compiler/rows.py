@@ -127,7 +127,7 @@ class RowSpace:
         return tensor.numel() if self.axis(tensor) is None else tensor.numel() // self.rows
 
     def axis(self, tensor: torch.Tensor | Array) -> int | None:
-        """The axis that has a place for each row, counted from the right; ``None`` where there is none."""
+        """The axis with one entry per row, counted from the right; ``None`` without such an axis."""
         shape = tensor.shape
         return next((i - len(shape) for i, size in enumerate(shape) if size == self.rows), None)
 

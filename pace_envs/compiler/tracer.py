@@ -64,7 +64,7 @@ class Tracer(TorchDispatchMode):
             name: Its name, without the underscore of those in place.
             args: Arguments.
             kwargs: Options, without ``out``.
-            target: What it writes; ``None`` for a result of its own.
+            target: What it writes; ``None`` for a new tensor.
             tensors: Those among the arguments and options.
         """
         raise NotImplementedError

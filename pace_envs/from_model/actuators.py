@@ -157,9 +157,9 @@ def _through_tendon(model: mujoco.MjModel, tendon: int, name: str) -> tuple[str,
     if len(tied) < len(row):
         if len(tied) > 1 or followers(model) & set(row) or not model.tendon(tendon).name:
             raise ValueError(
-                f"The actuator {name} pulls the tendon {label} over {listed(list(names.values()))}: a motor of several "
-                "joints needs a tendon with a name, over joints that follow no other. Name it, and take joints that "
-                f"<equality><joint/></equality> ties to others out of it: see {_REFERENCE}."
+                f"The actuator {name} pulls the tendon {label} over {listed(list(names.values()))}. A motor of several "
+                "joints needs a tendon with a name, over joints that follow no other. Name it. Remove joints from it "
+                f"that <equality><joint/></equality> ties to others: see {_REFERENCE}."
             )
         return label, 1.0, 0.0, {names[joint]: ratio for joint, ratio in row.items()}
     ratio = sum(row[joint] * of_first for joint, (of_first, _) in tied.items())
@@ -178,9 +178,8 @@ def _law(model: mujoco.MjModel, i: int, name: str) -> tuple[float, np.ndarray, f
     if not (constant and known):
         kind = mujoco.mjtGain(gain).name.removeprefix("mjGAIN_").lower()
         raise ValueError(
-            f"The actuator {name} is of the kind {kind!r}, which no drive here follows: position, velocity, "
-            f"intvelocity, motor, and general ones of the same form are read. Write a configuration for it: see "
-            f"{_REFERENCE}."
+            f"The actuator {name} is of the kind {kind!r}. Expected position, velocity, intvelocity, motor, or a "
+            f"general one of the same form. Write a configuration for it: see {_REFERENCE}."
         )
     values = model.actuator_biasprm[i] if bias == mujoco.mjtBias.mjBIAS_AFFINE else np.zeros(3)
     return float(gains[0]), values[:2], 0.0 - float(values[2])

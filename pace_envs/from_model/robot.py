@@ -132,6 +132,7 @@ def cfg_from_model(
         init_state=InitialStateCfg(pos=position, rot=orientation, joint_pos=_home_positions(robot)),
         actuators={"drives": _drive_cfg(joints, longest_delay, continuous=continuous)},
         joint_order=names,
+        assumed_gains={joint.name: gains(joint) for joint in joints if not has_gains(joint)},
         couplings={joint.name: dict(joint.drive.row) for joint in joints if joint.drive and joint.drive.row}
         | {name: dict(row) for name, row in (motors or {}).items() if name in names and name not in row},
     )
@@ -176,7 +177,8 @@ def robot_cfg_from_model(
 ) -> ArticulationCfg:
     """The robot of a model file for a training task, with the joints and drives of :func:`cfg_from_model`.
 
-    It stands on the ground with its lowest colliding geom.
+    It stands on the ground with its lowest colliding geom. Gains that the file does not state are assumed;
+    :func:`~pace_envs.use_identified` replaces them by those of the recordings.
 
     Args:
         path: MJCF (``.xml``) or URDF (``.urdf``).
@@ -296,9 +298,8 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     notes = [f"home posture: {f'keyframe {key}' if key else middle}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
-            f"gains, where a recording states none: kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
-            f"{defaults.NATURAL_FREQUENCY:g} Hz with the joint's inertia; kd for a damping ratio of "
-            f"{defaults.DAMPING_RATIO:g} (stiffness, damping)"
+            f"gains: the recording's; if it states none, kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
+            f"{defaults.NATURAL_FREQUENCY:g} Hz, and kd for a damping ratio of {defaults.DAMPING_RATIO:g}"
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:
@@ -347,8 +348,8 @@ def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
 
 def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> str:
     if runs_continuously(joints, model, control_dt):
-        return "the drives' loops run continuously, as MuJoCo holds the file's gains"
-    return "the drives' loops run at the control rate and hold their torque (--drive_dt: a faster loop)"
+        return "drive loops: continuous, as MuJoCo holds the file's gains, unless --drive_dt states a period"
+    return "drive loops: at the control rate with a held torque, unless --drive_dt states a period"
 
 
 def _folder_name(file: ModelFile) -> str:

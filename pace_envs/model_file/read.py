@@ -97,7 +97,7 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = 
         if "balanceinertia" in str(error):
             body = re.search(r"Element name '([^']*)'", str(error))
             raise ValueError(
-                f"{path}: no body can have the inertia that is stated for {body[1] if body else 'a body'}: one of its "
+                f"{path}: no body can have the stated inertia of {body[1] if body else 'a body'}. One of its "
                 "principal moments is above the sum of the other two. Correct it, or let MuJoCo make them equal: "
                 '<compiler balanceinertia="true"/>.'
             ) from None

@@ -90,11 +90,11 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
     if meshes and touches:
         notes.append(
-            f"Nothing touches its collision meshes {listed(meshes, 3)}, which are not there or none of "
-            f"{', '.join(_READABLE)}: convert them, or put them where the file looks for them."
+            f"Collision meshes without effect: {listed(meshes, 3)}. Expected {', '.join(_READABLE)} files beside the "
+            "URDF; the folder of a package:// path may also lie above it. Convert or move them."
         )
     elif meshes:
-        notes.append(f"Its meshes ({', '.join(meshes[:2])}{', …' if len(meshes) > 2 else ''}) are left out.")
+        notes.append("The meshes are not loaded: a fit needs no shapes.")
     types = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     moving = [name for name, kind in types.items() if kind in MOVING]
     command, (motors, told) = _command_interfaces(root), _motors(root, path)
@@ -169,9 +169,8 @@ def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
     if impossible := [name for name, change in told.items() if math.isfinite(change)]:
         most = max(told[name] for name in impossible)
         notes.append(
-            f"No body can have the inertia that is stated for {listed(impossible, 3)} (a principal moment is not "
-            f"positive, or above the sum of the other two): the nearest possible one is taken, changed by "
-            f"{100 * most:.1f} % at most."
+            f"No body can have the stated inertia of {listed(impossible, 3)}: a principal moment is not positive, or "
+            f"above the sum of the other two. The nearest possible one is used, changed by {100 * most:.1f} % at most."
         )
     return notes
 

@@ -17,8 +17,9 @@ import torch.distributed as dist
 
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import result_path
+from pace_actuators.text import listed
 from pace_envs.devices import find_device
-from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
+from pace_envs.identified import assumed_gains, doubts, set_identified_step, set_step, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
@@ -92,6 +93,12 @@ def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
             raise ValueError("randomize_identified needs identified drives: name a result.json with --identified.")
         if settings.physics_dt is not None:
             set_step(cfg, settings.physics_dt)
+        if joints := assumed_gains(cfg.scene.robot)["stiffness"]:
+            print(
+                f"warning: the model file states no gains of {listed(joints, 3)}; they are assumed from the effort "
+                "limits. Set stiffness and damping in the task, or use --identified. [W5]",
+                file=sys.stderr,
+            )
         return
     drives = IdentifiedDrives.load(settings.identified)
     for doubt in doubts(cfg, drives):

@@ -5,6 +5,8 @@ from pathlib import Path
 import torch
 
 from pace_optim.comparison import compare, comparison_lines
+from pace_optim.run.result import FitResult
+from pace_optim.run.summary import next_line
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import (
     add_common_options,
@@ -42,5 +44,9 @@ def main() -> None:
         options["device"] or "cpu",
     )
     print(*comparison_lines(content), sep="\n")
-    print(f"report: {Path(content['run']) / 'report.html'}")
-    print(f"run: {content['run']}")
+    run = Path(content["run"])
+    print(f"report: {run / 'report.html'}")
+    if len(options["runs"]) == 1 and not options["data"] and not (run / "diagnosis.json").is_file():
+        for line in next_line(FitResult.load(run), run, compared=True):
+            print(line)
+    print(f"run: {run}")

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import torch
 
-from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-from pace_optim.diagnosis.findings.text import lines_of
+from pace_optim.diagnosis import DiagnosisSettings, diagnose
+from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import errors_of
+from pace_optim.run.summary import error_line, next_line, summary
 from pace_optim.terminal.choices import MEASURED_FACTS
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
@@ -57,18 +57,13 @@ def main() -> None:
 
 
 def run_and_tell(settings: DiagnosisSettings) -> None:
-    """Diagnose; print the verdict before the robot is fitted again, and the folder of the last run at the end."""
-    diagnosis = diagnose(settings, on_verdict=_tell)
-    if len(diagnosis.runs) > 1:
-        before, after = (errors_of(FitResult.load(run), "all") for run in (diagnosis.runs[0], diagnosis.runs[-1]))
+    """Diagnose; print the verdict before the robot is fitted again, then the sizes, that fit and its folder."""
+    diagnosis = diagnose(settings, on_verdict=lambda found: print(*lines_of(found), sep="\n", flush=True))
+    first, last = Path(diagnosis.runs[0]), Path(diagnosis.runs[-1])
+    lines = size_lines(diagnosis.sizes)
+    if first != last:
         with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
-        print(f"whole robot with {' and '.join(with_what)}: {after} mrad (train / validation), before {before}")
-    for run in diagnosis.runs if len(diagnosis.runs) > 1 else ():
-        print(f"report: {Path(run) / 'report.html'}")
-    print(f"run: {diagnosis.runs[-1]}")
-
-
-def _tell(diagnosis: Diagnosis) -> None:
-    """Print what was found, before the robot is fitted again."""
-    print(*lines_of(diagnosis), sep="\n")
-    print(f"report: {Path(diagnosis.run) / 'report.html'}", flush=True)
+        before, refit = FitResult.load(first), FitResult.load(last)
+        lines = ["", f"whole robot with {' and '.join(with_what)}:", *summary(refit)]
+        lines += [error_line(before, "error before, all joints"), *next_line(refit, last)]
+    print(*lines, f"report: {last / 'report.html'}", f"run: {last}", sep="\n")

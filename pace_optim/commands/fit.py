@@ -156,7 +156,6 @@ def main() -> None:
             raise ValueError(missing_task())
         result, folder = fit_with_torques(FitSettings(**args, device=device), progress=progress, processes=processes)
     print(*summary(result), sep="\n")
-    print(f"report: {folder / 'report.html'}")
     interrupted = any("interrupted" in reason for reason in result.stop_reasons)
     if then_diagnose and not interrupted:
         from pace_optim.commands.diagnose import run_and_tell
@@ -165,7 +164,8 @@ def main() -> None:
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
-        print(*([] if interrupted else next_line(result, folder)), f"run: {folder}", sep="\n")
+        print(f"report: {folder / 'report.html'}", *([] if interrupted else next_line(result, folder)), sep="\n")
+        print(f"run: {folder}")
 
 
 def missing_task() -> str:

@@ -103,7 +103,7 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
                 "duration": float(track.time[-1] - track.time[0]),
                 "trained_share": float(track.train.mean()),
                 "repetitions": [o.name for o in run.tracks if o.group == track.group and o is not track],
-                "held_out": held_out_spans(track.time - track.time[0], track.train),
+                "held_out": held_out_spans(track.time - track.time[0], ~track.held_out),
             }
             for track in run.tracks
         ],
@@ -133,16 +133,13 @@ def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tr
 
 
 def _summary(compared: Sequence[JointComparison]) -> str:
-    """How many joints are explained, in a sentence."""
+    """How many joints are explained, in a sentence or two."""
     count = len(compared)
     done = sum(_explained(joint.content) for joint in compared)
     spread = sum(not _explained(joint.content) and not joint.places for joint in compared)
     if done == count:
-        return (
-            "The joint is at the noise floor: no model could explain more of this data."
-            if count == 1
-            else f"All {count} joints are at the noise floor: no model could explain more of this data."
-        )
+        which, near = "The joint is" if count == 1 else f"All {count} joints are", 100 * (AT_THE_FLOOR - 1)
+        return f"{which} within {near:.0f} % of the noise: a better model could explain little more of this data."
     rest = count - done
     if count == 1:
         text = "There is error above the noise floor that a better model could explain."

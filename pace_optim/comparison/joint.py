@@ -211,7 +211,7 @@ def rmse_by_part(tracks: Sequence[Track], j: int | None = None) -> dict[str, flo
     for part in ("train", "validation"):
         errors = []
         for track in tracks:
-            own = track.train if part == "train" else ~track.train
+            own = track.train if part == "train" else track.held_out
             errors.append(track.error[own][:, column][track.counts[own][:, column]])
         if (value := rms(np.concatenate(errors))) is not None:
             result[part] = value

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import joint_label, units_for
-from pace_actuators.text import position_unit, shortened
+from pace_actuators.text import position_unit, shortened, three_figures
 
 from .ladder import ladder_table
 
@@ -63,4 +63,4 @@ def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[s
 
 
 def _cell(value: float | None, factor: float) -> str:
-    return f"  {'–':>10}" if value is None else f"  {factor * value:#10.3g}"
+    return f"  {'–' if value is None else three_figures(factor * value):>10}"

@@ -50,14 +50,22 @@ class Track:
     swing: np.ndarray | None = None
     """How much of its swing each joint has behind it, 0 to 1, (K, n); NaN where the ground holds it. ``None``: the base
     rests."""
+    settling: np.ndarray | None = None
+    """Samples at the beginning that are neither trained on nor validated on, (K,) bool; ``None`` without any."""
 
     @property
     def counts(self) -> np.ndarray:
-        """Where joints are compared, (K, n) bool: where they are free; everywhere if they never are."""
-        if self.swing is None:
-            return np.ones(self.error.shape, dtype=bool)
-        free = ~np.isnan(self.swing)
-        return free | ~free.any(axis=0)
+        """Where joints are compared, (K, n) bool: where they are free (or never are), less what settles."""
+        result = np.ones(self.error.shape, dtype=bool)
+        if self.swing is not None:
+            free = ~np.isnan(self.swing)
+            result = free | ~free.any(axis=0)
+        return result if self.settling is None else result & ~self.settling[:, None]
+
+    @property
+    def held_out(self) -> np.ndarray:
+        """Whether a sample was kept for validation, (K,) bool."""
+        return ~self.train if self.settling is None else ~self.train & ~self.settling
 
     @property
     def dt(self) -> float:
@@ -147,6 +155,7 @@ def load_tracks(
             enabled=_enabled(entry),
             group=groups[r],
             swing=None if problem is None else _swing(problem, r, len(entry["time"])),
+            settling=np.asarray(entry["settling"]) if "settling" in entry else None,
         )
         for r, entry in enumerate(content["recordings"])
     )

@@ -26,6 +26,7 @@ import torch
 
 from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import effect_cfgs, get_effect
+from pace_actuators.text import plural
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, LinksCfg
@@ -155,8 +156,8 @@ def find_wrong_links(
         names = ", ".join(reference.link for reference in found)
         return LinkFindings(
             sentences=[
-                f"Wrong inertial parameters of {names} explain the error too, and these recordings cannot separate "
-                f"them from {' or '.join(likes)}: record once with a known added mass (added_mass in the recording)."
+                f"Wrong inertial parameters of {names} explain the error too. These recordings cannot separate them "
+                f"from {' or '.join(likes)}. Record once with a known added mass (added_mass in the recording)."
             ]
         )
     return _told(base, now, found)
@@ -206,7 +207,8 @@ def _best_addition(
         if any(size < len(addition.names) and each.rmse <= alike * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
-        say(f"fitting the links {', '.join(f'{each.link} ({len(each.names)})' for each in sought)}")
+        names = [f"{each.link} ({plural(len(each.names), 'parameter')})" for each in sought]
+        say(f"fitting the links {', '.join(names)}")
         values = _values_of(now) | screened.loads.get(addition.link, {})
         fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg.links)))
     if not fitted:

@@ -37,7 +37,7 @@ class CMAESOptimizerCfg(Config):
     stop: Sequence[Any] = ()
     """Further rules that end the search, beside ``epsilon`` and ``max_iteration``: ``"plateau"``, ``"window"``,
     ``"gradient"``, ``"early_stopping"``, ``"parameters"`` or ``"target"``, with numbers as in
-    ``"plateau:generations=30,improvement=0.01"``; or a rule of your own (:class:`~pace_optim.Criterion`)."""
+    ``"plateau:generations=30,improvement=0.01"``; or a custom rule (:class:`~pace_optim.Criterion`)."""
 
     sigma: float = 0.5
     """Initial standard deviation, in normalised parameters (the bounds are -1 and 1)."""
@@ -284,7 +284,7 @@ class CMAESOptimizer(TreeSearch):
     The score of a candidate is the mean over the samples of Σ_joints (q_sim - bias - q_measured)² [rad²]; it is
     accumulated during the rollout, positions are not stored.
 
-    Override :meth:`tell` for an objective of your own, and name the class in ``fit --optimizer my_module:MyOptimizer``:
+    Override :meth:`tell` for a custom objective, and name the class in ``fit --optimizer my_module:MyOptimizer``:
 
         class PositionAndVelocity(CMAESOptimizer):
             def tell(self, sim_dof_pos, real_dof_pos):
@@ -327,8 +327,8 @@ class CMAESOptimizer(TreeSearch):
             seed: Seed of the search.
             start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
             criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
-            processes: Who shares the search: each process simulates its part of the candidates, and does the
-                arithmetic of its own strategies; the others' candidates and states come from them.
+            processes: Who shares the search: each process simulates its part of the candidates, and updates its
+                strategies; the other processes send their candidates and states.
 
         Raises:
             ValueError: If the population is too small.
@@ -456,7 +456,7 @@ class CMAESOptimizer(TreeSearch):
         """The rollout that is being scored.
 
         Raises:
-            ValueError: If there is none.
+            ValueError: If no rollout is being scored.
         """
         if self.scores_buffer is None or self.rollout is None:
             raise ValueError("There is no rollout to score. Call update_simulator first.")
@@ -489,7 +489,7 @@ class CMAESOptimizer(TreeSearch):
             self._add(errors, weight)
 
     def score_of_each(self) -> torch.Tensor:
-        """What has been told of each candidate since the rollout began, (candidates,), on the processor."""
+        """The score of each candidate since the rollout began, (candidates,), on the processor."""
         self._scored()
         self._end_sample()
         return self._by_joint(self.scores_buffer).sum(dim=1).cpu()
@@ -502,7 +502,7 @@ class CMAESOptimizer(TreeSearch):
         per_joint = self._of_all(self._by_joint(self.scores_buffer))
         scores = torch.zeros(self.population_size, len(self.strategies), dtype=torch.float64)
         scores.index_add_(1, self._joint_group, per_joint)
-        self.scores_buffer = None  # the next generation needs a rollout of its own
+        self.scores_buffer = None  # the next generation needs a new rollout
         self._learn(scores.nan_to_num(nan=DIVERGED_SCORE).clamp(max=DIVERGED_SCORE).numpy())
 
     def close(self) -> None:

@@ -148,7 +148,7 @@ def stop_rule(rule: Any) -> Criterion:
     """The rule that a configuration names.
 
     Args:
-        rule: ``"plateau"``, with numbers ``"plateau:generations=30,improvement=0.01"``, or a rule of your own.
+        rule: ``"plateau"``, with numbers ``"plateau:generations=30,improvement=0.01"``, or a custom rule.
 
     Raises:
         ValueError: If there is no such rule or number.

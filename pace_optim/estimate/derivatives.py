@@ -1,6 +1,6 @@
 """Derivatives of the residuals by finite differences, coloured by kinematic tree and as wide as the noise asks.
 
-A simulation has noise of its own: where links rattle or stick, a change of a parameter by a millionth changes the
+A simulation is noisy too: where links rattle or stick, a change of a parameter by a millionth changes the
 motion as much as one by a hundredth. The noise η is measured at each look by a second difference (ECnoise of Moré and
 Wild, SIAM J. Sci. Comput. 33, 2011, of order 2):
 

@@ -54,7 +54,7 @@ class LeastSquaresCfg:
 
     near_enough: float = 2e-3
     """A descent by derivatives of a longer physics step ends when an iteration lowers the score by less than this part
-    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives of its own step."""
+    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives at the fit's step."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""

@@ -22,7 +22,7 @@ _FEWEST = 4
 _WIDEST = 512
 """Environments of a rollout at most."""
 _PARTS = 400
-"""Parts in time of all samples, at most, whose errors are told apart."""
+"""Parts in time of all samples, at most, whose errors are kept separate."""
 _LONG = 5
 """Samples of such a part at least."""
 
@@ -185,7 +185,7 @@ class Objective:
 
 
 def build(kind: type[CMAESOptimizer], problem: Problem, population_size: int, cfg: Any, **options: Any) -> Any:
-    """An optimizer of a class that may have a constructor of its own.
+    """An optimizer of a class that may have another constructor.
 
     Raises:
         ValueError: If that does not take what it is given.

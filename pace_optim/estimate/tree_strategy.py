@@ -50,7 +50,7 @@ class TreeStrategy:
     """pycma's strategy with its own random numbers, its best candidate and its reasons to stop.
 
     pycma brings candidates into their bounds one by one, which takes longer than their simulation on a GPU. So its
-    strategy is told of no bounds here, and a generation is brought into them at once: the candidates are the same.
+    strategy gets no bounds here, and a generation is brought into them at once: the candidates are the same.
 
     Attributes:
         best_x: The best candidate, normalised, (len(entries),).
@@ -143,7 +143,7 @@ class TreeStrategy:
 
 
 def _pycma(start: list[float], sigma: float, population_size: int, generator: np.random.Generator) -> Any:
-    """A strategy that is told of no bounds."""
+    """A strategy without bounds."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of optional packages at import
         import cma

@@ -71,7 +71,7 @@ def write_drives(
         _write(first, drive, dt)
         _write_beside(spec, name, drive, notes)
     if keys:
-        notes.append("control values of keyframes were those of other actuators: they are left out.")
+        notes.append("control values of keyframes are omitted: they belonged to other actuators.")
         for key in keys:
             key.ctrl = []
     return notes
@@ -176,8 +176,8 @@ def _shift_encoders(spec: mujoco.MjSpec, drives: Mapping[str, PlainDrive], notes
                 key.qpos = qpos
     most = max(abs(drive.encoder_bias) for drive in drives.values())
     notes.append(
-        f"encoder bias (up to {most:.3g} rad, of slides m): joint positions, targets and keyframes of this model are "
-        "what the encoders show, q - bias (the joints' ref is shifted)."
+        f"encoder bias of up to {most:.3g} rad (of slides m): positions, targets and keyframes of this model are what "
+        "the encoders show, q - bias. The joints' ref is shifted."
     )
     if spec.tendons:
         notes.append("tendons over joints with a bias have lengths of what the encoders show.")
@@ -192,8 +192,8 @@ def _integrator(drives: Mapping[str, PlainDrive]) -> mujoco.mjtIntegrator:
 def _rate_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
     if any(drive.second_order for drive in drives.values()):
         return [
-            "the integrator is Euler; the identification's steps were of second order. MuJoCo's joint friction turns "
-            "at the end of a step, the identification's within it: where joints often reverse, take a shorter timestep."
+            "the integrator is Euler; the fit's steps were of second order. MuJoCo's joint friction turns at the end "
+            "of a step, the fit's within it. If joints reverse often, use a shorter timestep."
         ]
     rates = sorted({drive.run_dt for drive in drives.values()})
     how = "implicitfast: kd acts within the step" if rates[0] == 0 else "Euler: a drive's torque is held over the step"
@@ -206,7 +206,7 @@ def _rate_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
 
 
 def _delete(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, notes: list[str]) -> None:
-    notes.append(f"the actuator {actuator.name or 'without a name'} moved a joint beside another: it is left out.")
+    notes.append(f"the actuator {actuator.name or 'without a name'} moved a joint beside another one; it is omitted.")
     for sensor in spec.sensors:
         if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname == actuator.name:
             spec.delete(sensor)
@@ -223,12 +223,12 @@ def _delay_notes(drives: Mapping[str, PlainDrive], dt: float) -> list[str]:
             f"delay of {1e3 * delay:.3g} ms: MuJoCo's shortest is one step, so it is {1e3 * near:.3g} ms in the model."
         ]
     notes = [
-        f"delay of {1e3 * delay:.3g} ms of the targets: it is in the actuators. After a reset MuJoCo's history holds "
-        "zeros: call mj_initCtrlHistory with the first targets."
+        f"delay of {1e3 * delay:.3g} ms of the targets: the actuators have it. After a reset MuJoCo's history holds "
+        "zeros. Call mj_initCtrlHistory with the first targets then."
     ]
     if abs(delay / dt - round(delay / dt)) > 1e-6 and any(math.isfinite(d.effort_limit) for d in drives.values()):
         notes.append(
-            "where a command arrives within a step, a limit acts on the torque before and after it in the "
-            "identification; MuJoCo limits the mean of both."
+            "commands that arrive within a step: the fit limits the torque before and after one, MuJoCo limits the "
+            "mean of both."
         )
     return notes

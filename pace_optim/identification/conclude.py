@@ -148,7 +148,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
     physical = problem.space.to_physical(end.x)
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
     unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
-    rates = end.rates
+    rates = None if end.rates is None else end.rates.at(problem.space, physical.numpy())
     told = replace(uncertainty, indistinguishable=()) if end.is_far else uncertainty  # where correlations mean nothing
     stalled = f"stalled: residual is {end.times or 0.0:,.0f}x the measurement noise"
     return make_result(
@@ -168,7 +168,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         times_noise=end.times,
         std_means_nothing=end.is_far,
         assumes_loop_rate=run.problem.assumes_loop_rate,
-        loop_rate=_loop_rate(end),
+        loop_rate=_loop_rate(end.problem, rates),
         warnings=by_effect(
             [
                 *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
@@ -181,11 +181,11 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
     )
 
 
-def _loop_rate(end: _End) -> dict[str, Any]:
+def _loop_rate(problem: Problem, rates: LoopRates | None) -> dict[str, Any]:
     """What is known of the loops' rate; nothing where it is stated, or as assumed for want of a comparison."""
-    if end.rates is not None:
-        return end.rates.to_dict(end.problem.space)
-    assumed, used = end.problem.assumed_loop, end.problem.loop_dt
+    if rates is not None:
+        return rates.to_dict(problem.space)
+    assumed, used = problem.assumed_loop, problem.loop_dt
     return {} if assumed in (None, used) else used_loop(assumed, used)
 
 

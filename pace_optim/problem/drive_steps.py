@@ -125,11 +125,10 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
             j = int(np.abs(vectors[:, -1]).argmax())
             felt = inverse[j, j]
             told = (
-                f"the loop of {names[j]} is unstable at its step of {1e3 * dt[j]:g} ms: kd dt / inertia is "
-                f"{kd[j] * dt[j] * felt:.3g} and kp dt² / inertia {kp[j] * dt[j] ** 2 * felt:.3g} (with an armature of "
-                f"{_armature(env, certain)[j]:.3g}), expected kd dt + kp dt² / 2 below 2 times the inertia. A real "
-                "drive runs its loop faster than that: set drive_dt in its PaceDCMotorCfg, or implicit=True; or "
-                "correct the gains"
+                f"the loop of {names[j]} is unstable at its step of {1e3 * dt[j]:g} ms. kd dt / inertia is "
+                f"{kd[j] * dt[j] * felt:.3g} and kp dt² / inertia {kp[j] * dt[j] ** 2 * felt:.3g}, with an armature of "
+                f"{_armature(env, certain)[j]:.3g}. Expected kd dt + kp dt² / 2 below 2 times the inertia. A real "
+                "drive runs its loop faster: set drive_dt or implicit=True in its PaceDCMotorCfg, or correct the gains"
             )
             if certain:
                 raise ValueError(f"{recording.name}: {told}.")

@@ -50,9 +50,9 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     notes = []
     if alone.any():
         notes.append(
-            f"{listed(names[alone], 3)}: the torque that is commanded is taken to be all that the drive gives"
-            f"{'' if drive.damping is None else ', less its damping'}, since nothing states the gains of a position "
-            "loop beside it. No loop corrects the simulation, so errors of this torque add up along the recording."
+            f"{listed(names[alone], 3)}: nothing states gains of a position loop beside the commanded torque. It is "
+            f"taken as all that the drive gives{'' if drive.damping is None else ', less its damping'}. No loop "
+            "corrects the simulation, so errors of this torque add up along the recording."
         )
         drive = replace(drive, stiffness=stiffness, damping=damping)
     _, on_speed = acting_loops(recording, stiffness)
@@ -112,8 +112,8 @@ def refuse_open_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -
         if gap > _CLOSED and not loops.closable(posture, slack):
             raise ValueError(
                 f"{recording.name}: where it begins, the closed chain ({name}) is open by {gap:.3g} (m or rad), "
-                "and no encoder bias within its bounds closes it. Check the joints' zeros, signs and units, or give "
-                "the assembly as init_state.joint_pos of the passive joints (a keyframe of the model file does, too)."
+                "and no encoder bias within its bounds closes it. Check the joints' zeros, signs and units. Or state "
+                "the assembly as init_state.joint_pos of the passive joints, or in a keyframe of the model file."
             )
     env.scene.reset()
 

@@ -242,9 +242,9 @@ def _held(
                 moving.append(f"{name} by {units_for(f'{high - low:.3g} rad', [types[name]])}")
     if moving and not is_asked:
         raise ValueError(
-            f"{recordings[0].label}: joints move that nothing commands: {listed(moving, 3)}. Add their commands "
-            "(des_dof_pos, des_dof_vel or des_dof_effort), or name the joints to identify with --joints: the others "
-            "are then held where they are in the median."
+            f"{recordings[0].label}: joints move without a command: {listed(moving, 3)}. Add their commands "
+            "(des_dof_pos, des_dof_vel or des_dof_effort). Or name the joints to identify with --joints; the others "
+            "are then held at their median."
         )
     if not held:
         before = [f"{name} at {value:.3g}" for name, value in env.cfg.scene.robot.held_joints.items()]

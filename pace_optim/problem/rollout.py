@@ -129,8 +129,8 @@ class Rollout:
         """
         if self.dataset.ee_pose is None:
             raise ValueError(
-                "The recordings have no pose of the end effector: add the series real_ee_pose, (T, 3) [m] or (T, 7) "
-                "with a quaternion (w, x, y, z), to each of them."
+                "The recordings have no pose of the end effector. Add the series real_ee_pose to each of them: (T, 3) "
+                "[m], or (T, 7) with a quaternion (w, x, y, z)."
             )
         return self._rows(self.dataset.ee_pose[self._step])
 

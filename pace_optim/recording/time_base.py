@@ -92,8 +92,7 @@ def fit_time_base(time: np.ndarray, control_dt: float, source: str, may_place: b
     if not exact and median < 0.95 * control_dt:
         notes.append(
             f"The recording ({1 / median:.4g} Hz) is finer than the control step ({1 / control_dt:.4g} Hz), "
-            "so information is lost; a smaller control step keeps it (of a model file --control_dt, else sim.dt times "
-            "decimation)."
+            "so information is lost. Use a smaller control step: --control_dt with a model file, else sim.dt."
         )
     num_samples = len(time) if exact else int(np.floor(time[-1] / spacing + 1e-6)) + 1
     return TimeBase(sample_stride=stride, num_samples=num_samples, exact=exact, notes=tuple(notes))
@@ -110,8 +109,7 @@ def _check_usable(time: np.ndarray, step: np.ndarray, median: float, source: str
         gap = int(np.argmax(step))
         raise ValueError(
             f"{source}: found a gap of {step[gap]:.3g} s after sample {gap} ({time[gap]:.3f} s from the "
-            f"start); expected no gap above {_MAX_GAP:g} s, since what happened in it is unknown. Cut the "
-            "file there into two recordings."
+            f"start); expected none above {_MAX_GAP:g} s. Cut the file there into two recordings."
         )
 
 

@@ -50,11 +50,11 @@ def joined(parts: Iterable[Markup]) -> Markup:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], css: str = "") -> Markup:
-    """A table of cells that are text or HTML; it scrolls sideways where the page is narrow."""
+    """A table of cells that are text or HTML. A click on a head sorts it; on a narrow page each row is a list."""
     return html(
         '<div class="scroll"><table class="{{ css }}"><thead><tr>{% for cell in header %}<th>{{ cell }}</th>'
-        "{% endfor %}</tr></thead><tbody>{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}"
-        "</tr>{% endfor %}</tbody></table></div>",
+        "{% endfor %}</tr></thead><tbody>{% for row in rows %}<tr>{% for cell in row %}"
+        '<td data-head="{{ header[loop.index0] }}">{{ cell }}</td>{% endfor %}</tr>{% endfor %}</tbody></table></div>',
         header=header,
         rows=rows,
         css=css,

@@ -37,6 +37,8 @@ class RecordingData:
     """Simulated less measured, (K, n) [rad]."""
     train: np.ndarray
     """Whether a sample was trained on, (K,) bool."""
+    held_out: np.ndarray
+    """Whether it was kept for validation, (K,) bool."""
     base: np.ndarray | None = None
     """Position [m] and quaternion of a base that moves, (K, 7)."""
     standing: np.ndarray | None = None
@@ -158,14 +160,15 @@ def _model_file(settings: Mapping[str, Any]) -> Path | None:
 
 
 def _recording(content: dict[str, Any]) -> RecordingData:
-    measured = np.asarray(content["dof_pos"])
+    measured, train = np.asarray(content["dof_pos"]), np.asarray(content["train"]).astype(bool)
     return RecordingData(
         name=content["name"],
         time=np.asarray(content["time"]),
         target=np.asarray(content["des_dof_pos"]),
         measured=measured,
         error=np.asarray(content["sim_dof_pos"]) - measured,
-        train=np.asarray(content["train"]).astype(bool),
+        train=train,
+        held_out=~train & ~np.asarray(content.get("settling", np.zeros_like(train))).astype(bool),
         base=None if "base" not in content else np.asarray(content["base"]),
         standing=None if "base" not in content else np.asarray(content["standing"]).astype(bool),
         feet=tuple(content.get("feet", ())),

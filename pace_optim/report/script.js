@@ -38,6 +38,40 @@
     return inColor(result);
   }
 
+  /** The layout with panels below each other where the page is too narrow for them side by side. */
+  function inWidth(layout, canvas) {
+    const across = Object.keys(layout).filter((key) => /^xaxis\d*$/.test(key) && layout[key].domain);
+    canvas.dataset.height ??= canvas.style.height;
+    const narrow = across.length > 1 && document.documentElement.clientWidth < 640;
+    canvas.style.height = narrow ? `${200 * across.length + 60}px` : canvas.dataset.height;
+    if (!narrow) return layout;
+    const below = Object.fromEntries(across.flatMap((key, i) => [
+      [key, { ...layout[key], domain: [0, 1] }],
+      [key.replace("x", "y"), { ...layout[key.replace("x", "y")], domain: [1 - (i + 0.62) / across.length, 1 - i / across.length] }],
+    ]));
+    return { ...layout, ...below };
+  }
+
+  /** A click on a head sorts the table's rows by that column, numbers by value; rows without a name stay last. */
+  function makeSortable(table) {
+    const body = table.tBodies[0], rows = [...body.rows];
+    if (rows.length < 3) return;
+    table.classList.add("can-sort");
+    const key = (row, i) => {
+      const text = row.cells[i].textContent.trim(), number = parseFloat(text.replace("−", "-"));
+      return Number.isNaN(number) ? text : number;
+    };
+    [...table.tHead.rows[0].cells].forEach((head, i) => head.addEventListener("click", () => {
+      const down = head.getAttribute("aria-sort") === "ascending";
+      for (const other of table.tHead.rows[0].cells) other.removeAttribute("aria-sort");
+      head.setAttribute("aria-sort", down ? "descending" : "ascending");
+      const order = (a, b) => (typeof a === typeof b ? (a > b) - (a < b) : typeof a === "number" ? -1 : 1) * (down ? -1 : 1);
+      const named = rows.filter((row) => row.cells[0].textContent.trim());
+      named.sort((a, b) => order(key(a, i), key(b, i)));
+      body.append(...named, ...rows.filter((row) => !named.includes(row)));
+    }));
+  }
+
   function makeFigure(element) {
     const spec = read(element), canvas = element.querySelector(".canvas"), bar = element.querySelector(".views");
     let shown = spec.views[0];
@@ -137,8 +171,9 @@
         const card = element.querySelector(`[data-figure="${name}"]`), filled = cell[name];
         card.querySelector(".said").textContent = filled.text;
         const data = figure.traces.map((trace, i) => ({ ...trace, ...filled.traces[i] }));
+        const canvas = card.querySelector(".canvas");
         await Plotly.react(
-          card.querySelector(".canvas"), inColor(data), inStyle(merged(figure.layout, filled.layout)), CONFIG);
+          canvas, inColor(data), inStyle(inWidth(merged(figure.layout, filled.layout), canvas)), CONFIG);
       }
     }
     element.addEventListener("change", draw);
@@ -161,6 +196,8 @@
     for (const draw of drawers) await draw();
     document.documentElement.dataset.drawn = "true";
   };
+  document.querySelectorAll(".scroll table").forEach(makeSortable);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+  matchMedia("(max-width: 640px)").addEventListener("change", drawAll);
   drawAll();
 })();

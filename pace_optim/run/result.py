@@ -52,7 +52,8 @@ class FitResult(DriveResult):
     objective: dict[str, float | None] = field(default_factory=dict)
     """What an objective of the user's own is at the result, in ``train`` and ``validation``; empty: it is ``score``."""
     step_error: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """The part of each value that comes from the physics step, shaped as ``std``, which includes it; empty: unknown."""
+    """The part of each value from the physics step and an assumed loop rate, shaped as ``std``, which includes it; it
+    is empty if unknown."""
     assumes_loop_rate: bool = False
     """Whether the rate of the drives' loops is assumed. What depends on it is in ``step_error`` and ``std``."""
     loop_rate: dict[str, Any] = field(default_factory=dict)

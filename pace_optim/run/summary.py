@@ -11,7 +11,7 @@ from pace_actuators.text import shortened
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
-_ABOVE_NOISE = 1.5
+ABOVE_NOISE = 1.5
 """Times the noise above which an error has causes beside it."""
 
 
@@ -30,10 +30,9 @@ def summary(result: FitResult) -> list[str]:
                 text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
             lines.append(text)
     if result.step_error:
-        of = f"the physics step of {1e3 * result.physics_dt:g} ms"
-        if result.assumes_loop_rate:
-            of += " and of the assumed loop rate"
-        lines.append(f"±: one standard deviation, of noise and of the error of {of} together")
+        rate = " and the assumed loop rate" if result.assumes_loop_rate else ""
+        step = f"the physics step of {1e3 * result.physics_dt:g} ms"
+        lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
@@ -48,18 +47,27 @@ def summary(result: FitResult) -> list[str]:
     return lines + [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
 
 
-def error_line(result: FitResult) -> str:
-    """RMSE of all joints in training and validation."""
-    return units_for(f"error, all joints: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
+def error_line(result: FitResult, of: str = "error, all joints") -> str:
+    """RMSE of all joints in training and validation, under a name."""
+    return units_for(f"{of}: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
 
 
-def next_line(result: FitResult, folder: Path) -> list[str]:
-    """The command that comes after a fit, where its error is above the noise."""
-    times = result.times_noise or 0.0
-    if times < _ABOVE_NOISE:
+def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> list[str]:
+    """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown.
+
+    Args:
+        result: Of the fit.
+        folder: Of the run.
+        compared: Whether the run has been compared with its recordings.
+    """
+    if result.times_noise is None:
         return []
-    verb = "diagnose" if result.std_means_nothing else "compare"
-    return [f"next: {command(verb)} {shlex.quote(str(folder))}"]
+    run = shlex.quote(str(folder))
+    if result.times_noise < ABOVE_NOISE:
+        robot = shlex.quote(f"{result.robot_name}_identified.xml")
+        return [f"next: {command('export')} {run} --format mjcf --output {robot}"]
+    verb = "diagnose" if compared or (result.std_means_nothing and not result.effects) else "compare"
+    return [f"next: {command(verb)} {run}"]
 
 
 def _torque_errors(result: FitResult) -> list[str]:
@@ -78,13 +86,12 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
         return []
     names = [name for name in names if set(joints) & set(result.parameters[name])]
     unit = {name: next(result.unit_of(name, j) for j in joints if j in result.parameters[name]) for name in names}
-    columns = [f"{name} [{unit[name]}]".rjust(26) for name in names]
+    columns = [[f"{name} [{unit[name]}]", *(_value(result, name, joint) for joint in joints)] for name in names]
     head = units_for("train / validation [mrad]", [joint_type])
-    lines = ["  ".join(["joint".ljust(width), *columns, head.rjust(26)])]
-    for joint in joints:
-        cells = [_value(result, name, joint).rjust(26) for name in names]
-        lines.append("  ".join([joint.ljust(width), *cells, errors_of(result, joint).rjust(26)]))
-    return [*lines, ""]
+    columns.append([head, *(errors_of(result, joint) for joint in joints)])
+    aligned = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+    rows = zip([name.ljust(width) for name in ("joint", *joints)], *aligned, strict=True)
+    return [*("  ".join(row) for row in rows), ""]
 
 
 def _links(result: FitResult) -> list[str]:

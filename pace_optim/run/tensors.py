@@ -56,7 +56,7 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
             refuse(where, f"{name} is no series of finite numbers of shape {shape}", _ANEW)
     simulated = entry["sim_dof_pos"]
     entry["sim_dof_pos"] = simulated.where(simulated.abs() < _LARGEST, torch.nan)
-    for name in ("train", "torque_enable"):
+    for name in ("train", "torque_enable", "settling"):
         flags = entry[name] if name == "train" else entry.get(name, entry["train"])
         if not (isinstance(flags, torch.Tensor) and flags.dtype == torch.bool and flags.shape == time.shape):
             refuse(where, f"{name} is no series of true and false of shape {tuple(time.shape)}", _ANEW)

@@ -30,6 +30,8 @@ from pace_optim.run.result import FitResult, rmse_by_joint
 
 _DEPTH = 100.0
 """How far the ground is below, so that no leg reaches it [m]."""
+_MANY = 10.0
+"""Times the fit's error from which on it is stated as such."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,14 +64,16 @@ class TrainingReplay:
         """Its lines, one per joint."""
         width = max(len(name) + len(" [mrad]") for name in (*self.joint_names, "joint"))
         parts = [part for part in ("train", "validation") if self.replayed.get(part)]
-        head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>9}" for part in parts)
+        head = "".join(f"{part + ': fit':>18}{'training env':>15}{'change':>11}" for part in parts)
         lines = [f"{'RMSE ' + units_for('[mrad]', self.joint_types):<{width}}{head}"]
         labels = [joint_label(*each, self.joint_types) for each in zip(self.joint_names, self.joint_types, strict=True)]
         for name, label in zip((*self.joint_names, ALL), (*labels, ALL), strict=True):
             cells = ""
             for part in parts:
                 fitted, here = self.fitted[part][name], self.replayed[part][name]
-                cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f} {100 * (here / fitted - 1):>+7.2f}%"
+                ratio = here / fitted
+                change = f"{100 * (ratio - 1):+.2f} %" if ratio < _MANY else f"{ratio:,.0f} times"
+                cells += f"{1e3 * fitted:>18.4f}{1e3 * here:>15.4f}{change:>11}"
             lines.append(f"{label:<{width}}{cells}")
         lines.append(
             f"control steps: {1e3 * self.fitted_control_dt:g} ms in the fit, {1e3 * self.control_dt:g} ms here"

@@ -168,18 +168,6 @@ def test_each_code_of_a_warning_has_a_section_with_its_cure():
         assert "**Meaning.**" in text and "**Cure.**" in text, f"{code} needs a meaning and a cure"
 
 
-BEING_EDITED = (
-    "pace_actuators/drive.py",
-    "pace_actuators/pace_dc_motor.py",
-    "pace_actuators/effects/",
-    "pace_envs/compiler/",
-    "pace_envs/step_graph.py",
-    "pace_optim/estimate/",
-    "pace_optim/recording/torque/",
-)
-"""Places whose docstrings still have old habits. Shorten this list."""
-
-
 @cache
 def docstrings(path: Path) -> list[str]:
     """Docstrings of modules, classes, functions and fields, without their code."""
@@ -198,7 +186,6 @@ def test_docstrings_and_comments_have_none_of_the_habits():
     found = [
         f"{name_of(path)}: {each}"
         for path, source in modules().items()
-        if not name_of(path).startswith(BEING_EDITED)
         for text in [*docstrings(path), *(_NAME_IN_CODE.sub("CODE", each) for each in _COMMENT.findall(source))]
         for each in habits(text)
     ]
@@ -208,8 +195,6 @@ def test_docstrings_and_comments_have_none_of_the_habits():
 def test_sentences_of_docstrings_are_short():
     for room, paths in rooms().items():
         found = [each for path in paths for text in docstrings(path) for each in sentences(text)]
-        if name_of(paths[0]).startswith(BEING_EDITED):
-            continue
         mean, long = mean_and_long(found)
         assert mean <= DOCSTRING_MEAN, f"{room}: {mean:.1f} words a sentence, at most {DOCSTRING_MEAN:g}"
         assert len(long) <= max(DOCSTRING_LONG_SHARE * len(found), 1), (

@@ -140,7 +140,7 @@ def test_joints_that_nothing_commands_are_held_where_the_log_has_them(duo):
 
 
 def test_joints_that_move_without_a_command_are_held_only_if_one_asks_for_it(duo):
-    with pytest.raises(ValueError, match=r"joints move that nothing commands: right_elbow by 0\.\d+ rad.*--joints"):
+    with pytest.raises(ValueError, match=r"joints move without a command: right_elbow by 0\.\d+ rad.*--joints"):
         duo({LEFT: MOTION, RIGHT: MOTION})
     problem = duo({LEFT: MOTION, RIGHT: MOTION}, joints="left.*")
     assert problem.joint_names == (LEFT,)

@@ -242,6 +242,21 @@ def test_the_policys_gains_stay(result):
     env.close()
 
 
+def test_gains_that_no_file_states_become_the_recordings_unless_the_task_sets_them(result):
+    cfg = load_env_cfg(WALK)
+    robot, first = cfg.scene.robot, JOINTS[0]
+    robot.assumed_gains = dict.fromkeys(JOINTS, (85.0, 0.6))
+    (group,) = robot.actuators
+    robot.actuators[group].stiffness, robot.actuators[group].damping = {first: 9.0, f"(?!{first}).*": 85.0}, 0.6
+    changed(result, drive={"stiffness": dict.fromkeys(JOINTS, 7.0), "damping": dict.fromkeys(JOINTS, 0.3)})
+    (doubt,) = [each for each in doubts(cfg, result) if "[W25]" in each]
+    assert doubt.startswith("stiffness is 9 in this task and was 7")
+    assert f"gains of {len(JOINTS)} joints: the recordings'" in use_identified(cfg, result)[0]
+    drive = cfg.scene.robot.actuators[group]
+    assert drive.stiffness == {re.escape(j): 9.0 if j == first else 7.0 for j in JOINTS}
+    assert set(drive.damping.values()) == {0.3}
+
+
 def test_the_policy_sees_the_encoder(result):
     """A scale error shows up in the observation too."""
     changed(result, effects=["encoder_scale"], parameters={"encoder_scale.error": dict.fromkeys(JOINTS, 0.05)})

@@ -119,8 +119,8 @@ def unstamped(recordings: Sequence[Recording]) -> list[str]:
     if len(recordings) < 2 or any(session_starts(recordings)[1]):
         return []
     return [
-        "No time stamps say when they were made: they count as made one after another, in this order. A friction that "
-        "falls anew in each, from cold, shows in one of them alone."
+        "No time stamps state when they were made, so they are taken as made in a row, in this order. If the drives "
+        "were cold before each, diagnose one recording alone."
     ]
 
 

@@ -36,16 +36,15 @@ def advise(
             f"{other_gain} in the recording)."
         )
     result += [
-        f"{effect.name} would not show in these recordings: the {effect.absorbed_by} absorbs it. What would "
-        f"separate them: {effect.separates}."
+        f"{effect.name} would not show in these recordings: the {effect.absorbed_by} absorbs it. To "
+        f"separate them, you need {effect.separates}."
         for effect in absorbed
     ]
     if decision == "unknown" or bool(curves_in(outcome.final.model).any()):
         whose = "the error" if decision == "unknown" else "the error of some joints"
         result.append(
-            f"None of the known effects explains {whose}. The report says which variable carries it, and how: find "
-            "what it is, write it as an effect (docs/your_own_effect.md) and diagnose again with --effects "
-            "module:Class."
+            f"None of the known effects explains {whose}. The report shows which variable carries it. Find "
+            "the cause, write it as an effect (docs/your_own_effect.md) and diagnose again with --effects module:Class."
         )
     return result
 
@@ -62,6 +61,6 @@ def rivals(joint_names: Sequence[str], outcome: Outcome) -> list[Rivals]:
     for pair in confounded(outcome):
         names, separates = (pair.chosen.name, pair.rival.name), pair.chosen.separates or pair.rival.separates
         models = with_it(pair.models[0]), with_it(pair.models[1])
-        hint = f"What would separate them: {separates}." if separates else ""
+        hint = f"To separate them, you need {separates}." if separates else ""
         result.append(Rivals(names=names, models=models, joints=pair.joints, hint=hint))
     return result

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from pace_actuators.drive_result import ALL
-from pace_actuators.effects import Effect
+from pace_actuators.effects import Effect, get_effect
 from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
 from pace_actuators.text import conjoined
@@ -22,7 +22,7 @@ from pace_optim.diagnosis.findings.result import Diagnosis
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.names import Hint
-from pace_optim.diagnosis.verdict.sizes import sizes
+from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes, ranking
 from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
@@ -146,12 +146,29 @@ def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: P
     return replace(
         diagnosis,
         summary=f"{diagnosis.summary} {fall}",
+        sizes=[_as_refitted(size, refit) for size in diagnosis.sizes],
         runs=[diagnosis.run, str(folder)],
         ladder=[
             {"model": "base model", "validation_rmse": before, "run": diagnosis.run},
             {"model": " + ".join(names), "validation_rmse": after, "run": str(folder)},
         ],
     )
+
+
+def _as_refitted(size: dict[str, Any], refit: FitResult) -> dict[str, Any]:
+    """The size of an effect as the refit of the whole robot has it."""
+    name, joint = f"{size['effect']}.{size['parameter']}", size["joint"]
+    values = refit.parameters.get(name, {})
+    if (key := joint if joint in values else ALL) not in values:
+        return size
+    effect = get_effect(size["effect"])
+    (parameter,) = (each for each in effect.parameters if each.name == size["parameter"])
+    return size | {
+        "value": values[key],
+        "std": None if refit.std_means_nothing else refit.std[name][key],
+        "factor": None if size["factor"] is None else factor_of(effect, parameter, values[key]),
+        "at_bound": f"{name}/{key}" in refit.at_bound,
+    }
 
 
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:

@@ -46,7 +46,7 @@ class Diagnosis:
     ``explained`` of what lies above the floor, and the ``doubts``."""
     sizes: list[dict[str, Any]] = field(default_factory=list)
     """Every parameter of the effects found, on each joint: value, standard deviation, unit, the factor of what was
-    stated where it is one, and whether it is at a bound."""
+    stated where it is one, and whether it is at a bound; of the refit once that is done."""
     likes: dict[str, list[str]] = field(default_factory=dict)
     """Effects that these recordings cannot separate from one found, by its name."""
     joints: dict[str, dict[str, Any]]

@@ -14,12 +14,8 @@ _EFFECTS = 8
 
 
 def lines_of(diagnosis: Diagnosis) -> list[str]:
-    """What is printed as soon as the verdict is known, the most important first."""
+    """What is printed as soon as the verdict is known, the most important first; sizes come with the refit."""
     lines = [f"verdict: {diagnosis.verdict}", diagnosis.summary]
-    lines += [f"  {text}" for text in size_lines(diagnosis.sizes)]
-    stuck = dict.fromkeys(f"{size['effect']} ({size['joint']})" for size in diagnosis.sizes if size["at_bound"])
-    if stuck:
-        lines.append(f"At its bound: {', '.join(stuck)}.")
     lines += [f"{effect} cannot be separated from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in shortened(diagnosis.advice, "proposal")]
     names = list(diagnosis.joints)
@@ -35,8 +31,8 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
 
 
 def size_lines(sizes: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each value: "torque_gain.gain of servo: 0.45 ± 0.002 times what was stated"."""
+    """A line for each value: "  torque_gain.gain of servo: 0.45 ± 0.002 times what was stated"."""
     return [
-        f"{effect}.{parameter} of {conjoined(joints)}: {text}"
+        f"  {effect}.{parameter} of {conjoined(joints)}: {text}"
         for (effect, parameter, text), joints in sizes_by_joints(sizes).items()
     ]

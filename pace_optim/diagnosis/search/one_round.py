@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect
+from pace_actuators.text import listed
 from pace_optim.diagnosis.candidates.multistart import multistart
 from pace_optim.diagnosis.candidates.screening import Probe, screen, starts_of
 from pace_optim.diagnosis.diagnosis_cfg import CandidatesCfg
@@ -213,7 +214,7 @@ def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
 
 
 def _names(effects: Sequence[type[Effect]]) -> str:
-    return ", ".join(effect.name for effect in effects)
+    return listed([effect.name for effect in effects], 3)
 
 
 def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], torch.Tensor]:

@@ -142,7 +142,7 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
 
     Residuals are whitened by C, which a fit follows. What lasts in them is in Σ = L⁻¹ C' L⁻ᵀ, with C' all that is not
     known of a swing. If the errors of a swing are above C', its Σ is as many times as large: each swing is a cluster
-    with a variance of its own (Liang and Zeger, Biometrika 73, 1986).
+    with its own variance (Liang and Zeger, Biometrika 73, 1986).
 
     Args:
         jacobian: On the training samples.
@@ -239,7 +239,7 @@ def make_probes(
 
     Args:
         x: Normalised vector, (size,).
-        around: Vectors around x that tell the derivatives.
+        around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
         joint_names: All joints, in order.
         shake: How far first positions are moved [rad].
@@ -267,13 +267,15 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
     """Commanded, measured and simulated encoder positions of one candidate, recording by recording."""
     data, residuals, result = problem.dataset, residuals.positions, []
     for r, recording in enumerate(data.recordings):
-        at = residuals.where[:, r]
+        at, also = residuals.where[:, r], {}
         measured = torch.as_tensor(recording.dof_pos)[: int(at.sum())]
         enabled = recording.torque_enable
         error = residuals.error[0, at, r]
         if residuals.weight is not None:
             error = error / residuals.weight[at, r].clamp(min=1.0)
         on = torch.ones(len(measured), dtype=torch.bool) if enabled is None else torch.as_tensor(enabled).bool()
+        if data.settling is not None:
+            also["settling"] = data.settling[residuals.step][at, r]
         path, base = problem.base_paths[r], {}
         if path is not None:
             base = {
@@ -292,5 +294,6 @@ def trajectories(problem: Problem, residuals: Residuals) -> dict[str, Any]:
                 "train": data.train[residuals.step][at, r],
                 "torque_enable": on[: len(measured)],
             }
+            | also
         )
     return {"joint_names": list(problem.joint_names), "recordings": result}

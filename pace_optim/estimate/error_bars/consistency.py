@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from pace_actuators.text import plural
+from pace_actuators.text import capitalised, plural
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
 from pace_optim.estimate.derivatives import Jacobian, colour, stencil
@@ -21,7 +21,7 @@ from pace_optim.problem.problem import Problem
 
 DISAGREEMENT = 4.0
 """Recordings disagree on a parameter that differs by this many standard deviations of the difference."""
-_SHOWN = 3
+_SHOWN = 2
 """Joints of which a sentence gives the values."""
 _SMALLEST_PART = 0.01
 """Differences below this part of the bound range are not worth a sentence."""
@@ -31,7 +31,7 @@ _GAIN_RANGE = 0.6
 _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
 _GAIN_REFITS = 2
-"""Recordings refitted with gains of their own."""
+"""Recordings refitted with separate gains."""
 _REFINE = LeastSquaresCfg(max_iteration=12, score_tolerance=1e-4)
 """From the joint result: what is left after that is some tenths of a standard deviation."""
 
@@ -143,12 +143,15 @@ def _disagreements(space: ParameterSpace, names: tuple[str, ...], values: np.nda
             found.setdefault((name, space.unit_of(name, key), names[r]), []).append(
                 text if key == GLOBAL else f"{key} {text}"
             )
+    most = sorted(found.items(), key=lambda each: -len(each[1]))
     parts = [
-        f"{name.replace('_', ' ')} [{unit}] differs between {recording} and the other recordings: "
+        f"{capitalised(name.replace('_', ' '))} [{unit}] differs between {recording} and the others: "
         f"{'; '.join(places[:_SHOWN])}{_more(len(places) - _SHOWN)}."
-        for (name, unit, recording), places in found.items()
+        for (name, unit, recording), places in most[:_SHOWN]
     ]
-    return [f"{' And '.join(parts)} [W17]"] if parts else []
+    if len(most) > _SHOWN:
+        parts.append(f"So do {plural(len(most) - _SHOWN, 'more parameter')} (consistency.json).")
+    return [f"{' '.join(parts)} [W17]"] if parts else []
 
 
 def _more(joints: int) -> str:
@@ -161,7 +164,7 @@ def _odd_one_out(values: np.ndarray, std: np.ndarray, smallest: float) -> tuple[
 
     Args:
         values: One per recording, (R,).
-        std: Their standard deviations, (R,); NaN where there is none.
+        std: Their standard deviations, (R,); NaN if unknown.
         smallest: Differences below this do not count.
 
     Returns:

@@ -14,7 +14,7 @@ FAR_ABOVE_NOISE = 10.0
 
 
 def times_noise(problem: Problem, rmse: float | None) -> float | None:
-    """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` where there is none.
+    """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` without noise.
 
     Args:
         problem: What was fitted.
@@ -60,7 +60,7 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     )
     unit = units_for("mrad", joint_types)
     return [
-        f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: physics is missing, a fact "
+        f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise. Physics is missing, a fact "
         f"of the drive is wrong, or the fit is in a local minimum. The error bars mean nothing.{search} "
         f"{command('diagnose')} looks for the missing physics. [W1]"
     ]

@@ -7,6 +7,7 @@ friction and kd h / 2 of armature. A fit with a wrong rate finds these in its va
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -53,7 +54,7 @@ class LoopRates:
     likelihood: np.ndarray
     """Of each, (periods,); that of the best is 1."""
     assumed: float
-    """The period that is taken where the recordings tell none [s]."""
+    """The period that is used if the recordings do not show one [s]."""
     fitted: float
     """The period that was fitted with [s]."""
 
@@ -96,6 +97,16 @@ class LoopRates:
         """
         return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
 
+    def at(self, space: ParameterSpace, physical: np.ndarray) -> LoopRates:
+        """The same about a result: the chosen period's values are the result's, and the others' as far away as here.
+
+        Args:
+            space: The parameters.
+            physical: The result, (size,).
+        """
+        moved = self.values + (physical - self.value_at(self.chosen))
+        return replace(self, values=np.clip(moved, space.lower.numpy(), space.upper.numpy()))
+
     def to_dict(self, space: ParameterSpace) -> dict[str, Any]:
         """For ``result.json``: the periods, and the values with the chosen one and the farthest from it."""
         ends = dict.fromkeys((self.chosen, self.farthest))
@@ -123,9 +134,10 @@ class LoopRates:
         change = self.value_at(other) - self.value_at(used)
         size = np.where(known, np.abs(change) / np.maximum(np.abs(self.value_at(used)), 1e-12), 0.0)
         shown = [
-            f"{space.labels[i].split('/')[0].replace('_', ' ')} of {space.labels[i].split('/')[1]} is "
-            f"{self.value_at(used)[i]:.4g} with {_rate(used)} and {self.value_at(other)[i]:.4g} with {_rate(other)}"
+            f"{re.sub('[_.]', ' ', name)} of {key} is {self.value_at(used)[i]:.4g} with {_rate(used)} and "
+            f"{self.value_at(other)[i]:.4g} with {_rate(other)}"
             for i in np.argsort(-size)[:_NAMED].tolist()
+            for name, _, key in [space.labels[i].partition("/")]
         ]
         return [
             f"{begin}These recordings cannot separate {_rate(used)} and {_rate(other)}: {', '.join(shown)}. The error "

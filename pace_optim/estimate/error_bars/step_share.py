@@ -42,12 +42,12 @@ def change_without_step(
 def step_share(
     there: Jacobian, change: torch.Tensor, space: ParameterSpace, x: torch.Tensor, known: np.ndarray
 ) -> np.ndarray:
-    """What of each value comes from the step, physical (size,): the value less what a fit without a step would give.
+    """The part of each value that comes from the step, physical (size,): the value less that of a fit without a step.
 
     The residuals r at the result change by c when the step goes, and the result moves, in the linear map of its error
     bars, by - (JᵀJ)⁻¹ Jᵀ c. It does so only if the recording has no such step in it: what no parameter makes up for,
     c' = c + J times that move, then stands in the residuals, r = - c' + noise. A recording that this very step made has
-    nothing of it. So much of c' as the residuals hold, α = - r c' / c' c', tells them apart.
+    nothing of it. The share of c' that the residuals hold, α = - r c' / c' c', separates the two cases.
 
     Args:
         there: At the result, on the training samples.

@@ -14,11 +14,11 @@ from pace_optim.estimate.derivatives import Colouring, Jacobian
 from pace_optim.problem.parameter_space import ParameterSpace
 
 AT_BOUND = 1e-3
-"""A normalised entry this close to -1 or 1 is at its bound, unless its error bar tells it from there."""
+"""A normalised entry this close to -1 or 1 is at its bound, unless its error bar excludes the bound."""
 NO_INFLUENCE = 1e-6
 """A parameter whose whole range moves the joints by less than this (RMS) has no influence [rad]."""
 WEAK_STD = 0.05
-"""A direction known no better than this part of the bound range cannot be told apart."""
+"""A direction known no better than this part of the bound range is confounded."""
 SEEN = 1e-12
 """A direction of JᵀJ, scaled to a unit diagonal, with less than this moves nothing but rounding errors."""
 _NOTHING = 1e-10
@@ -27,9 +27,9 @@ _NOTHING_KNOWN = 1e6
 """Variance of a direction that moves nothing, of the prior's."""
 _WEAK_SHARE = 0.3
 SURE = 2.0
-"""Standard deviations that tell a value from another."""
+"""Standard deviations that separate two values."""
 HARDLY_KNOWN = 1 / (2 * SURE)
-"""A standard deviation above this part of the bound range leaves a parameter open: no value is told from the middle."""
+"""A standard deviation above this part of the bound range leaves a parameter open: every value is like the middle."""
 ANYWHERE = 1 / 3
 """Variance of a value that may be anywhere between its bounds, normalised to -1 and 1."""
 
@@ -47,22 +47,22 @@ class Uncertainty:
     no_influence: tuple[str, ...]
     """Labels of parameters that do not move the joints."""
     indistinguishable: tuple[tuple[str, ...], ...]
-    """Sets of labels that the recording cannot tell apart."""
+    """Sets of labels that the recording cannot separate."""
     by_chance: tuple[str, ...] = ()
     """Labels of those at a bound that could be anywhere between their bounds."""
     combinations: tuple[tuple[str, ...], ...] = ()
     """Those of them of which a combination moves nothing at all."""
     step: np.ndarray | None = None
-    """What of each value comes from the steps of physics and drives, (size,), which ``std`` and ``correlation`` then
-    know of."""
+    """The part of each value that comes from the steps of physics and drives, (size,); ``std`` and ``correlation``
+    then include it."""
 
     def without_error_bars(self) -> Uncertainty:
-        """The same where error bars mean nothing: there are none."""
+        """The same without error bars, where they mean nothing."""
         nothing = np.full_like(self.std, np.nan)
         return replace(self, std=nothing, correlation=np.full_like(self.correlation, np.nan), step=None)
 
     def with_step(self, share: np.ndarray) -> Uncertainty:
-        """The same, knowing what of each value comes from a step, (size,): an error of one size for all."""
+        """The same with the part of each value that comes from a step, (size,): an error of one size for all."""
         std = np.hypot(self.std, share)
         scale = np.where(std > 0, std, 1.0)
         covariance = self.correlation * np.outer(self.std, self.std) + np.outer(share, share)

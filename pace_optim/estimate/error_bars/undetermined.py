@@ -28,7 +28,7 @@ _SURE = 3.0
 
 
 def whole_delay(problem: Problem, delay: float, std: float | None) -> list[str]:
-    """What other delays would look the same, in a sentence; nothing where the recordings tell.
+    """Which other delays would look the same, in a sentence; nothing if the recordings separate them.
 
     Commands that come on their own clock, at instants at which the loop runs too, are taken over late by a whole number
     of its steps, whatever their delay.
@@ -100,7 +100,7 @@ def _none_or_prior(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty) 
     """Labels of what may be none, or as its prior is, by its error bar."""
     space, value = problem.space, problem.space.to_physical(x).numpy()
     apart = np.maximum(value, np.abs(value - _within_bounds(problem).numpy()))
-    unsure = apart < SURE * uncertainty.std  # not where there is none
+    unsure = apart < SURE * uncertainty.std  # false without an error bar
     return {label for label, yes in zip(space.labels, unsure, strict=True) if yes and label.split("/")[0] in CARRIED}
 
 

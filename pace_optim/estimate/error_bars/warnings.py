@@ -201,8 +201,8 @@ def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: fl
         return []
     unit = units_for("mrad", problem.joint_types)
     return [
-        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} {unit}, "
-        f"and the error is {1e3 * left:.3g} {unit}: part of it may come from the step. Fit with "
+        f"Halving the physics step of {1e3 * problem.physics_dt:g} ms changes the motion by {1e3 * change:.3g} {unit}; "
+        f"the error is {1e3 * left:.3g} {unit}. Part of it may come from the step. Fit with "
         f"--physics_dt {problem.physics_dt / 2:.12g}. [W13]"
     ]
 

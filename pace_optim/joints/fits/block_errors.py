@@ -113,9 +113,9 @@ def check_long_enough(
         usual = _usual_time(samples, control_dt)
         if _free_blocks(usual, cfg) < fewest:
             raise ValueError(
-                f"In what was kept for validation, the median joint swings for {usual:.2g} s, too short to "
-                f"judge a model by; expected {fewest * cfg.swing_s:g} s or more. Walk for longer, or fit again with "
-                "further recordings as --validation."
+                f"In the held-out data, the median joint swings for {usual:.2g} s, too short to judge a model by. "
+                f"Expected {fewest * cfg.swing_s:g} s or more. Walk for longer, or fit again with further recordings "
+                "as --validation."
             )
         return
     if (count := len(_blocks(where, control_dt, cfg))) < fewest:

@@ -92,7 +92,7 @@ def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFi
             value, limit, share = float(speed[k, j]), float(limits.velocity[j]), float(over.mean())
             message = (
                 f"{joint}: its target moves at up to {value:.3g} rad/s (at {time[k]:.2f} s), faster than the drive's "
-                f"no-load speed of {limit:.3g} rad/s, and in {share:.1%} of the time too fast to be followed."
+                f"no-load speed of {limit:.3g} rad/s. The drive cannot follow it in {share:.1%} of the time."
             )
             message = units_for(message, limits.joint_types[j : j + 1])
             findings.append(_finding(joint, "speed", value, limit, time[k], share, message))

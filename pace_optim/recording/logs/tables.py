@@ -317,8 +317,8 @@ def _seconds(path: Path, column: str, values: np.ndarray, unit: str) -> tuple[np
     fitting = [u for u, seconds in TIME_UNITS.items() if _FASTEST <= median * seconds <= _SLOWEST]
     if 0.5 <= median <= 1.5 or not fitting:
         raise ValueError(
-            f"{path}: '{column}' steps by {median:g}: in s that is {1 / median if median else 0:.3g} Hz, too slow for "
-            "joints; if it is another unit, say so in a column map: [time] unit = "
+            f"{path}: '{column}' steps by {median:g}. In s that is {1 / median if median else 0:.3g} Hz, too slow for "
+            "joints. If it has another unit, state it in a column map: [time] unit = "
             '"ms" (or "us", "ns").'
         )
     unit = "s" if "s" in fitting else fitting[0]

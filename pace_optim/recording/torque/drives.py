@@ -51,7 +51,7 @@ class MeasuredDrives:
         """Within what unknown gains are refined that torques say: lower, start and upper factor, by label and joint.
 
         Args:
-            facts: What nobody knows.
+            facts: Unknown facts.
             factors: The parameter that is a factor of each gain.
             sensed: Joints whose torques a fit follows: their gains are as unsure as their sensors' scales.
         """
@@ -86,7 +86,7 @@ def read_drives(
     slides: Collection[str] = (),
     sensed: Collection[str] = (),
 ) -> MeasuredDrives:
-    """Read the law of every joint in every recording that has its torque, and take what nobody stated.
+    """Read the law of every joint in every recording that has its torque, and take the facts that are not stated.
 
     Args:
         recordings: On the control grid.
@@ -95,7 +95,7 @@ def read_drives(
         delay_mode: What the drives delay.
         control_dt: Control step [s].
         unknown: Facts that are stated and that are not to be believed.
-        assumed: Joints whose gains nobody states: those that are configured are assumed.
+        assumed: Joints without stated gains: the configured ones are assumed.
         slides: Joints that slide.
         sensed: Joints whose torques a fit follows: a constant part is one of their sensors, and not of their drives.
     """
@@ -153,7 +153,7 @@ def _with_facts(
     slides: Collection[str],
     sensed: Collection[str],
 ) -> tuple[Recording, dict[str, set[str]], list[tuple[str, str, str]]]:
-    """A recording with what its torques say and nobody states; what was taken; and what contradicts: fact, joint, text.
+    """A recording with the facts that its torques show; the facts taken; the contradictions as fact, joint, text.
 
     What the recording or the robot's configuration states holds, unless it is declared unknown.
     """

@@ -28,14 +28,14 @@ _LEVELS = np.linspace(0.4, 1.0, 31)
 _HALF = 0.5
 """Quantile of the torque's size below which one start takes it to be free, in case most of the rest is cut."""
 _FEW = 2000
-"""Samples that tell when a drive runs."""
+"""Samples that show when a drive runs."""
 _PHASES = 8
 _FINEST_PHASE = 0.01
 """Instants in a control step that are tried at first, and how near to each other they are at last [steps]."""
 _FELT = 1e-3
 """Part of a torque that a term must be to be one of the law."""
 _NEAR = 9
-"""Lags of commands that are tried with lags of position and speed of their own."""
+"""Lags of commands that are tried with separate lags of position and speed."""
 _HALVINGS = 20
 _PLATEAU = 0.05
 """A limit that is one is held to within this part of it; one that is not depends on something, as on the speed."""
@@ -64,7 +64,7 @@ class MeasuredLaw:
     speed_lag: float
     """How old the speed in it is [control steps]."""
     resolution: float
-    """What the delay can be told to [control steps]: commands count from one sample to the next."""
+    """Resolution of the delay [control steps]: commands count from one sample to the next."""
     limit: float | None
     """Where the torque was cut [N m]; ``None`` where it was not."""
     peak: float
@@ -136,7 +136,7 @@ def _settled(table: Table, below: np.ndarray) -> tuple[_Fit, float | None]:
 
 
 def has_offset(law: MeasuredLaw) -> bool:
-    """Whether a drive gives a constant torque of its own."""
+    """Whether a drive gives a constant torque by itself."""
     return abs(law.offset) > max(SURE * law.std["offset"], APART * law.peak)
 
 
@@ -210,7 +210,7 @@ class _Fit:
         return np.sqrt(variance + self._between_lags())
 
     def _between_lags(self) -> np.ndarray:
-        """Variances of the coefficients from lags between which a log that does not sample the drive cannot tell, (p,).
+        """Variances of the coefficients from lags that a log at another rate cannot separate, (p,).
 
         A lag of position or speed is known to half of what lies between two of the table's.
         """
@@ -300,8 +300,8 @@ def _terms(table: Table, lags: _Lags) -> dict[str, np.ndarray]:
 def _best_lags(table: Table, below: np.ndarray, of_their_own: bool = True) -> _Fit:
     """The lags at which the law leaves least, and no more of them than explain more than chance does.
 
-    Position and speed are those of the torque's own sample (both lags 0), or as old as each other, or each has a lag of
-    its own. Another lag must lower Bayes' criterion, in which residuals that go on from sample to sample count as few.
+    Position and speed are those of the torque's own sample (both lags 0), or as old as each other, or each has its own
+    lag. Another lag must lower Bayes' criterion, in which residuals that go on from sample to sample count as few.
     No command is newer than the position that it is compared with, and no speed, which is made of positions, is newer.
 
     Args:
@@ -410,7 +410,7 @@ def _law(joint: str, fit: _Fit, limit: float | None, stds: np.ndarray) -> Measur
     torque = table.torque[fit.below]
     share = np.std(fit.columns[fit.below][:, fit.names.index("damping")]) * abs(value["damping"]) / np.std(torque)
     if table.commands.keys() == {"effort"} and not (value["damping"] > SURE * std["damping"] and share > _FELT):
-        del value["damping"], std["damping"]  # a drive that is told torques has none unless it shows
+        del value["damping"], std["damping"]  # a torque drive has no damping unless it shows
     left = torque - fit.predicted[fit.below]
     return MeasuredLaw(
         joint=joint,

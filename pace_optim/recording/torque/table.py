@@ -12,7 +12,7 @@ from pace_optim.recording.resample import interpolate_smooth
 _FEEDBACK_LAGS = np.arange(-1.0, 4.0)
 """Samples by which a log's torque may come later than the position or speed that it was made of."""
 _BETWEEN = np.arange(-1.0, 3.5, 0.5)
-"""The same where a log's samples are not those of the drive: their noise tells whole samples from others."""
+"""The same where a log's samples are not those of the drive: their noise separates whole samples from others."""
 _MOST_SAMPLES = 10_000
 """More say nothing new of six numbers."""
 _LEAST_SAMPLES = 100

@@ -118,8 +118,8 @@ def delay_sentence(
     if delay_mode == "command":
         first, last = (1e3 * control_dt * each for each in span)
         return (
-            f"By dof_effort the delay is {first:.3g} to {last:.3g} ms, and no one delay within the bounds is that of "
-            "all: it is sought within its bounds."
+            f"By dof_effort the delays are {first:.3g} to {last:.3g} ms. No delay within the bounds fits all of them, "
+            "so it is sought within its bounds."
         )
     return ""
 

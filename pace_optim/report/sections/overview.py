@@ -10,9 +10,9 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import SHOWN, capitalised, duration, position_text, position_unit, pretty_unit, three_figures
+from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import next_line
+from pace_optim.run.summary import ABOVE_NOISE, next_line
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -42,10 +42,15 @@ def overview(run: RunData) -> Section:
 
 
 def _plain_headline(result: FitResult) -> str:
-    """Without a diagnosis: how far the error is above the noise, where that says that physics is missing."""
-    if result.std_means_nothing and result.times_noise:
+    """Without a diagnosis: how far the error is above the noise, if that is known."""
+    if not result.times_noise:
+        return _follows(result)
+    if result.std_means_nothing:
         return f"{result.times_noise:,.0f} times the noise: physics is missing"
-    return _follows(result)
+    errors = result.rmse.get("validation") or result.rmse["train"]
+    times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
+    where = "on data it was not fitted to" if result.rmse.get("validation") else "on the data it was fitted to"
+    return f"{times:.2g} times the noise {where}" if times >= ABOVE_NOISE else f"At the noise {where}"
 
 
 def _follows(result: FitResult) -> str:
@@ -82,7 +87,8 @@ def _verdict(run: RunData) -> str:
 
 def _next(run: RunData) -> str:
     """The command that comes next, where nothing was diagnosed."""
-    lines = [] if run.read_json("diagnosis.json") else next_line(run.result, run.folder.resolve())
+    compared = bool(run.read_json("comparison.json"))
+    lines = [] if run.read_json("diagnosis.json") else next_line(run.result, run.folder.resolve(), compared=compared)
     return "".join(lines).removeprefix("next: ")
 
 
@@ -94,7 +100,7 @@ def _share_of_motion(run: RunData, held_out: bool) -> float | None:
     """The error as a part of the joints' standard deviation, on what was held out or on what was trained on."""
     error, moved = 0.0, 0.0
     for recording in run.recordings:
-        where = recording.train != held_out
+        where = recording.held_out if held_out else recording.train
         if where.any():
             measured = recording.measured[where]
             error += float(np.square(recording.error[where]).sum())
@@ -147,17 +153,13 @@ def _warnings(result: FitResult) -> Markup:
         text = "No parameter is at a bound, without influence, or confounded with another."
         return html('<div class="callout good"><h3>No warnings</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
-    sentences = [_sentence(text) for text in result.warnings]
+    sentences = [pretty_unit(text) for text in result.warnings]
     most = SHOWN if count > SHOWN + 1 else count  # one more takes no more room than its heading would
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
         said += folded(len(rest), bullets(rest))
     text = '<div class="callout bad"><h3>{{ title }}: read before you use the values</h3>{{ said }}</div>'
     return html(text, title=title, said=said)
-
-
-def _sentence(text: str) -> str:
-    return capitalised(pretty_unit(text))
 
 
 def _errors_by_joint(result: FitResult) -> Markup:

@@ -37,8 +37,8 @@ def parameters(run: RunData) -> Section:
     return Section(
         id="parameters",
         title="Parameters",
-        lead="Bars span 1.96 standard deviations to either side (95 %). They know of noise, of the residuals' "
-        "correlation in time and of the error of the physics step, not of physics that the model lacks.",
+        lead="Bars span 1.96 standard deviations to either side (95 %). They include noise, the residuals' correlation "
+        "in time, the physics step and an assumed loop rate. They do not include physics that the model lacks.",
         html=html('<div class="cards">{{ cards }}</div>', cards=joined(cards)),
     )
 

@@ -63,7 +63,7 @@ def _encode(recording: RecordingData, per_curve: int, joint_types: Sequence[Join
     return {
         "name": recording.name,
         "time": _base64(time, "<f4"),
-        "held_out": held_out_spans(time, recording.train),
+        "held_out": held_out_spans(time, ~recording.held_out),
         "joints": [_encode_joint(recording, j, per_curve, own) for j, own in enumerate(joint_types)],
     }
 
@@ -72,7 +72,7 @@ def _encode_joint(recording: RecordingData, j: int, per_curve: int, joint_type: 
     target, measured, error = recording.target[:, j], recording.measured[:, j], recording.error[:, j]
     kept = samples_to_draw((error, measured, target), per_curve)
     factor, unit = position_unit([float(np.abs(error).max(initial=0.0))], [joint_type])
-    train, held_out = rms(error[recording.train]), rms(error[~recording.train])
+    train, held_out = rms(error[recording.train]), rms(error[recording.held_out])
     parts = [(name, value) for name, value in (("training", train), ("validation", held_out)) if value is not None]
     words = ", ".join(f"{three_figures(factor * value)} {unit} in {name}" for name, value in parts)
     return {

@@ -98,7 +98,7 @@ def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") ->
     links = [link["label"] for link in content.get("links", [])]
     return html(
         '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
-        "fit with it.</p>{% elif effects or links %}<p>{{ why }}: <code>{{ command }} …"
+        "fit with it.</p>{% elif (effects or links) and not refitted %}<p>{{ why }}: <code>{{ command }} …"
         "{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}{% endif %}</code></p>"
         "{% endif %}{{ more }}</div>",
         css=css,
@@ -107,6 +107,7 @@ def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") ->
         has_it=has_it,
         effects=shlex.join(dict.fromkeys([*run.effects, *effects])),
         links=shlex.join(links),
+        refitted=len(content["runs"]) > 1,
         why="Add it" if content["added"] or links else "Until it is known, this lowers the error",
         command=command("fit"),
         more=more,

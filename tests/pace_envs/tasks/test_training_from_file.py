@@ -128,7 +128,7 @@ def test_a_mesh_is_found_as_the_file_names_it(folder, name):
 def test_meshes_that_cannot_touch_are_told(folder, name):
     (folder / "robot.urdf").write_text(walker(name))
     (folder.parent / "meshes" / "box.dae").write_text("<COLLADA/>")
-    with pytest.warns(UserWarning, match=rf"Nothing touches its collision meshes {name}.*\.stl"):
+    with pytest.warns(UserWarning, match=rf"Collision meshes without effect: {name}.*\.stl"):
         load_robot_spec(ArticulationCfg(mjcf_path=folder / "robot.urdf"), touches=True)
 
 

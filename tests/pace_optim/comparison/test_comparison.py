@@ -8,7 +8,7 @@ from problems import BENCH, env_cfg, make_problem, record
 
 from pace_optim.comparison.error_regions import worst_places
 from pace_optim.comparison.frequency import band_edges, band_power, narrowest_band, response
-from pace_optim.comparison.joint import compare_joint, hysteresis, share_above, whiteness
+from pace_optim.comparison.joint import compare_joint, hysteresis, rmse_by_part, share_above, whiteness
 from pace_optim.comparison.load_torque import load_torques
 from pace_optim.comparison.motion import motion_of
 from pace_optim.comparison.regions import best_region, evidence, lay_out
@@ -48,6 +48,13 @@ def track(error, position=CHIRP, *, noise=1e-4, name="chirp", group=0, load=None
         group=group,
         enabled=np.ones(len(position), dtype=bool),
     )
+
+
+def test_a_beginning_that_is_not_judged_by_the_fit_is_not_compared_either():
+    one = track(np.where(TIME[: len(CHIRP)] < 1.0, 0.1, 0.0), train=False, noise=0.0)
+    settled = replace(one, settling=one.time < 1.0)
+    assert rmse_by_part([one])["validation"] > 0.01 and rmse_by_part([settled])["validation"] == 0.0
+    assert not settled.held_out[0] and settled.held_out[-1]
 
 
 def reversal_error(position=CHIRP, lasting=0.05):

@@ -69,7 +69,7 @@ def test_a_torque_that_is_commanded_is_all_that_moves_a_motor(robot, commands):
     problem = load_problem(str(robot), data=[recorded(robot, commands=commands)])
     assert problem.contradictions == ()
     assert error_of(problem) < 5e-3  # nothing holds it: steps of 2.5 ms drift so far from steps of 0.25 ms in a second
-    assert any("taken to be all that the drive gives" in note for note in problem.dataset.recordings[0].notes)
+    assert any("taken as all that the drive gives" in note for note in problem.dataset.recordings[0].notes)
 
 
 def test_positions_cannot_move_a_drive_that_has_no_position_loop(robot):

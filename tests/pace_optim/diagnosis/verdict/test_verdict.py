@@ -14,8 +14,8 @@ from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_actuators.text import size_text
 from pace_optim.diagnosis import Diagnosis
-from pace_optim.diagnosis.findings.findings import percent_text
-from pace_optim.diagnosis.findings.text import lines_of
+from pace_optim.diagnosis.findings.findings import percent_text, with_refit
+from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
@@ -63,7 +63,7 @@ def test_what_multiplies_what_was_stated_is_a_factor():
     assert factor_of(get_effect("torque_offset"), get_effect("torque_offset").parameters[0], 2.0) is None
 
 
-def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
+def test_the_verdict_is_printed_first_then_likes_and_advice_and_sizes_with_the_fit():
     content = make_diagnosis() | {
         "sizes": [SIZE | {"at_bound": True}],
         "likes": {"torque_gain": ["payload"]},
@@ -71,12 +71,9 @@ def test_the_verdict_is_printed_first_then_sizes_likes_and_advice():
     }
     lines = lines_of(Diagnosis(**content))
     assert lines[0] == "verdict: effect" and lines[1] == content["summary"]
-    assert lines[2].endswith("times what was stated, at its bound")
-    assert lines[3:6] == [
-        "At its bound: torque_gain (knee).",
-        "torque_gain cannot be separated from payload.",
-        "- Record more.",
-    ]
+    assert lines[2:4] == ["torque_gain cannot be separated from payload.", "- Record more."]
+    (size,) = size_lines(content["sizes"])
+    assert size.startswith("  torque_gain.gain of knee: ") and size.endswith("times what was stated, at its bound")
 
 
 def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
@@ -95,6 +92,20 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
         assert "and 2 more" in first and "torque_gain cannot be separated from payload" in first
     html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
+
+
+def test_a_size_is_that_of_the_whole_robot_s_fit_once_it_is_done(tmp_path):
+    found = Diagnosis(**make_diagnosis() | {"sizes": [SIZE, SIZE | {"effect": "payload", "parameter": "mass"}]})
+    result = SimpleNamespace(
+        rmse={"validation": {"all": 1e-3}},
+        joint_types=["hinge"],
+        parameters={"torque_gain.gain": {"all": 0.5}},
+        std={"torque_gain.gain": {"all": 0.01}},
+        std_means_nothing=False,
+        at_bound=[],
+    )
+    first, second = with_refit(found, result, result, tmp_path).sizes
+    assert first == SIZE | {"value": 0.5, "factor": 0.5, "std": 0.01} and second == found.sizes[1]
 
 
 def ended(problem, final):

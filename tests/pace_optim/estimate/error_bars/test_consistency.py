@@ -50,7 +50,7 @@ def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording
         recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([4.0 / 1.3])), name="wrong"
     )
     sentences = checked([*recordings[:2], wrong]).sentences
-    assert any("viscous friction" in s and "differs between wrong and" in s for s in sentences)
+    assert any("Viscous friction" in s and "differs between wrong and" in s for s in sentences)
     gain = [s for s in sentences if "behaves as if" in s]
     assert len(gain) == 1
     assert gain[0].startswith("wrong behaves as if its damping were 30% higher than stated (4 instead of 3.08")
@@ -77,9 +77,9 @@ def test_of_many_joints_the_first_are_shown_and_the_others_counted():
         values[2, joints:] = 0.1
         return consistency._disagreements(space, ("a", "b", "c"), values, std)[0]
 
-    assert sentence(5).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007; and 2 more joints. [W17]")
-    assert sentence(4).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007; and 1 more joint. [W17]")
-    assert sentence(3).endswith("joint_2 0.5 ± 0.01 against 0.1 ± 0.007. [W17]")
+    assert sentence(4).endswith("joint_1 0.5 ± 0.01 against 0.1 ± 0.007; and 2 more joints. [W17]")
+    assert sentence(3).endswith("joint_1 0.5 ± 0.01 against 0.1 ± 0.007; and 1 more joint. [W17]")
+    assert sentence(2).endswith("joint_1 0.5 ± 0.01 against 0.1 ± 0.007. [W17]")
 
 
 def test_one_recording_has_nothing_to_disagree_with(recordings):

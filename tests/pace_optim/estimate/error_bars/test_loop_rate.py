@@ -122,6 +122,9 @@ def test_both_values_of_what_depends_on_the_rate_are_told():
     known = np.ones(space.size, dtype=bool)
     (told,) = of([1.0, 1.0, 1.0], values).sentences(space, known)
     assert "viscous friction of servo is 0.23 with 0.4 kHz and 0.11 with 2 kHz" in told and "--drive_dt" in told
+    found = values[0] + np.where(np.arange(space.size) == 1, 0.05, 0.0)
+    (told,) = of([1.0, 1.0, 1.0], values).at(space, found).sentences(space, known)
+    assert "is 0.28 with 0.4 kHz and 0.16 with 2 kHz" in told  # the first is the result's
     (told,) = of([1e-4, 1.0, 1.0], values).sentences(space, known)
     assert "allow 1 kHz to 2 kHz; 1 kHz is used" in told
     written = of([1e-4, 1.0, 1.0], values).to_dict(space)

@@ -58,8 +58,9 @@ def recording(n: int, samples: int = 400, seed: int = 0) -> RecordingData:
     phase, tempo = rng.uniform(0, 6, n), rng.uniform(2, 5, n)
     measured = 0.4 * np.sin(tempo * time[:, None] + phase)
     error = 0.01 * np.cos(7 * time[:, None] + phase)
+    train = np.ones(samples, dtype=bool)
     return RecordingData(
-        name="chirp", time=time, target=measured, measured=measured, error=error, train=np.ones(samples, dtype=bool)
+        name="chirp", time=time, target=measured, measured=measured, error=error, train=train, held_out=~train
     )
 
 
